@@ -75,12 +75,16 @@ def array_of_rows(value: object, shape: tuple[int, ...], name: str, *, hint: str
 
 
 def _with_hint(hint: str) -> str:
+    """Return the `hint` as the end of a message, after a semicolon; return an empty text for an
+    empty hint.
+    """
     return f"; {hint}" if hint else ""
 
 
 def type_name(value: object) -> str:
-    """Return the name of the type of `value` for a message; for an array the shape, and for a class
-    the name of the class.
+    """Return the name of the type of `value` for a message.
+
+    An array is named with its shape; a class is named as a class, with its own name.
     """
     if isinstance(value, jax.Array):
         return f"an array of shape {value.shape}"
@@ -138,9 +142,15 @@ def without_mask(value: object, name: str) -> Any:
 
 
 def _convert_to_si(value: Any, name: str, si_unit: str = "") -> Any:
-    """Return the numbers in SI units of a quantity of astropy or pint.
+    """Return `value` as plain numbers in SI units if it is a quantity of astropy or pint.
 
-    A `Rotation` of SciPy becomes its quaternion (w, x, y, z). Other values are returned unchanged.
+    A `Rotation` of SciPy becomes its quaternion (w, x, y, z), a list is converted item by item, and
+    other values are returned unchanged.
+
+    - `value`: anything that a user may pass for an array.
+    - `name`: the name of the argument in messages; it also selects a unit in `_UNITS`.
+    - `si_unit`: the SI unit whose dimension the quantity must have; if it is empty, the unit that
+      `_UNITS` lists for `name`, if any.
     """
     if is_rotation(value):
         # Written out, since `as_quat(scalar_first=True)` needs SciPy 1.14.
@@ -154,7 +164,7 @@ def _convert_to_si(value: Any, name: str, si_unit: str = "") -> Any:
     if unit is None or isinstance(value, jax.Array):
         return value
     si_unit = si_unit or _UNITS.get(name, "")
-    kind = _dimension(value, unit)
+    kind = _powers_of_si_units(value, unit)
     if si_unit and kind is not None and kind != _DIMENSIONS[si_unit]:
         raise TypeError(f"{name}: wanted a unit such as {si_unit}, got {unit or 'no unit'}")
     if hasattr(value, "si"):
@@ -172,9 +182,14 @@ def is_rotation(value: object) -> bool:
     return hasattr(value, "as_quat")
 
 
-def _dimension(value: Any, unit: Any) -> dict[str, Any] | None:
-    """Return the powers of SI units in a unit of astropy or pint, without angles; `None` for other
-    values.
+def _powers_of_si_units(value: Any, unit: Any) -> dict[str, Any] | None:
+    """Return the dimension of a quantity as powers of SI units, such as {"m": 1, "s": -2}; angles
+    are left out.
+
+    The result is `None` if the quantity is neither of astropy nor of pint.
+
+    - `value`: the quantity.
+    - `unit`: the unit of the quantity, an object of the same library.
     """
     if hasattr(value, "dimensionality"):
         return {_PINT.get(name, str(name)): power for name, power in value.dimensionality.items()}
@@ -205,6 +220,9 @@ def require_same_batch(**arrays: tuple[Array, int]) -> None:
 
 @functools.cache
 def _warn_of_lost_digits() -> None:
+    """Warn, once in a process, that float64 numbers become float32 because the 64 bits of JAX are
+    off.
+    """
     # The cache makes this warning appear once in a process.
     warnings.warn(
         "rigidjax: float64 numbers become float32, seven digits, because JAX's 64 bits are off; "
@@ -270,15 +288,31 @@ def first_bad_row(faults: Callable[[Any, Any], Any], rows: Array | np.ndarray) -
 
 
 def _index_of_first_true(xp: ModuleType, bad: Array | np.ndarray) -> Any:
+    """Return the index, a scalar, of the first true entry of the booleans `bad` (n,), or −1 if none
+    is true.
+
+    `xp` is the module of the array, `numpy` or `jax.numpy`.
+    """
     return xp.where(bad.any(), xp.argmax(bad), -1)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _compiled_index_of_first(faults: Callable[[Any, Any], Any], rows: Array) -> Array:
+    """Return the index, a scalar, of the first row with a fault, or −1 if no row has one; the
+    search is compiled by JAX.
+
+    - `faults`: a function (xp, rows) of the array module and the rows that returns booleans (n,),
+      true for the rows with a fault.
+    - `rows`: (n, …) the rows that are searched.
+    """
     return _index_of_first_true(jnp, faults(jnp, rows))
 
 
 def _is_not_finite(xp: ModuleType, rows: Array | np.ndarray) -> Any:
+    """Return booleans (n,): whether each of the `rows` (n, …) contains a NaN or an infinity.
+
+    `xp` is the module of the array, `numpy` or `jax.numpy`.
+    """
     return ~xp.isfinite(rows).reshape(rows.shape[0], -1).all(axis=1)
 
 
@@ -391,14 +425,14 @@ def require_function(value: object, name: str, description: str, *, hint: str = 
     got = type_name(value)
     if callable(value) and not isinstance(value, type):
         listed = re.match(r"\w*\(([^()]*)\)", description)
-        if listed is None or _accepts(value, len(listed[1].split(","))):
+        if listed is None or _accepts_arguments(value, len(listed[1].split(","))):
             return value
         got = f"one with other arguments: {inspect.signature(value)}"
     raise TypeError(f"{name}: wanted a function {description}, got {got}{_with_hint(hint)}")
 
 
-def _accepts(value: Callable[..., Any], count: int) -> bool:
-    """Return whether the function `value` can be called with `count` arguments."""
+def _accepts_arguments(value: Callable[..., Any], count: int) -> bool:
+    """Return whether the function `value` can be called with `count` positional arguments."""
     try:
         inspect.signature(value).bind(*[None] * count)
     except (TypeError, ValueError) as error:
@@ -410,7 +444,7 @@ def _accepts(value: Callable[..., Any], count: int) -> bool:
 def integer(value: object, name: str, least: int) -> int:
     """Return `value` as a Python integer of at least `least`, known before anything is compiled."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"{name}: wanted a whole number of Python, got {_describe(value)}")
+        raise TypeError(f"{name}: wanted a whole number of Python, got {_number_or_type(value)}")
     if value < least:
         raise ValueError(f"{name}: wanted a whole number of at least {least}, got {value}")
     return int(value)
@@ -468,7 +502,7 @@ def file_path(value: Any, name: str = "path") -> Path:
     """Return the path of a file from its name, `value`."""
     named = isinstance(value, str | os.PathLike) and isinstance(os.fspath(value), str)
     if not named or value == "":
-        raise TypeError(f"{name}: wanted the name of a file, got {_describe(value)}")
+        raise TypeError(f"{name}: wanted the name of a file, got {_number_or_type(value)}")
     return Path(value)
 
 
@@ -489,10 +523,13 @@ def require_option(value: object, options: Sequence[str], name: str) -> str:
     """Return `value` if it is one of `options`."""
     if isinstance(value, str) and value in options:
         return value
-    raise ValueError(f"{name}: wanted one of {', '.join(options)}, got {_describe(value)}")
+    raise ValueError(f"{name}: wanted one of {', '.join(options)}, got {_number_or_type(value)}")
 
 
-def _describe(value: object) -> str:
+def _number_or_type(value: object) -> str:
+    """Return a number or a text as Python writes it, and the name of the type for any other
+    `value`; it stands in messages after "got".
+    """
     return repr(value) if isinstance(value, int | float | str) else type(value).__name__
 
 
@@ -528,7 +565,7 @@ def float_type(value: Any, name: str = "dtype") -> Any:
     except (TypeError, ValueError):
         kind = None
     if kind not in (np.float32, np.float64):
-        raise TypeError(f"{name}: wanted float32 or float64, got {_describe(value)}")
+        raise TypeError(f"{name}: wanted float32 or float64, got {_number_or_type(value)}")
     return kind
 
 

@@ -41,8 +41,10 @@ def raise_attribute_error(module: str, name: str) -> ModuleType:
 
 @functools.cache
 def _public_paths() -> dict[str, str]:
-    """Return the shortest path, such as `rj.torques.Sum`, of each public name; the keys are the
-    names as they are written, and in lower case.
+    """Return the shortest path, such as `rj.torques.Sum`, of each public name of the library, by
+    name.
+
+    Each name is a key of the dictionary as it is written, and also in lower case.
     """
     modules, paths = [("rj", sys.modules["rigidjax"])], {}
     for path, module in modules:

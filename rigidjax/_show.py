@@ -42,6 +42,7 @@ def time_as_text(t: Any, span: Any, digits: int = 6) -> str:
 
 
 def _nested_as_text(value: object) -> str:
+    """Return a number, or nested lists of numbers, as text, with six digits for each float."""
     if isinstance(value, list):
         return f"[{', '.join(map(_nested_as_text, value))}]"
     return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
     `None` the process belongs to this command, so that compiled programs are kept for the next run,
     unless `--no-cache` is given.
     """
-    parser = _parser()
+    parser = _make_parser()
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help()
@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
     jax.config.update("jax_enable_x64", True)
     if options.command == "identify" and options.demo == bool(options.logs):
         parser.error("identify: give either log FILES or --demo")
-    _check_files(options, parser)
+    _check_output_files(options, parser)
     if arguments is None:
         # Characters of a file name that the terminal cannot show are escaped, since they would
         # raise an error that ends the run.
@@ -60,7 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")  # pyright: ignore
         sys.unraisablehook = _raise_interrupt_again
     try:
-        return _run(options, parser, owns_process=arguments is None)
+        return _dispatch_command(options, parser, owns_process=arguments is None)
     except KeyboardInterrupt:
         _print_error("interrupted (Ctrl-C); nothing more is written")
         return 130
@@ -70,7 +70,8 @@ def _raise_interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
     """Raise a Ctrl-C (`KeyboardInterrupt`) again if Python dropped it, as in JAX's callback of the
     garbage collector.
 
-    `dropped` holds the exception as `sys.unraisablehook` gets it.
+    `dropped` holds an exception that Python could not raise, as `sys.unraisablehook` gets it; other
+    exceptions are reported as usual.
     """
     if dropped.exc_type is KeyboardInterrupt:
         # Another thread raises the interrupt a moment later: within this hook it would be dropped
@@ -80,10 +81,15 @@ def _raise_interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(dropped)
 
 
-def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, owns_process: bool) -> int:
+def _dispatch_command(
+    options: argparse.Namespace, parser: argparse.ArgumentParser, owns_process: bool
+) -> int:
     """Run the command that the options name, and return its exit code.
 
-    `owns_process` says whether the process belongs to this command.
+    - `options`: the options of the command line.
+    - `parser`: the parser of the command line, which reports wrong options.
+    - `owns_process`: whether the process belongs to this command, so that settings of JAX may be
+      changed.
     """
     if options.command == "workprecision":
         return workprecision.run_subcommand(options)
@@ -101,16 +107,18 @@ def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, owns_proc
     return _run_demo(options) if options.demo else _run_logs(options)
 
 
-def _check_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Check the output files that the options name, and end the program with a message if a file
-    could not be written after the fit.
+def _check_output_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """Check the output files that the `options` name, and end the program with a message of the
+    `parser` if a file could not be written after the fit.
+
+    A name of the figure without an ending gets the ending `.png`.
     """
     figure = options.figure
     if figure is not None and figure.name and not figure.suffix.strip("."):
         # Matplotlib adds the ending `.png` to a name without an ending. The ending is added here,
         # so that messages name the right file.
         options.figure = figure.with_name(figure.name.rstrip(".") + ".png")
-    if figure is not None and not _matplotlib():
+    if figure is not None and not _has_matplotlib():
         parser.error("--figure: needs matplotlib: pip install 'rigidjax[view]'")
     if figure is not None and figure.suffix.strip("."):
         from matplotlib.backend_bases import FigureCanvasBase
@@ -175,7 +183,7 @@ def _cache_folder() -> Path:
     return Path.home() / inside / "rigidjax"
 
 
-class _Parser(argparse.ArgumentParser):
+class _EscapingParser(argparse.ArgumentParser):
     """Read the command line; its error messages contain no control characters of file names."""
 
     def error(self, message: str) -> NoReturn:
@@ -247,9 +255,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def _parser() -> argparse.ArgumentParser:
+def _make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = _Parser(
+    parser = _EscapingParser(
         prog="python -m rigidjax",
         description="Differentiable rigid-body mechanics for JAX: identify inertia from data.",
         epilog="Try: python -m rigidjax identify --demo",
@@ -274,12 +282,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run_demo(options: argparse.Namespace) -> int:
-    """Run the demo, the fit of asteroid Toutatis, and return the exit code."""
+    """Run the demo, the fit of asteroid Toutatis, with the `options` of the command line, and
+    return the exit code.
+    """
     from rigidjax.datasets import toutatis
 
     print("4179 Toutatis, 17 radar observations, 2 to 18 December 1992")
     print(f"data: {toutatis.CITATION}\n")
-    fit = _fit(toutatis.model(), options, 16)
+    fit = _fit_or_print_error(toutatis.model(), options, 16)
     if fit is None:
         return 2
     more = toutatis.rows(fit)
@@ -290,12 +300,15 @@ def _run_demo(options: argparse.Namespace) -> int:
     print(rj.identify.report.verdict(fit))
     title = "4179 Toutatis, December 1992"
     units = {"time_unit": "day", "rate_unit": "deg/day"}
-    return _write(fit, options, title, [toutatis.CITATION], [title], units, more)
+    return _write_outputs(fit, options, title, [toutatis.CITATION], [title], units, more)
 
 
 def _channels_of_options(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Channel]:
-    """Return the sensors that the options describe, where `rates` are the names of the rate
-    columns.
+    """Return the sensors of a log that the command line describes.
+
+    - `options`: the options of the command line: `--sensor`, or else `--unit`, `--noise` and
+      `--limit` of one gyro.
+    - `rates`: the names of the three columns of the body rates, for this gyro.
     """
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
@@ -314,8 +327,8 @@ def _channels_of_options(options: argparse.Namespace, rates: Sequence[str]) -> l
 def _read_logs(
     options: argparse.Namespace,
 ) -> tuple[list[spec.Channel], list[rj.identify.Recording], rj.identify.Model]:
-    """Return three things: the sensors of the first log; the recordings of all logs; and the model
-    that the options describe.
+    """Read the logs that the `options` of the command line name. Return three things: the sensors
+    of the first log; the recordings of all logs; and the model that the options describe.
     """
     if options.columns and options.time:
         raise LogError("--time: not together with --columns, whose first name is the time column")
@@ -335,7 +348,7 @@ def _read_logs(
             dataclasses.replace(one, unit=spec.unit_of_channel(path, one))
             for one in _channels_of_options(options, rates)
         ]
-        _say_units(path, time, time_unit, channels)
+        _print_units(path, time, time_unit, channels)
         how |= dict(time=time, time_unit=time_unit, flight=options.flight)
         records.append(spec.read_log(path, channels, **how))
         of_first = of_first or channels
@@ -343,8 +356,14 @@ def _read_logs(
     return of_first or [], records, spec.model_of(records, options.model, **how)
 
 
-def _say_units(path: str, time: str, time_unit: str, channels: Sequence[spec.Channel]) -> None:
-    """Print the units that were taken from the names of the columns of a log."""
+def _print_units(path: str, time: str, time_unit: str, channels: Sequence[spec.Channel]) -> None:
+    """Print which units were taken from the names of the columns of a log, if any.
+
+    - `path`: the path of the log.
+    - `time`: the name of the time column.
+    - `time_unit`: the unit of the times.
+    - `channels`: the sensors of the log, with their columns and units.
+    """
     units = [("time", (time,), time_unit)] + [(one.kind, one.columns, one.unit) for one in channels]
     words = [f"{what} in {unit}" for what, names, unit in units if unit_in(names[0], [unit or ""])]
     if words:
@@ -352,8 +371,10 @@ def _say_units(path: str, time: str, time_unit: str, channels: Sequence[spec.Cha
 
 
 @contextlib.contextmanager
-def _log_warnings(strict: bool) -> Iterator[None]:
-    """Print each warning of a log in one line or, if `strict`, raise the first warning."""
+def _warnings_as_lines(strict: bool) -> Iterator[None]:
+    """Print each warning about a log in one line, within a `with` block; if `strict` is true, raise
+    the first of these warnings as an error.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("error" if strict else "always", LogWarning)
         usual = warnings.showwarning
@@ -371,9 +392,11 @@ def _log_warnings(strict: bool) -> Iterator[None]:
 
 
 def _run_logs(options: argparse.Namespace) -> int:
-    """Run the fit of the logs that the options name, print the report, and return the exit code."""
+    """Fit the model to the logs that the `options` of the command line name, print and write the
+    report, and return the exit code.
+    """
     try:
-        with _log_warnings(options.strict):
+        with _warnings_as_lines(options.strict):
             channels, records, model = _read_logs(options)
     except ValueError as error:
         return _print_error(error)
@@ -385,7 +408,7 @@ def _run_logs(options: argparse.Namespace) -> int:
         count, span = record.t.shape[0] + record.dropped, record.t[-1] - record.t[0]
         _print_line(f"{path}: {count} samples over {span:.4g} s{words}")
     print()
-    fit = _fit(model, options, 8)
+    fit = _fit_or_print_error(model, options, 8)
     if fit is None:
         return 2
     of_gyros = (c.unit for c in channels if c.kind == "gyro" and c.unit != "rpm")
@@ -399,16 +422,17 @@ def _run_logs(options: argparse.Namespace) -> int:
     print(rj.identify.report.verdict(fit))
     names = [_checks.escape_controls(Path(path).name) for path in options.logs]
     title = f"Identification of {', '.join(names[:3])}{' …' if names[3:] else ''}"
-    return _write(fit, options, title, names, names, {"rate_unit": rate_unit})
+    return _write_outputs(fit, options, title, names, names, {"rate_unit": rate_unit})
 
 
-def _fit(
+def _fit_or_print_error(
     model: rj.identify.Model, options: argparse.Namespace, starts: int
 ) -> rj.identify.Fit | None:
-    """Return the fit of the model from `starts` starts, or from the number of starts in the
-    options.
+    """Return the fit of the `model`, or `None` after an error whose message is printed.
 
-    After an error the message is printed, and the result is `None`.
+    - `options`: the options of the command line, which may name the number of starts and a
+      checkpoint file.
+    - `starts`: the number of starting points if the options do not name it.
     """
     try:
         return rj.identify.fit(
@@ -422,7 +446,7 @@ def _fit(
         return None
 
 
-def _write(
+def _write_outputs(
     fit: rj.identify.Fit,
     options: argparse.Namespace,
     title: str,
@@ -431,20 +455,29 @@ def _write(
     units: dict[str, str],
     more_rows: Sequence[tuple[str, float, float, float, str]] = (),
 ) -> int:
-    """Write the outputs that the options ask for, and return the exit code.
+    """Write the figure, the report and the numbers of a fit that the options ask for, and return
+    the exit code.
 
     An output that fails is reported, and all other outputs are still written.
 
-    **Arguments:** `fit` the result of the fit; `options` the options of the command line; `title`
-    the title of the report; `files_read` the files that were read; `names` the names of the
-    recordings; `units` the units of rates and times; `more_rows` rows of further quantities.
+    - `fit`: the result of the fit.
+    - `options`: the options of the command line.
+    - `title`: the title of the report.
+    - `files_read`: the names of the files that were read.
+    - `names`: the names of the recordings.
+    - `units`: the units of rates and times, by the names of the arguments `rate_unit` and
+      `time_unit`.
+    - `more_rows`: rows of further quantities: name, value, low and high end of the interval, and
+      unit.
     """
     report, figure = rj.identify.report, options.figure
-    if options.demo and figure is None and _matplotlib():
+    if options.demo and figure is None and _has_matplotlib():
         figure = Path("toutatis.png")
 
     def write_page() -> None:
-        figures = _figures(fit, names, units) if figure is not None or _matplotlib() else []
+        figures = (
+            _report_figures(fit, names, units) if figure is not None or _has_matplotlib() else []
+        )
         page: dict[str, Any] = {
             "title": title,
             "figures": figures,
@@ -477,8 +510,14 @@ def _write(
     return 2 if not all_written else 0 if fit.ok else 1
 
 
-def _figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str]) -> list[Any]:
-    """Return the figures of a report, without the figures whose drawing raises an error."""
+def _report_figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str]) -> list[Any]:
+    """Return the figures of a report, without the figures whose drawing raises an error.
+
+    - `fit`: the result of the fit.
+    - `names`: the names of the recordings; each of the first twelve has a figure.
+    - `units`: the units of rates and times, by the names of the arguments `rate_unit` and
+      `time_unit`.
+    """
     figures, plot = [], functools.partial(rj.plot.fit, fit, **units)
     logs = [functools.partial(plot, index=i, title=name) for i, name in enumerate(names[:12])]
     time_unit = units.get("time_unit", "s")
@@ -492,8 +531,10 @@ def _figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str]) -> l
     return figures
 
 
-def _matplotlib() -> bool:
-    """Return whether matplotlib is installed, and choose its backend without windows."""
+def _has_matplotlib() -> bool:
+    """Return whether matplotlib is installed, and set it to draw without windows; print a line if
+    it is missing.
+    """
     try:
         import matplotlib
     except ModuleNotFoundError:
@@ -504,7 +545,7 @@ def _matplotlib() -> bool:
 
 
 def _print_line(line: str) -> None:
-    """Print a line, with its control characters escaped."""
+    """Print the text `line`, with its control characters escaped."""
     try:
         print(_checks.escape_controls(line), flush=True)
     except OSError:

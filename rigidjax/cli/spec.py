@@ -114,7 +114,9 @@ def parse_channel(text: str) -> Channel:
 
 
 def _units_of_kind(kind: str) -> tuple[str, ...]:
-    """Return the allowed units of a kind of sensor, or an empty tuple for an unknown kind."""
+    """Return the allowed units of a kind of sensor, such as `gyro` or `euler-ZXZ`, the default unit
+    first; return an empty tuple for an unknown kind.
+    """
     key = "euler" if kind.startswith("euler-") else kind
     return () if kind == "euler" else SENSOR_UNITS.get(key, ())
 
@@ -218,7 +220,9 @@ def read_log(
 
 
 def _first_time(t: np.ndarray) -> float:
-    """Return the first time that is not missing (NaN), or zero if all times are missing."""
+    """Return the first of the times `t` (T,) that is not missing (NaN), or zero if all are
+    missing.
+    """
     finite = np.isfinite(t)
     return float(t[np.argmax(finite)]) if finite.any() else 0.0
 
@@ -241,8 +245,12 @@ def unit_of_time(path: str | Path, column: str, stated_unit: str | None) -> str:
 
 
 def _typical_rate(path: str | Path, channel: Channel, rates: np.ndarray) -> float:
-    """Return the median length of the rates (n, 3), rad/s, and raise `LogError` if all rates are
-    zero.
+    """Return the median length of the body rates, rad/s, and raise `LogError` if there are none or
+    all are zero.
+
+    - `path`: the path of the log, for the message.
+    - `channel`: the gyro, with the names of its columns, for the message.
+    - `rates`: (n, 3) the rates.
     """
     names = ", ".join(channel.columns)
     if not rates.size:
@@ -257,14 +265,17 @@ def _typical_rate(path: str | Path, channel: Channel, rates: np.ndarray) -> floa
 
 
 def _sensor_and_readings(
-    channel: Channel, values: np.ndarray, factor: float, bias: bool
+    channel: Channel, values: np.ndarray, factor: float, has_bias: bool
 ) -> tuple[AbstractSensor, np.ndarray]:
-    """Return the sensor that a channel describes, and its readings.
+    """Return two things: the sensor that a channel of a log describes; and its readings (T, 3), for
+    attitudes quaternions (T, 4).
 
-    **Arguments:** `channel` the channel; `values` (T, columns) the values of its columns, in SI;
-    `factor` the factor from the unit of the channel to SI; `bias` whether the sensor gets a bias.
+    - `channel`: the kind, the columns, the noise and the limit of the sensor.
+    - `values`: (T, columns) the values of its columns, in SI units.
+    - `factor`: the factor from the unit of the channel to SI.
+    - `has_bias`: whether the sensor gets a bias, initially zero, which a fit can estimate.
     """
-    zero = [0.0, 0.0, 0.0] if bias else None
+    zero = [0.0, 0.0, 0.0] if has_bias else None
     noise = None if channel.noise is None else factor * np.array(channel.noise)
     limit = None if channel.limit is None else channel.limit * factor
     if channel.kind == "gyro":
@@ -287,12 +298,15 @@ def input_names(wheels: Sequence[WheelColumn]) -> list[str]:
     return [f"wheel {i + 1}" if len(wheels) > 1 else "wheel" for i in range(len(wheels))]
 
 
-def _evenly_spaced(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays, the times and values of an evenly spaced series in which missing rows are
-    interpolated.
+def _fill_missing_rows(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two arrays: the times; and the values of an evenly spaced series in which missing rows
+    are interpolated.
 
-    If a time differs from an even spacing by more than a thousandth of a step, the times t and the
-    `values` are returned unchanged.
+    If a time differs from an even spacing by more than a thousandth of a step, both arrays are
+    returned unchanged.
+
+    - `t`: (T,) increasing times, s.
+    - `values`: (T,) the values at these times.
     """
     step = np.median(np.diff(t)) if t.size > 1 else np.nan
     place = (t - t[:1]) / step
@@ -310,7 +324,14 @@ def _evenly_spaced(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
 def _logged_speeds(
     path: str | Path, t: np.ndarray, table: dict[str, np.ndarray], wheels: Sequence[WheelColumn]
 ) -> dict[str, Series]:
-    """Return the logged speed of each wheel, rad/s, by the name of its input."""
+    """Return the logged speed of each wheel as a series in time, rad/s, by the name of its input
+    (`input_names`).
+
+    - `path`: the path of the log, for messages.
+    - `t`: (T,) the times, s.
+    - `table`: the columns of the log, by name.
+    - `wheels`: the wheels, with the column and the unit of their speeds.
+    """
     speeds = {}
     # Speeds outside of the window are kept as well, since a delayed speed is from a time before the
     # reading.
@@ -319,16 +340,20 @@ def _logged_speeds(
         unit = unit_of([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
         try:
             samples = table[one.column][kept] * UNITS[unit]
-            speeds[name] = Series(*_evenly_spaced(t[kept], samples))
+            speeds[name] = Series(*_fill_missing_rows(t[kept], samples))
         except ValueError as error:
             raise LogError(f"{path}: column {one.column!r}: {error}") from None
     return speeds
 
 
-def _torque_of_wheels(wheels: Sequence[WheelColumn], free: Sequence[str]) -> Torque | None:
-    """Return the torque of the wheels and, if `free` contains "drag", of a linear drag.
+def _torque_of_options(wheels: Sequence[WheelColumn], free: Sequence[str]) -> Torque | None:
+    """Return the torque on the body: that of the wheels and, if `free` contains "drag", a linear
+    drag.
 
     Without wheels and drag it returns `None`.
+
+    - `wheels`: the wheels whose speeds were logged.
+    - `free`: some of `bias`, `drag`, `delay`; for `delay` each wheel gets a delay, initially zero.
     """
     delay = 0.0 if "delay" in free else None
     parts: list[Torque] = [
@@ -367,23 +392,26 @@ def model_of(
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {chart!r}")
     if loss not in LOSSES:
         raise LogError(f"loss: wanted one of {', '.join(LOSSES)}, got {loss!r}")
-    moving = _declared_free_numbers(recordings[0].sensors, input_names(wheels), typical, free)
+    moving = _free_numbers_of_options(recordings[0].sensors, input_names(wheels), typical, free)
     return Model(
         list(recordings),
         MODELS[chart](typical),
-        torque=_torque_of_wheels(wheels, free),
+        torque=_torque_of_options(wheels, free),
         free=moving,
         loss=LOSSES[loss],
     )
 
 
-def _declared_free_numbers(
+def _free_numbers_of_options(
     sensors: Sequence[AbstractSensor], wheels: Sequence[str], typical: float, free: Sequence[str]
 ) -> list[Free]:
-    """Return the `Free` of each free number of the sensors, and of the torque that
-    `_torque_of_wheels` returns.
+    """Return the free numbers of a fit beyond the body and its motion: biases and places of
+    sensors, the drag, and the delays of wheels.
 
-    `wheels` are the names of the inputs of the wheels.
+    - `sensors`: the sensors of one recording.
+    - `wheels`: the names of the inputs that hold the speeds of the wheels.
+    - `typical`: the typical size of a moment of inertia, kg m².
+    - `free`: some of `bias`, `drag`, `delay`, the numbers that the command line makes free.
     """
 
     def of_sensor(index: int, name: str) -> Callable[[Scene], Any]:

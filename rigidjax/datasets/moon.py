@@ -44,9 +44,8 @@ class Moon(eqx.Module):
     """Hold some years of the ephemeris, as functions of the time, s, since the start of `first`.
 
     **Arguments:** `first`, `last` Julian years, such as 1970.0 and 1976.0; 2000.0 is the Julian
-    date
-    2451545.0. The tables begin at least ten days before `first` and end at least ten days after
-    `last`.
+    date 2451545.0. The tables begin at least ten days before `first` and end at least ten days
+    after `last`.
 
     **Fields:** `earth`, `sun` Chebyshev tables of the positions of Earth and Sun relative to the
     Moon, m, ICRF; `angles` a Chebyshev table of the 3-1-3 Euler angles (φ, θ, ψ) of the Moon, rad,
@@ -79,8 +78,11 @@ class Moon(eqx.Module):
             raise ValueError(f"Moon: wanted years in order in 1900 to 2199, got {first}, {last}")
 
         def table(name: str, step: int) -> np.ndarray:
-            """Return the Chebyshev coefficients of the table `name`, on intervals of `step`
-            days.
+            """Return the Chebyshev coefficients (intervals, 3, terms) of one table of the
+            ephemeris, in the years of this object.
+
+            - `name`: the name of the table in the file names of DE421, such as `moon`.
+            - `step`: the length of an interval of the result, days; longer intervals are divided.
             """
             rows = np.load(Path(spec.origin or "").parent / f"jpl-{name}.npy", mmap_mode="r")
             a_block = len(rows) // _BLOCKS
@@ -114,8 +116,7 @@ class Moon(eqx.Module):
         """Return the inertia of the Moon, kg m², with the oblateness J2 of DE421.
 
         **Arguments:** `beta` β = (C − A)/B and `gamma` γ = (B − A)/C, with the principal moments A
-        ≤
-        B ≤ C; by default the values of DE421. With `core` the result is the inertia of the mantle
+        ≤ B ≤ C; by default the values of DE421. With `core` the result is the inertia of the mantle
         alone, for use with `torque(core=True)`.
         """
         c = self.constants
@@ -124,11 +125,11 @@ class Moon(eqx.Module):
         largest = self._mass * self._radius**2 * c["J2M"] * 2 * (1 + b) / (2 * b - g + b * g)
         ones = jnp.stack([(1 - b * g) / (1 + b), (1 + g) / (1 + b), jnp.ones_like(b)])
         whole = Inertia(largest * jnp.diag(ones))
-        return whole - self._core if core else whole
+        return whole - self._core_inertia if core else whole
 
     def chart(self, *, core: bool = False) -> AbstractBodyChart:
         """Return the chart of `body` for a fit, in which β and γ are the free parameters."""
-        return _Shape(self, core)
+        return _BetaGammaChart(self, core)
 
     def torque(
         self, degree: int = 4, *, tide: bool = False, core: bool = False, figure: bool = False
@@ -136,14 +137,12 @@ class Moon(eqx.Module):
         """Return the torque of Earth and Sun on the Moon.
 
         **Arguments:** `degree` the highest degree of the Moon's gravity field that the Earth acts
-        on, 2 to
-        4; `tide` whether
-        the Earth and the spin deform the Moon; `core` whether a liquid core turns in the mantle;
-        `figure` whether the Earth is oblate. DE421 gives the
-        core's angular velocity at `EPOCH`; the initial value, at `first`, is integrated from
-        `EPOCH` with the mantle moving as in the ephemeris. **Raises:** `ValueError` for a core in
-        float32 (unless `first` is `EPOCH`): a time of decades, in s, has rounding errors of minutes
-        in float32.
+        on, 2 to 4; `tide` whether the Earth and the spin deform the Moon; `core` whether a liquid
+        core turns in the mantle; `figure` whether the Earth is oblate. DE421 gives the core's
+        angular velocity at `EPOCH`; the initial value, at `first`, is integrated from `EPOCH` with
+        the mantle moving as in the ephemeris. **Raises:** `ValueError` for a core in float32
+        (unless `first` is `EPOCH`): a time of decades, in s, has rounding errors of minutes in
+        float32.
         """
         c = self.constants
         rows = []
@@ -158,13 +157,13 @@ class Moon(eqx.Module):
             few, radius = -0.5 * c["J2E"] * self._mu_earth, 1e3 * c["AE"]
             earths = [(self._mu_earth - 2 * few, 0.0), (few, radius), (few, -radius)]
         law: Any = Sum(
-            *(GravityGradient(mu, _add_to_z(self.earth, z), rows) for mu, z in earths),
-            GravityGradient(c["GMS"] * self._in_si, self.sun),
+            *(GravityGradient(mu, _shift_along_z(self.earth, z), rows) for mu, z in earths),
+            GravityGradient(c["GMS"] * self._si_per_au3_day2, self.sun),
         )
         if core:
             rate = jnp.array([c["OMGCX"], c["OMGCY"], c["OMGCZ"]]) / DAY
             friction = c["KVC"] / DAY * self.body().tensor[2, 2]
-            law = _Core(rate, self._core.tensor, friction, law)
+            law = _LiquidCore(rate, self._core_inertia.tensor, friction, law)
             if self.first != EPOCH:
                 law = eqx.tree_at(lambda core: core.state0, law, _core_velocity_at(law, self.first))
         if tide:
@@ -174,35 +173,46 @@ class Moon(eqx.Module):
         return law
 
     @property
-    def _core(self) -> Inertia:
-        """Return the inertia of the core: flattened, with a fraction of the Moon's largest
-        moment.
+    def _core_inertia(self) -> Inertia:
+        """Return the inertia of the liquid core, kg m²: flattened, with a fraction of the Moon's
+        largest moment, both from DE421.
         """
         c = self.constants
         share, flat = c["IFAC"] * self.body().tensor[2, 2], 1 - c["COBLAT"]
         return Inertia(share * jnp.diag(jnp.array([flat, flat, 1.0])))
 
     @property
-    def _in_si(self) -> float:
-        """Return the number of m³/s² in one au³/day²."""
+    def _si_per_au3_day2(self) -> float:
+        """Return the number of m³/s² in one au³/day², the unit of the gravitational parameters of
+        DE421.
+        """
         return (1e3 * self.constants["AU"]) ** 3 / DAY**2
 
     @property
     def _mu_earth(self) -> float:
+        """Return the gravitational parameter G m of the Earth, m³/s²."""
         c = self.constants
-        return self._in_si * c["GMB"] * c["EMRAT"] / (1 + c["EMRAT"])
+        return self._si_per_au3_day2 * c["GMB"] * c["EMRAT"] / (1 + c["EMRAT"])
 
     @property
     def _mass(self) -> float:
+        """Return the mass of the Moon, kg."""
         return self._mu_earth / self.constants["EMRAT"] / _G
 
     @property
     def _radius(self) -> float:
+        """Return the radius of the Moon, m, to which its gravity field refers."""
         return 1e3 * self.constants["AM"]
 
 
-class _Shape(AbstractBodyChart):
-    """Describe β and γ by 1000 log(β/β*) and 1000 log(γ/γ*), where β* and γ* are DE421's values."""
+class _BetaGammaChart(AbstractBodyChart):
+    """Describe the inertia of the Moon by two free numbers, 1000 log(β/β*) and 1000 log(γ/γ*), for
+    a fit.
+
+    Here β = (C − A)/B and γ = (B − A)/C for the principal moments A ≤ B ≤ C, and β*, γ* are the
+    values of DE421. **Fields:** `moon` the ephemeris with the constants; `core` whether the inertia
+    is that of the mantle alone, without a liquid core.
+    """
 
     size: ClassVar[int] = 2
     log_names: ClassVar[tuple[str, ...]] = ("β", "γ")
@@ -210,29 +220,33 @@ class _Shape(AbstractBodyChart):
     core: bool = eqx.field(static=True)
 
     def body(self, vector: Array) -> Inertia:
-        beta, gamma = jnp.exp(1e-3 * vector + self._known)
+        beta, gamma = jnp.exp(1e-3 * vector + self._log_of_known)
         return self.moon.body(beta, gamma, core=self.core)
 
     def vector(self, body: Inertia) -> Array:
-        return 1e3 * (self.logs(body) - self._known)
+        return 1e3 * (self.logs(body) - self._log_of_known)
 
     def logs(self, body: Inertia) -> Array:
-        tensor = body.tensor + self.moon._core.tensor if self.core else body.tensor
+        tensor = body.tensor + self.moon._core_inertia.tensor if self.core else body.tensor
         a, b, c = (tensor[i, i] for i in range(3))
         return jnp.log(jnp.stack([(c - a) / b, (b - a) / c]))
 
     @property
-    def _known(self) -> Array:
+    def _log_of_known(self) -> Array:
+        """Return the logarithms (2,) of the values β* and γ* of DE421."""
         return jnp.log(jnp.array([self.moon.constants[name] for name in ("LBET", "LGAM")]))
 
 
-class _Core(eqx.Module):
+class _LiquidCore(eqx.Module):
     """Describe the torque on the mantle of the Moon, with a liquid core inside.
 
     The core acts on the mantle by friction at the boundary and by the flattening of the boundary.
-    The state of this torque is the angular velocity of the core (3,), rad/s, mantle frame. Source:
-    Folkner and others 2014 (DE430), section III; Williams and others 2001, Lunar rotational
-    dissipation in solid body and molten core, JGR 106:27933.
+    The state of this torque, `own` in its methods, is the angular velocity of the core (3,), rad/s,
+    mantle frame. **Fields:** `state0` (3,) the initial angular velocity of the core; `tensor` (3,
+    3) the inertia of the core, kg m²; `friction` the torque per difference of the angular
+    velocities, N m s; `gravity` the torque of Earth and Sun on the whole Moon. Source: Folkner and
+    others 2014 (DE430), section III; Williams and others 2001, Lunar rotational dissipation in
+    solid body and molten core, JGR 106:27933.
     """
 
     feels: ClassVar[type] = HasAttitude
@@ -256,22 +270,27 @@ class _Core(eqx.Module):
         return evaluate(self.gravity, t, state, whole) + self.on_mantle(state, own)
 
 
-class _AlongEphemeris(eqx.Module):
-    """Evaluate the time derivative of the core's angular velocity, with the mantle as in the
-    ephemeris.
+class _CoreAcceleration(eqx.Module):
+    """Evaluate the time derivative (3,), rad/s², of the core's angular velocity, while the mantle
+    moves as in the ephemeris.
+
+    It is a vector field (t, own, args) with the time t, s, and the angular velocity `own` (3,),
+    rad/s, mantle frame. **Fields:** `core` the torque of the core; `moon` the ephemeris.
     """
 
-    core: _Core
+    core: _LiquidCore
     moon: Moon
 
     def __call__(self, t: ScalarLike, own: Array, args: object = None) -> Array:
         return self.core.rate(t, own, self.moon.attitude(t), self.moon.body(core=True))
 
 
-def _core_velocity_at(core: _Core, year: float) -> Float[Array, "3"]:
-    """Return the angular velocity (3,) of the core at a Julian `year`, rad/s, mantle frame.
+def _core_velocity_at(core: _LiquidCore, year: float) -> Float[Array, "3"]:
+    """Return the angular velocity (3,) of the Moon's liquid core at a given `year`, rad/s, mantle
+    frame.
 
-    It is integrated from `core.state0` at `EPOCH`.
+    It is integrated from `core.state0` at `EPOCH`, while the mantle moves as in the ephemeris.
+    `core` is the torque of the core; `year` is a Julian year, such as 1990.5.
     """
     if core.state0.dtype != jnp.float64:
         raise ValueError(
@@ -280,13 +299,20 @@ def _core_velocity_at(core: _Core, year: float) -> Float[Array, "3"]:
         )
     between = Moon(min(year, EPOCH), max(year, EPOCH))
     begin, end = (365.25 * DAY * (at - between.first) for at in (EPOCH, year))
-    return _integrate_core(_AlongEphemeris(core, between), core.state0, jnp.array([begin, end]))
+    return _integrate_core(_CoreAcceleration(core, between), core.state0, jnp.array([begin, end]))
 
 
 @eqx.filter_jit
 def _integrate_core(
-    field: _AlongEphemeris, own: Array, ends: Float[Array, "2"]
+    field: _CoreAcceleration, own: Array, ends: Float[Array, "2"]
 ) -> Float[Array, "3"]:
+    """Return the angular velocity (3,) of the Moon's liquid core at the last time, rad/s, mantle
+    frame.
+
+    - `field`: the time derivative of the angular velocity, with the mantle as in the ephemeris.
+    - `own`: (3,) the angular velocity at the first time.
+    - `ends`: (2,) the first and the last time, s; the last may be earlier.
+    """
     steps = dfx.PIDController(rtol=1e-12, atol=1e-12 * jnp.max(jnp.abs(own)))
     first = jnp.sign(ends[1] - ends[0]) * jnp.minimum(DAY, jnp.abs(ends[1] - ends[0]))
     solution = dfx.diffeqsolve(
@@ -296,16 +322,20 @@ def _integrate_core(
     return solution.ys[0]  # pyright: ignore[reportOptionalSubscript]
 
 
-def _add_to_z(table: Chebyshev, z: float) -> Chebyshev:
-    """Return the Chebyshev `table` of positions, with `z` added to the third component."""
+def _shift_along_z(table: Chebyshev, z: float) -> Chebyshev:
+    """Return a Chebyshev `table` of positions (3,), m, with the length `z`, m, added to the third
+    component of each position.
+    """
     moved = table.coefficients.at[:, 2, 0].add(z)
     return eqx.tree_at(lambda t: t.coefficients, table, moved)
 
 
 def _subdivide_polynomials(rows: np.ndarray, parts: int) -> np.ndarray:
-    """Return the Chebyshev polynomials `rows` (intervals, k, terms) on shorter intervals.
+    """Return Chebyshev coefficients on shorter intervals: each interval is divided into equal
+    parts, and the functions do not change.
 
-    Each interval is divided into `parts` equal intervals; the polynomials do not change.
+    - `rows`: (intervals, k, terms) the coefficients of k functions on each interval.
+    - `parts`: the number of parts of each interval. The result is (intervals · parts, k, terms).
     """
     count, k, terms = rows.shape
     if parts == 1:

@@ -92,14 +92,20 @@ def model() -> Model:
 
 
 @jax.jit
-def _periods(body: Inertia, state: Attitude) -> Array:
+def _log_periods(body: Inertia, state: Attitude) -> Array:
+    """Return the logarithms (2,) of the rotation period and the precession period, days, of a free
+    `body` with the initial `state`.
+    """
     turning = exact.body_period(body, state.omega)
     precessing = exact.precession_period(body, state.omega)
     return jnp.log(jnp.stack([turning, precessing]) / DAY)
 
 
 @jax.jit
-def _direction(body: Inertia, state: Attitude) -> Array:
+def _momentum_direction(body: Inertia, state: Attitude) -> Array:
+    """Return the longitude and latitude (2,), rad, of the angular momentum of a `body` with the
+    given `state`, in world axes.
+    """
     momentum = spatial_angular_momentum(body, state)
     flat = jnp.hypot(momentum[0], momentum[1])
     return jnp.stack([jnp.arctan2(momentum[1], momentum[0]), jnp.arctan2(momentum[2], flat)])
@@ -109,8 +115,7 @@ def rows(fit: Fit) -> list[Row]:
     """Return the periods and the direction of the angular momentum as rows for `report.table`.
 
     **Arguments:** `fit` of `model()`. **Returns** rows (name, value, low, high, unit), where low
-    and
-    high are the ends of the 95 % interval: two periods, days, and the ecliptic longitude and
+    and high are the ends of the 95 % interval: two periods, days, and the ecliptic longitude and
     latitude (J2000) of the angular momentum, degrees.
     """
 
@@ -126,9 +131,9 @@ def rows(fit: Fit) -> list[Row]:
         return zip(names, *numbers, strict=True)
 
     names = ("rotation about the long axis", "precession of the long axis")
-    out: list[Row] = [(*row, "day") for row in rows_of_quantities(_periods, names, np.exp)]
+    out: list[Row] = [(*row, "day") for row in rows_of_quantities(_log_periods, names, np.exp)]
     names = ("angular momentum, longitude", "angular momentum, latitude")
-    for name, *numbers in rows_of_quantities(_direction, names, np.degrees):
+    for name, *numbers in rows_of_quantities(_momentum_direction, names, np.degrees):
         turn = 360.0 if "longitude" in name and numbers[0] < 0 else 0.0
         out.append((name, *(number + turn for number in numbers), "deg, ecliptic J2000"))
     return out

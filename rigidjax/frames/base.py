@@ -22,8 +22,8 @@ class AbstractScene(eqx.Module):
     is the term of the scene in plain diffrax. A scene that ends a run, for example at a collision,
     has two more methods: `ends(t, state)`, true at the end, and `end_words(t, state)`, the reason.
     Under `jit` the state is traced, so that the reason cannot contain its numbers. `stats` of the
-    solution then has `ended`, `end_time`
-    and `end_state`. Only scenes of a particle can end a run in this way.
+    solution then has `ended`, `end_time` and `end_state`. Only scenes of a particle can end a run
+    in this way.
 
     >>> class Spring(AbstractScene):
     ...     def acceleration(self, t, state):
@@ -52,7 +52,6 @@ class AbstractScene(eqx.Module):
         """Return, by name, the largest change of each conserved quantity from its first value.
 
         **Arguments:** `ts` (T,) times, s; `ys` the states at these times, with a leading axis T.
-
 
         >>> still = Point(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
         >>> float(rj.scenes.earth(0.8).drift(jnp.arange(2.0), still)["jacobi"])

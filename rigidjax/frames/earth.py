@@ -55,8 +55,7 @@ class Earth(AbstractScene):
     def jacobi_integral(self, state: Point) -> Scalar:
         """Return the Jacobi integral ½|v'|² + g z − ½|Ω × x'|², m²/s², conserved along the motion.
 
-        Here x' and v' are the position and velocity of `state`, z is the height, and g
-        `gravity`.
+        Here x' and v' are the position and velocity of `state`, z is the height, and g `gravity`.
         """
         require_point(state)
         x, v = components(state.x), components(state.v)
@@ -88,8 +87,7 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
     **Arguments:** `latitude` λ, rad, geodetic, north positive; `gravity` along the plumb line,
     m/s²; `rate` Ω of the Earth, rad/s (WGS84: 7.292115e-5, one turn in 86164.1 s). States are
     `Point(x, v)`: position and velocity in the axes east, north, up, from that place. **Raises:**
-    `ValueError` for a latitude beyond
-    a right angle (degrees?) or gravity that is not positive.
+    `ValueError` for a latitude beyond a right angle (degrees?) or gravity that is not positive.
 
     >>> earth(0.5).acceleration(0.0, Point([0.0, 0, 0], [0.0, 0, 0])).tolist()
     [0.0, 0.0, -9.80665]
@@ -151,7 +149,6 @@ class Foucault(AbstractScene):
         `east_speed`, `north_speed` the horizontal velocity, m/s. The height and the vertical
         velocity follow from the constant length.
 
-
         >>> foucault(0.5, 10.0).state(6.0, 0.0, 4.0, 0.0).v.tolist()
         [4.0, 0.0, 3.0]
         """
@@ -167,11 +164,9 @@ class Foucault(AbstractScene):
         """Return the state of the bob at time `t`, s, in closed form, for small swings.
 
         The complex number s = east + i north obeys s'' + 2iΩ_z s' + ω₀² s = 0, with Ω_z = Ω sin λ
-        and
-        ω₀² = g/L for a string of length L. The solution is s = e^{−iΩ_z t} (A cos ωt + B sin ωt)
-        with
-        ω² = ω₀² + Ω_z²; the initial state gives A and B (Landau and Lifshitz,
-        Mechanics, sec. 39, problem 3). Its error is of the order of (amplitude/length)².
+        and ω₀² = g/L for a string of length L. The solution is s = e^{−iΩ_z t} (A cos ωt + B sin
+        ωt) with ω² = ω₀² + Ω_z²; the initial state gives A and B (Landau and Lifshitz, Mechanics,
+        sec. 39, problem 3). Its error is of the order of (amplitude/length)².
 
         **Arguments:** `state` the state at t = 0. **Returns** a `Point` at the height of the lowest
         place.
@@ -217,9 +212,9 @@ def foucault(
 
     **Arguments:** `latitude` λ, rad, north positive; `length` of the string, m; `gravity` m/s²,
     along the plumb line; `rate` of the Earth, rad/s (WGS84 by default). All arguments may be
-    traced: `latitude` and `rate`, for example, can be fitted to measurements.
-    **Raises:** `ValueError` for a length or gravity that is not positive, or for a latitude beyond
-    a right angle (degrees?).
+    traced: `latitude` and `rate`, for example, can be fitted to measurements. **Raises:**
+    `ValueError` for a length or gravity that is not positive, or for a latitude beyond a right
+    angle (degrees?).
 
     >>> pendulum = foucault(0.85, 67.0)
     >>> pendulum.start(3.0, 0.0).v.tolist()

@@ -80,8 +80,10 @@ class InFrame(AbstractScene):
 
 
 def scene_of_force(force: object) -> AbstractScene:
-    """Return the scene that `simulate` solves for `force`: a scene, a moving frame or a plain
-    force.
+    """Return the scene that `simulate` solves for the motion of a particle under `force`.
+
+    `force` is a scene, which is returned unchanged; a `MovingFrame`, in which the particle moves
+    freely; a force per mass `(t, state, body) → (3,)`, m/s²; or `None` for a free particle.
     """
     if isinstance(force, AbstractScene):
         return force
@@ -110,11 +112,10 @@ class BodyInFrame(eqx.Module):
     """Give the inertial torque, and for `Rigid` the inertial force, on a body in a moving frame S'.
 
     Pass this to `simulate` as the torque of an `Attitude` or `Rigid` state in S'. Such a state has
-    q',
-    body → S', with the matrix Q'; Ω', the rate relative to S', in body axes; a `Rigid` state also
-    has x' and v', the position and velocity of the centre of mass in S'. The absolute rate is Ω_abs
-    = Ω' + W, where W = Q'ᵀ Ω is the rate Ω of the frame in body axes. It obeys I dΩ_abs/dt = IΩ_abs
-    × Ω_abs + τ, with the inertia I and the real torque τ. Hence the equation of Ω' is
+    q', body → S', with the matrix Q'; Ω', the rate relative to S', in body axes; a `Rigid` state
+    also has x' and v', the position and velocity of the centre of mass in S'. The absolute rate is
+    Ω_abs = Ω' + W, where W = Q'ᵀ Ω is the rate Ω of the frame in body axes. It obeys I dΩ_abs/dt =
+    IΩ_abs × Ω_abs + τ, with the inertia I and the real torque τ. Hence the equation of Ω' is
 
     I dΩ'/dt = IΩ' × Ω' + [τ + IΩ_abs × Ω_abs − IΩ' × Ω' − I(Q'ᵀ dΩ/dt − Ω' × W)],
 
@@ -122,9 +123,8 @@ class BodyInFrame(eqx.Module):
     S'; `torque` the real torque τ, `(t, state in S', body) → (3,)`, N m, body axes; or a model that
     returns a `Wrench`, whose force is in the axes of S'; or `None`. `simulate` refuses torques that
     need the absolute rate (wheels, `ChangingInertia`), both as this `torque` and in a sum with a
-    `BodyInFrame`.
-    Source: notes, eqs 50, 91, for a body instead of a point. **Raises:** `TypeError` for a
-    force on a state that has no position.
+    `BodyInFrame`. Source: notes, eqs 50, 91, for a body instead of a point. **Raises:** `TypeError`
+    for a force on a state that has no position.
 
     >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
     >>> still = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, -1.0])

@@ -34,7 +34,7 @@ class Instant(eqx.Module):
 
     def to_inertial(self, state: PyTree) -> Any:
         """Return `state`, which is given in S', transformed to S (notes, eqs 85, 88)."""
-        _can_travel(state)
+        _require_transformable(state)
         turned = {}
         if hasattr(state, "x"):
             x, rate = state.x, self.rate.astype(state.x.dtype)
@@ -50,7 +50,7 @@ class Instant(eqx.Module):
 
     def from_inertial(self, state: PyTree) -> Any:
         """Return `state`, which is given in S, transformed to S' (notes, eqs 86, 88)."""
-        _can_travel(state)
+        _require_transformable(state)
         turned = {}
         if hasattr(state, "x"):
             dtype = state.x.dtype
@@ -111,7 +111,10 @@ class Instant(eqx.Module):
         return turning + self.translation().astype(x.dtype)
 
 
-def _can_travel(state: PyTree) -> None:
+def _require_transformable(state: PyTree) -> None:
+    """Raise an error unless `state` is one state that can be transformed between frames: with `x`
+    (3,) and `v` (3,), with `q` (4,) and `omega` (3,), or with all four fields.
+    """
     point = hasattr(state, "x") and hasattr(state, "v")
     attitude = hasattr(state, "q") and hasattr(state, "omega")
     if not (point or attitude):
@@ -128,5 +131,8 @@ def _can_travel(state: PyTree) -> None:
 
 
 def _replace_fields(state: PyTree, fields: dict[str, Any]) -> Any:
+    """Return a copy of `state` in which the fields with the names in `fields` have the values in
+    `fields`.
+    """
     names = list(fields)
     return eqx.tree_at(lambda s: [getattr(s, n) for n in names], state, [fields[n] for n in names])

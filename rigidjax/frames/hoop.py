@@ -20,8 +20,7 @@ class Hoop(AbstractScene):
     `scenes.hoop` makes this scene.
 
     The axes turn with the hoop: x is in the plane of the hoop, y across this plane, z up; the
-    centre of the hoop is the origin. **Fields:**
-    `radius` m, `rate` rad/s, `gravity` m/s².
+    centre of the hoop is the origin. **Fields:** `radius` m, `rate` rad/s, `gravity` m/s².
 
     >>> scene = hoop(2.0, 0.0)
     >>> float(scene.radius), float(scene.gravity)
@@ -97,8 +96,7 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
 
     **Arguments:** `radius` R, m; `rate` Ω, rad/s; `gravity` m/s². Source: Goldstein, Mechanics,
     sec. 2.7 (θ'' = sin θ (Ω² cos θ − g/R) for the angle θ from the lowest place); notes, eq 91.
-    **Raises:** `ValueError` for a radius
-    that is not positive.
+    **Raises:** `ValueError` for a radius that is not positive.
 
     >>> hoop(1.0, 5.0).acceleration(0.0, Point([0.0, 0, -1], [0.0, 0, 0])).tolist()
     [0.0, 0.0, 0.0]
@@ -108,9 +106,10 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
     return Hoop(r, _checks.require_finite(w, "rate"), _checks.require_finite(g, "gravity"))
 
 
-class _Angle(eqx.Module):
-    """Compute the angle Ωt + ½αt², rad, at time t, s; Ω is `rate`, rad/s, and α `growth`,
-    rad/s².
+class _QuadraticAngle(eqx.Module):
+    """Compute the angle Ωt + ½αt², rad, of a uniformly accelerated turn at time t, s.
+
+    **Fields:** `rate` Ω at t = 0, rad/s; `growth` α = dΩ/dt, rad/s².
     """
 
     rate: Scalar
@@ -133,4 +132,4 @@ def turntable(rate: ScalarLike, growth: ScalarLike = 0.0) -> InFrame:
     rate = _checks.require_finite(_checks.array_of_shape(rate, (), "rate"), "rate")
     growth = _checks.require_finite(_checks.array_of_shape(growth, (), "growth"), "growth")
     up = jnp.eye(3, dtype=rate.dtype)[2]
-    return InFrame(MovingFrame(AboutAxis(up, _Angle(rate, growth))))
+    return InFrame(MovingFrame(AboutAxis(up, _QuadraticAngle(rate, growth))))

@@ -34,13 +34,11 @@ class OrbitalGravityGradient(eqx.Module):
 
 def libration(rate: ScalarLike) -> BodyInFrame:
     """Return the gravity-gradient torque on a body in a circular orbit, for `simulate` with
-    `Attitude`
-    states relative to the orbital frame.
+    `Attitude` states relative to the orbital frame.
 
     The orbital frame has x away from the planet, y along the motion and z along the orbit's normal;
     the frame turns at the rate n about z. `q` takes body axes to the orbital frame; `omega` is the
-    rate
-    relative to this frame, in body axes.
+    rate relative to this frame, in body axes.
 
     **Arguments:** `rate` n of the orbit, rad/s. Small librations in the orbital plane of a body
     with moments (a, b, c) about (x, y, z) have the rate n √(3 (b − a)/c). Source: Hughes 1986,

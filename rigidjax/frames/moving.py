@@ -30,9 +30,8 @@ class MovingFrame(eqx.Module):
     - `origin`: a function of the time that returns the origin X (3,) of S', m, axes of S; `None` if
       the origins of S and S' coincide.
     - `rate`: a function of the time that returns the angular velocity Ω (3,), rad/s, **axes of
-      S'**;
-      if it is `None`, Ω = vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation. dΩ/dt always
-      comes from automatic differentiation.
+      S'**; if it is `None`, Ω = vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation. dΩ/dt
+      always comes from automatic differentiation.
 
     The numbers of a frame may be traced: motions in the frame can be differentiated with respect to
     them. **Raises:** `TypeError` for a `rotation` that cannot be called; `ValueError`, when the
@@ -160,8 +159,7 @@ class MovingFrame(eqx.Module):
         corrected).
 
         d²x'/dt² = f − Ω×(Ω×x') − 2Ω×v' − dΩ/dt×x' − Mᵀ d²X/dt². (The notes have no moving origin,
-        and
-        eq 91 prints one more x'' inside its bracket, a slip: see eq 90.)
+        and eq 91 prints one more x'' inside its bracket, a slip: see eq 90.)
 
         **Arguments:** `x`, `v` (3,) position x' and velocity v' in S', m and m/s; `t` the time, s;
         `force` the force per mass f = MᵀF (3,), m/s², **axes of S'** (`force_from_inertial` makes f
@@ -220,7 +218,7 @@ class MovingFrame(eqx.Module):
         >>> half.compose(half).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
-        both = _Composed(self, require_frame(inner, "inner"))
+        both = _ComposedMotion(self, require_frame(inner, "inner"))
         return MovingFrame(both.rotation, both.origin, both.rate)
 
     def inverse(self) -> "MovingFrame":
@@ -228,7 +226,7 @@ class MovingFrame(eqx.Module):
 
         `frame.compose(frame.inverse())` does not move.
         """
-        back = _Inverse(self)
+        back = _InverseMotion(self)
         return MovingFrame(back.rotation, back.origin, back.rate)
 
     def place(self, t: ScalarLike) -> Vec3:
@@ -247,7 +245,13 @@ def require_frame(frame: object, name: str) -> Any:
     )
 
 
-class _Composed(eqx.Module):
+class _ComposedMotion(eqx.Module):
+    """Describe the motion of a frame that moves as `inner` does within the moving frame `outer`.
+
+    The methods `rotation`, `rate` and `origin` are functions of the time, s, for a `MovingFrame`:
+    the rotation matrix (3, 3), the angular velocity (3,), rad/s, and the origin (3,), m.
+    """
+
     outer: MovingFrame
     inner: MovingFrame
 
@@ -264,7 +268,13 @@ class _Composed(eqx.Module):
         return self.outer.place(t) + linalg3.apply(self.outer.matrix(t), self.inner.place(t))
 
 
-class _Inverse(eqx.Module):
+class _InverseMotion(eqx.Module):
+    """Describe the motion of the inertial frame S relative to the moving frame S' = `frame`.
+
+    The methods `rotation`, `rate` and `origin` are functions of the time, s, for a `MovingFrame`:
+    the rotation matrix (3, 3), the angular velocity (3,), rad/s, and the origin (3,), m.
+    """
+
     frame: MovingFrame
 
     def rotation(self, t: ScalarLike) -> Any:

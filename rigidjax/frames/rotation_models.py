@@ -78,9 +78,11 @@ class AboutAxis(eqx.Module):
 
 
 def with_forward_solves(rotation: PyTree) -> Any:
-    """Return `rotation` with the differential equations in it solved by `diffrax.ForwardMode`.
+    """Return the function of time `rotation` with each `diffrax.RecursiveCheckpointAdjoint` in it
+    replaced by `diffrax.ForwardMode`.
 
-    dΩ/dt is a forward-mode derivative, which `diffrax.RecursiveCheckpointAdjoint` refuses.
+    dΩ/dt, the derivative of a frame's angular velocity Ω, is a forward-mode derivative, which
+    `diffrax.RecursiveCheckpointAdjoint` refuses.
     """
 
     def reverse(part: PyTree) -> bool:
@@ -90,8 +92,10 @@ def with_forward_solves(rotation: PyTree) -> Any:
 
 
 def state_of(rotation: PyTree, t: Array) -> Any:
-    """Return the value of `rotation` at `t`: a matrix, a quaternion, or a state with `q` and
-    `omega`.
+    """Return the value of a frame's `rotation` at the time `t`, s: a matrix (3, 3), a quaternion
+    (4,), or a state with `q` and `omega`.
+
+    `rotation` is a function of the time, or a solution of `simulate`, which is evaluated at `t`.
     """
     return rotation.evaluate(t) if hasattr(rotation, "evaluate") else rotation(t)
 

@@ -38,13 +38,12 @@ def family(
     predict the next member, which Newton's method corrects as in `periodic_orbit`.
 
     **Arguments:** `orbit` a `PeriodicOrbit` near the first member; `values` (N,), each near the
-    value
-    before it; `hold` `"x"`, `"z"`, `"vy"` or `"period"`, a quantity that must be monotone along the
-    family (use `follow` past a fold). **Returns** a `PeriodicOrbit` with a leading axis N. It can
-    be differentiated with respect to μ and `values` in forward and reverse mode; the derivatives
-    are exact (implicit function theorem). **Raises:** `ValueError`
-    (`EquinoxRuntimeError` under `jit`) with the first value at which Newton's method
-    found no member.
+    value before it; `hold` `"x"`, `"z"`, `"vy"` or `"period"`, a quantity that must be monotone
+    along the family (use `follow` past a fold). **Returns** a `PeriodicOrbit` with a leading axis
+    N. It can be differentiated with respect to μ and `values` in forward and reverse mode; the
+    derivatives are exact (implicit function theorem). **Raises:** `ValueError`
+    (`EquinoxRuntimeError` under `jit`) with the first value at which Newton's method found no
+    member.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> start = moon.lyapunov_guess(1, 0.01)
@@ -63,27 +62,37 @@ def family(
     where = lambda i: f" at {hold} = {values[i]:.9g}"  # noqa: E731
     advice = "; take smaller steps, or the family turns back there: hold another of x, z, vy, "
     lost = _is_lost(start, numbers, left)
-    return _orbits_or_error(numbers, lost, where, "family: lost", advice + "period, or use follow")
+    return _orbits_unless_lost(
+        numbers, lost, where, "family: lost", advice + "period, or use follow"
+    )
 
 
 def _is_lost(start: Array, numbers: Array, left: Array) -> Array:
-    """Return (N,) booleans: whether Newton's method failed or left the family at each member.
+    """Return booleans (N,): whether Newton's method failed at each member of a family, or went to
+    an orbit of less than half or more than twice the period of the member before it.
 
-    **Arguments:** `start` (4,) the numbers x, z, v_y, T/2 of the orbit before the first member;
-    `numbers` (N, 4) those numbers of the members; `left` (N,) the largest residuals.
+    - `start`: (4,) the numbers x, z, v_y, T/2 of the orbit before the first member: its position,
+      its velocity and half of its period T, where it crosses y = 0 at a right angle.
+    - `numbers`: (N, 4) the numbers x, z, v_y, T/2 of the members.
+    - `left`: (N,) the largest residual of each member, |y|, |v_x| or |v_z| after half a period.
     """
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
     return ~((left <= correction.usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
 
 
-def _orbits_or_error(
+def _orbits_unless_lost(
     numbers: Array, is_lost: Array, place: Callable[[int], str], message: str, advice: str
 ) -> PeriodicOrbit:
-    """Return the members as a `PeriodicOrbit`, or raise an error if `is_lost` (N,) is true of any.
+    """Return the members of a family as one `PeriodicOrbit` with a leading axis N, or raise an
+    error if a member is lost.
 
-    **Arguments:** `numbers` (N, 4) x, z, v_y, T/2 of the members. The error says `message`, then
-    `place(i)` with the index i of the first lost member if `is_lost` is known, then `advice`.
+    - `numbers`: (N, 4) the numbers x, z, v_y, T/2 of the members: position, velocity and half of
+      the period T, where an orbit crosses y = 0 at a right angle.
+    - `is_lost`: (N,) whether Newton's method failed at each member.
+    - `place`: a function that returns, for the index of the first lost member, the words that name
+      it in the message; it is used if `is_lost` is known.
+    - `message`, `advice`: the words of the error before and after this place.
     """
     known = _checks.is_known(is_lost) and bool(is_lost.any())
     words = message + (place(int(np.argmax(np.asarray(is_lost)))) if known else "") + advice
@@ -92,8 +101,21 @@ def _orbits_or_error(
 
 @eqx.filter_jit
 def _members_at_values(
-    scene: "AbstractReversible", start: Array, held_value: Array, index: int, tolerance: float
+    scene: "AbstractReversible", start: Array, held_values: Array, index: int, tolerance: float
 ) -> Any:
+    """Return two arrays: the numbers x, z, v_y, T/2 (N, 4) of the members of a family of periodic
+    orbits, one for each held value; and the largest residual (N,) of each.
+
+    The numbers are position, velocity and half of the period T, where an orbit crosses y = 0 at a
+    right angle. Each member is predicted along the tangent of the family and corrected by Newton's
+    method.
+
+    - `scene`: the equations of motion.
+    - `start`: (4,) the numbers of an orbit near the first member.
+    - `held_values`: (N,) the values of the number that each member must have.
+    - `index`: the index, 0 to 3, of the number that is held.
+    - `tolerance`: the largest residual of a member.
+    """
     free = np.delete(np.arange(4), index)
     still = jax.tree.map(lambda n: lax.stop_gradient(n) if eqx.is_array(n) else n, scene)
 
@@ -101,7 +123,7 @@ def _members_at_values(
         # The start of Newton's method is not differentiated: the converged orbit does not depend on
         # the start.
         previous, aim = lax.stop_gradient(previous), lax.stop_gradient(value)
-        guess = previous[free] + _slope_along_family(still, previous, index) * (
+        guess = previous[free] + _derivative_along_family(still, previous, index) * (
             aim - previous[index]
         )
         root, left = correction.correct_orbit(index, tolerance, scene, guess, value)
@@ -111,7 +133,7 @@ def _members_at_values(
     # The guess is corrected first: the tangent of the family exists only at an exact member.
     held_now = lax.stop_gradient(start[index])
     root, _ = correction.correct_orbit(index, tolerance, still, start[free], held_now)
-    _, out = lax.scan(step, correction.insert_held(root, start[index], index), held_value)
+    _, out = lax.scan(step, correction.insert_held(root, start[index], index), held_values)
     return out
 
 
@@ -122,29 +144,34 @@ def family_slope(
     `hold`.
 
     **Arguments:** `orbit` a member of the family; `hold` as in `family`. **Returns** a
-    `PeriodicOrbit`
-    that holds derivatives: `.period` is d period/d hold, for example. The derivatives are exact
-    (implicit function theorem). **Raises:** `ValueError` at a fold of the family in `hold`.
+    `PeriodicOrbit` that holds derivatives: `.period` is d period/d hold, for example. The
+    derivatives are exact (implicit function theorem). **Raises:** `ValueError` at a fold of the
+    family in `hold`.
 
     >>> hill, start = rj.orbits.hill(), rj.Point([0.3, 0, 0], [0.0, 1.6, 0])
     >>> orbit = hill.periodic_orbit(rj.orbits.PeriodicOrbit(start, 1.2))
     >>> round(float(hill.family_slope(orbit).period), 3)
     12.076
     """
-    change = _family_slope(scene, crossing(orbit), index_of_held(hold))
+    change = _orbit_derivative(scene, crossing(orbit), index_of_held(hold))
     turned = ~jnp.isfinite(change.period)
     words = f"family_slope: the family has a fold in {hold} here; take another of x, z, vy, period"
     return _checks.error_if(change, turned, words)
 
 
-def _slope_along_family(
+def _derivative_along_family(
     scene: "AbstractReversible", numbers: Array, index: int
 ) -> Float[Array, "3"]:
-    """Return (3,) derivatives, along the family of an orbit, with respect to one of its four
-    numbers.
+    """Return the derivatives (3,), along a family of periodic orbits, of three of the numbers x, z,
+    v_y, T/2 with respect to the fourth.
 
-    **Arguments:** `numbers` (4,) x, z, v_y, T/2 of the orbit; `index` selects the number with
-    respect to which the other three are differentiated.
+    The numbers are position, velocity and half of the period T, where an orbit crosses y = 0 at a
+    right angle.
+
+    - `scene`: the equations of motion.
+    - `numbers`: (4,) those four numbers of the orbit at which the derivatives are taken.
+    - `index`: the index, 0 to 3, of the number with respect to which the other three are
+      differentiated.
     """
     _, matrix = correction.value_and_jacobian(
         lambda n: correction.periodicity_residual(scene, n), numbers
@@ -153,8 +180,17 @@ def _slope_along_family(
 
 
 @eqx.filter_jit
-def _family_slope(scene: "AbstractReversible", numbers: Array, index: int) -> PeriodicOrbit:
-    unknown = _slope_along_family(scene, numbers, index)
+def _orbit_derivative(scene: "AbstractReversible", numbers: Array, index: int) -> PeriodicOrbit:
+    """Return the derivative of the start and period of a periodic orbit along its family, as a
+    `PeriodicOrbit` that holds derivatives.
+
+    - `scene`: the equations of motion.
+    - `numbers`: (4,) x, z, v_y, T/2 of the orbit: position, velocity and half of the period T,
+      where it crosses y = 0 at a right angle.
+    - `index`: the index, 0 to 3, of the number with respect to which the orbit is differentiated;
+      for 3 it is the whole period.
+    """
+    unknown = _derivative_along_family(scene, numbers, index)
     change = orbit_of(correction.insert_held(unknown, jnp.ones_like(unknown[0]), index))
     # The last of `numbers` is half the period, but `hold="period"` means the whole period.
     return jax.tree.map(lambda leaf: 0.5 * leaf, change) if index == 3 else change
@@ -175,13 +211,11 @@ def follow(
     Applications of Bifurcation Theory).
 
     **Arguments:** `orbit` a member, which is not returned; `step` the arclength from each member to
-    the
-    next, negative for the opposite direction; `count` the number of members; `rising` `"x"`, `"z"`,
-    `"vy"` or `"period"`, the quantity that grows in the first step if `step` is positive.
+    the next, negative for the opposite direction; `count` the number of members; `rising` `"x"`,
+    `"z"`, `"vy"` or `"period"`, the quantity that grows in the first step if `step` is positive.
     **Returns** a `PeriodicOrbit` with a leading axis; to differentiate a member, give it to
-    `periodic_orbit` first. **Raises:**
-    `ValueError` (`EquinoxRuntimeError` under `jit`) with the number of members found before the
-    family was lost.
+    `periodic_orbit` first. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) with the
+    number of members found before the family was lost.
     """
     start, index = crossing(orbit), index_of_held(rising)
     length = _checks.array_of_shape(step, (), "step").astype(start.dtype)
@@ -195,20 +229,36 @@ def follow(
     far = jnp.sqrt(jnp.sum(moved * moved, axis=1)) > 2 * jnp.abs(length)
     lost = _is_lost(start, numbers, left) | far
     where = lambda i: f" after {i} of {count} members"  # noqa: E731
-    return _orbits_or_error(numbers, lost, where, "follow: lost", "; take smaller steps")
+    return _orbits_unless_lost(numbers, lost, where, "follow: lost", "; take smaller steps")
 
 
 @eqx.filter_jit
 def _follow_family(
     scene: "AbstractReversible", start: Array, step: Array, count: int, index: int, tolerance: float
 ) -> Any:
+    """Return two arrays for the next `count` members N of a family of periodic orbits, at equal
+    steps of arclength: their numbers x, z, v_y, T/2 (N, 4); and the largest residual (N,) of each.
+
+    The numbers are position, velocity and half of the period T, where an orbit crosses y = 0 at a
+    right angle. The method is pseudo-arclength continuation.
+
+    - `scene`: the equations of motion.
+    - `start`: (4,) the numbers of the orbit from which the family is followed.
+    - `step`: the arclength from each member to the next, in the space of the four numbers.
+    - `index`: the index, 0 to 3, of the number that grows in the first step if `step` is positive.
+    - `tolerance`: the largest residual of a member.
+    """
+
     def residual(numbers: Array) -> Array:
         return correction.periodicity_residual(scene, numbers)
 
     def tangent(matrix: Array, previous: Array) -> Array:
-        """Return the unit tangent (4,) of the family, which has a positive product with `previous`.
+        """Return the unit tangent (4,) of the family at a member, in the direction that has a
+        positive product with `previous`.
 
-        `matrix` (3, 4) is the Jacobian of the residual; its product with the tangent is zero.
+        - `matrix`: (3, 4) the Jacobian of the periodicity residual with respect to the four numbers
+          of the member; its product with the tangent is zero.
+        - `previous`: (4,) the tangent at the member before.
         """
         rows = jnp.concatenate([matrix, previous[None]])
         along = jnp.linalg.solve(rows, jnp.zeros(4, start.dtype).at[3].set(1))
@@ -263,13 +313,12 @@ def bifurcation(
     motion out of the plane, and the halo orbits branch off where this index is 1.
 
     **Arguments:** `orbit`, `other` two members near each other, with `value` between their
-    stability
-    indices; `index` 0 or 1, an index into `stability_indices`; `value` the wanted stability index;
-    `hold` the quantity that the search varies along the family, `"x"`, `"z"`, `"vy"` or `"period"`.
-    The search runs in Python, not under `jit`. Source:
-    Howell 1984, doi:10.1007/BF01358403; Robin and Markellos 1980, doi:10.1007/BF01231183.
-    **Raises:** `ValueError` if `value` does not lie between the two stability indices, or if the
-    indices are complex.
+    stability indices; `index` 0 or 1, an index into `stability_indices`; `value` the wanted
+    stability index; `hold` the quantity that the search varies along the family, `"x"`, `"z"`,
+    `"vy"` or `"period"`. The search runs in Python, not under `jit`. Source: Howell 1984,
+    doi:10.1007/BF01358403; Robin and Markellos 1980, doi:10.1007/BF01231183. **Raises:**
+    `ValueError` if `value` does not lie between the two stability indices, or if the indices are
+    complex.
     """
     from scipy.optimize import brentq
 
@@ -300,6 +349,11 @@ def bifurcation(
 
 
 def _stability_index(scene: "AbstractReversible", orbit: PeriodicOrbit, index: int) -> float:
+    """Return one stability index ν = ½(λ + 1/λ) of a periodic orbit as a Python float, where λ is
+    an eigenvalue of the monodromy matrix; raise an error if it is complex.
+
+    `index`, 0 or 1, selects one of the two stability indices of the `orbit` in the `scene`.
+    """
     stability = np.asarray(_stability_of_orbit(scene, orbit))[index]
     if abs(stability.imag) > 1e-9 * max(1.0, abs(stability)):
         words = "the stability indices are complex at a member between the orbits"
@@ -309,4 +363,7 @@ def _stability_index(scene: "AbstractReversible", orbit: PeriodicOrbit, index: i
 
 @eqx.filter_jit
 def _stability_of_orbit(scene: "AbstractReversible", orbit: PeriodicOrbit) -> Array:
+    """Return both stability indices (2,) of an `orbit` in the `scene`, complex, the larger real
+    part first; this program is compiled.
+    """
     return scene.stability_indices(orbit)

@@ -32,10 +32,9 @@ class ThreeBody(AbstractReversible):
 
     The axes rotate, with the origin at the common centre of mass, the first body (mass 1 − μ) at
     (−μ, 0, 0), the second (mass μ) at (1 − μ, 0, 0). The units are the distance between the bodies,
-    the
-    total mass of the bodies, and 1/(angular rate of the bodies); hence the period of the bodies is
-    2π. **Fields:** `mu` the mass ratio μ; `radii` (2,) the radii of the bodies, at which a run ends
-    by a collision.
+    the total mass of the bodies, and 1/(angular rate of the bodies); hence the period of the bodies
+    is 2π. **Fields:** `mu` the mass ratio μ; `radii` (2,) the radii of the bodies, at which a run
+    ends by a collision.
 
     >>> scene = cr3bp(0.5)
     >>> [float(r) for r in scene.distances(jnp.array([0.0, 0.0, 0.0]))]
@@ -105,12 +104,11 @@ class ThreeBody(AbstractReversible):
         ys: Float[ArrayLike, " rows"] | Sequence[float],
     ) -> Float[Array, "rows columns"]:
         """Return 2U on a grid of the plane z = 0; a particle with Jacobi's constant C stays where
-        2U ≥
-        C.
+        2U ≥ C.
 
         **Arguments:** `xs` (columns,), `ys` (rows,) the coordinates x and y of the grid.
-        `matplotlib.pyplot.contour(xs, ys, grid,
-        levels=[C])` draws the curve of zero velocity (Szebehely 1967, sec. 4.7).
+        `matplotlib.pyplot.contour(xs, ys, grid, levels=[C])` draws the curve of zero velocity
+        (Szebehely 1967, sec. 4.7).
 
         >>> rj.orbits.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
         [[4.0]]
@@ -151,8 +149,7 @@ class ThreeBody(AbstractReversible):
         """Return the six exponents λ of small motions e^{λt} about an equilibrium point with z = 0.
 
         **Arguments:** `x` (3,) the equilibrium, such as a row of `lagrange_points`. The equilibrium
-        is
-        stable to first order if no λ has a positive real part: L4 and L5 are for μ below Routh's
+        is stable to first order if no λ has a positive real part: L4 and L5 are for μ below Routh's
         value ½(1 − √(23/27)), and L1–L3 never are. Motions in the plane obey λ⁴ + (4 − U_xx − U_yy)
         λ² + U_xx U_yy − U_xy² = 0, motions along z obey λ² = U_zz (Szebehely 1967, sec. 5.2).
 
@@ -183,8 +180,8 @@ class ThreeBody(AbstractReversible):
         hold="z")`.
 
         **Arguments:** `point` 1, 2 or 3; `amplitude` along z, in the scene's unit: its sign selects
-        the northern or the southern branch.
-        Source: Richardson 1980, doi:10.1007/BF01229511 (third order).
+        the northern or the southern branch. Source: Richardson 1980, doi:10.1007/BF01229511 (third
+        order).
         """
         return richardson.orbit_guess(self.mu, point, None, amplitude)
 
@@ -193,13 +190,12 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
     """Return the circular restricted three-body problem with mass ratio μ.
 
     **Arguments:** `mu` μ = m₂/(m₁ + m₂) for the masses m₁ and m₂ of the bodies, 0 < μ ≤ ½
-    (Earth–Moon
-    0.01215…); `radii` (2,) the radii of the two bodies in units of the distance between them. A run
-    that comes closer to a body than its radius ends with a message that says the body, the time and
-    the distance. For radii of zero a run ends at the distance where rounding spoils the attraction
-    (`smallest_distance`). **Raises:**
-    `ValueError` for μ outside (0, ½] (`EquinoxRuntimeError` under `jit`). Source: notes, eq 91,
-    with a uniform Ω = (0, 0, 1); Szebehely 1967, Theory of Orbits.
+    (Earth–Moon 0.01215…); `radii` (2,) the radii of the two bodies in units of the distance between
+    them. A run that comes closer to a body than its radius ends with a message that says the body,
+    the time and the distance. For radii of zero a run ends at the distance where rounding spoils
+    the attraction (`smallest_distance`). **Raises:** `ValueError` for μ outside (0, ½]
+    (`EquinoxRuntimeError` under `jit`). Source: notes, eq 91, with a uniform Ω = (0, 0, 1);
+    Szebehely 1967, Theory of Orbits.
 
     >>> cr3bp(0.5).lagrange_points[3].round(12).tolist()
     [0.0, 0.866025403784, 0.0]
@@ -268,8 +264,8 @@ def hill(radius: ScalarLike = 0.0) -> Hill:
     """Return the scene of Hill's problem, the limit of `cr3bp(mu)` as μ → 0 in units of μ^{1/3}.
 
     **Arguments:** `radius` of the small body, in units of μ^{1/3} times the distance between the
-    bodies; a run ends when the particle comes closer. Source: Hill 1878,
-    doi:10.2307/2369430; Szebehely 1967, sec. 10.4.
+    bodies; a run ends when the particle comes closer. Source: Hill 1878, doi:10.2307/2369430;
+    Szebehely 1967, sec. 10.4.
 
     >>> hill().lagrange_points[1].round(12).tolist()
     [0.693361274351, 0.0, 0.0]

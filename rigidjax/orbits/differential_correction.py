@@ -50,22 +50,18 @@ def periodic_orbit(
 
     The method finds orbits that are symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and
     most others in use. Such an orbit crosses the plane at a right angle (y = v_x = v_z = 0) twice a
-    period
-    T. Newton's method changes three of (x, z, v_y, T/2) at the first crossing until y, v_x, v_z
-    vanish at T/2.
+    period T. Newton's method changes three of (x, z, v_y, T/2) at the first crossing until y, v_x,
+    v_z vanish at T/2.
 
     **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right angle;
     `hold` the quantity that stays fixed, `"x"`, `"z"`, `"vy"` or `"period"`, and so selects one
-    orbit
-    of the family (use `"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` the largest
-    accepted |y|, |v_x|, |v_z| at the half period, by default 1e-12 (1e-4 in float32).
+    orbit of the family (use `"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` the
+    largest accepted |y|, |v_x|, |v_z| at the half period, by default 1e-12 (1e-4 in float32).
 
     **Returns** a `PeriodicOrbit`. It can be differentiated, in forward and reverse mode, with
-    respect to
-    the numbers of the scene (μ) and the held quantity: the derivatives come from the implicit
-    function theorem. Source: Howell 1984,
-    doi:10.1007/BF01358403. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton's
-    method does not converge.
+    respect to the numbers of the scene (μ) and the held quantity: the derivatives come from the
+    implicit function theorem. Source: Howell 1984, doi:10.1007/BF01358403. **Raises:** `ValueError`
+    (`EquinoxRuntimeError` under `jit`) if Newton's method does not converge.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
@@ -76,7 +72,7 @@ def periodic_orbit(
     free = np.delete(np.arange(4), index)
     if tolerance is None:
         tolerance = usual_tolerance(numbers)
-    unknown, left = _corrected_numbers(scene, numbers[free], numbers[index], index, tolerance)
+    unknown, left = _compiled_correction(scene, numbers[free], numbers[index], index, tolerance)
     bad = ~(left <= tolerance)
     said = f" ({float(left):.1e} left at half period)" if _checks.is_known(left) else ""
     words = f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
@@ -123,8 +119,12 @@ def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
 
 
 def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> Float[Array, "4"]:
-    """Return x, z, v_y, T/2 (4,): the three numbers `unknown`, with `held_value` put in at
-    `index`.
+    """Return the four numbers x, z, v_y, T/2 (4,) of a periodic orbit from three unknown numbers
+    and one that is held.
+
+    - `unknown`: (3,) the three numbers, in their order.
+    - `held_value`: the fourth number.
+    - `index`: the place, 0 to 3, of the fourth number.
     """
     parts = list(unknown)
     parts.insert(index, held_value)
@@ -132,8 +132,8 @@ def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> F
 
 
 def usual_tolerance(numbers: Array) -> float:
-    """Return the default tolerance for y, v_x, v_z at the half period: 1e-12, or 1e-4 in
-    float32.
+    """Return the default tolerance for |y|, |v_x| and |v_z| at the half period of an orbit with
+    these `numbers`: 1e-12, or 1e-4 in float32.
     """
     return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
 
@@ -141,10 +141,14 @@ def usual_tolerance(numbers: Array) -> float:
 def integrate(
     scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **options: Any
 ) -> dfx.Solution:
-    """Return the solution from `state` at time 0 to time `t`, with derivatives in forward mode.
+    """Return the solution of a particle's motion from `state` at time 0 to time `t`, with
+    derivatives in forward mode.
 
-    **Arguments:** `rtol`, `atol` the tolerances of a step; `options` further arguments of
-    `diffrax.diffeqsolve`.
+    - `scene`: the equations of motion.
+    - `state`: the initial position and velocity, a `Point`.
+    - `t`: the last time, in the scene's unit.
+    - `rtol`, `atol`: the relative and absolute tolerance of a step.
+    - `options`: further arguments of `diffrax.diffeqsolve`.
     """
     motion = dfx.ODETerm(scene.field), dfx.Dopri8(), jnp.zeros_like(t), t, None, state
     options |= dict(adjoint=dfx.ForwardMode(), max_steps=100_000, throw=False)
@@ -173,13 +177,21 @@ def transition_matrix(
     """
     _checks.require_instance(state, Point, "state", requirement="a Point(x, v)")
     t = _checks.require_finite(_checks.array_of_shape(t, (), "t"), "t")
-    return _transition_matrix(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
+    return _compiled_transition_matrix(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
 
 
 @eqx.filter_jit
-def _transition_matrix(
+def _compiled_transition_matrix(
     scene: AbstractScene, numbers: Array, t: Array, rtol: float, atol: float
 ) -> Array:
+    """Return the state-transition matrix (6, 6), the derivatives of the final with respect to the
+    initial position and velocity.
+
+    - `scene`: the equations of motion.
+    - `numbers`: (6,) the initial position and velocity (x, v).
+    - `t`: the duration of the motion, in the scene's unit of time.
+    - `rtol`, `atol`: the relative and absolute tolerance of a step.
+    """
     # Forward mode solves the six variational equations together with the motion.
     return jax.jacfwd(lambda n: state_after(scene, n, t, rtol=rtol, atol=atol))(numbers)
 
@@ -206,9 +218,10 @@ def value_and_jacobian(f: Callable[[Array], Array], x: Array) -> tuple[Array, Ar
 
 
 def newton(f: Callable[[Array], Array], x: Array, tolerance: float) -> Array:
-    """Return a zero of `f` near `x`, by Newton's method.
+    """Return a zero (n,) of the function `f` near the start `x` (n,), by Newton's method.
 
-    The steps end when all |f| are below a tenth of `tolerance`, or after `MAX_STEPS` steps.
+    The steps end when all |f| are below a tenth of `tolerance`, or after `MAX_STEPS` steps. `f`
+    returns as many values (n,) as it has unknowns.
     """
 
     def is_unfinished(carry: tuple[Array, Array, Array]) -> Any:
@@ -231,9 +244,22 @@ def newton(f: Callable[[Array], Array], x: Array, tolerance: float) -> Array:
 # linear in the tangents, so that it serves `jax.jacfwd` and `jax.grad`, although the solves inside
 # run in forward mode.
 @eqx.filter_jit
-def _corrected_numbers(
+def _compiled_correction(
     scene: AbstractScene, unknown: Array, held_value: Array, index: int, tolerance: float
 ) -> Any:
+    """Return two things: the three corrected numbers (3,) of a periodic orbit; and the largest
+    residual, |y|, |v_x| or |v_z| after half a period.
+
+    A periodic orbit of period T is given by x, z, v_y, T/2, where it crosses y = 0 at a right
+    angle; one of these four numbers is held. The program is compiled, and can be differentiated in
+    forward and reverse mode.
+
+    - `scene`: the equations of motion.
+    - `unknown`: (3,) the start of Newton's method.
+    - `held_value`: the number that is held.
+    - `index`: its place, 0 to 3, among the four numbers.
+    - `tolerance`: the largest accepted residual.
+    """
     return correct_orbit(index, float(tolerance), scene, unknown, held_value)
 
 
@@ -241,6 +267,19 @@ def _corrected_numbers(
 def correct_orbit(
     index: int, tolerance: float, scene: AbstractScene, unknown: Array, held_value: Array
 ) -> Any:
+    """Return two things: the three numbers (3,) that make an orbit periodic, by Newton's method;
+    and the largest residual, |y|, |v_x| or |v_z| after half a period.
+
+    A periodic orbit of period T is given by x, z, v_y, T/2, where it crosses y = 0 at a right
+    angle; one of these four numbers is held.
+
+    - `index`: the place, 0 to 3, of the held number.
+    - `tolerance`: the largest accepted residual.
+    - `scene`: the equations of motion.
+    - `unknown`: (3,) the start of Newton's method for the other numbers.
+    - `held_value`: the number that is held.
+    """
+
     def residual(unknown: Array) -> Array:
         return periodicity_residual(scene, insert_held(unknown, held_value, index))
 
@@ -250,6 +289,14 @@ def correct_orbit(
 
 @correct_orbit.def_jvp
 def _correct_orbit_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
+    """Return the outputs of `correct_orbit`, and their derivatives along given tangents, by the
+    implicit function theorem.
+
+    - `primals`: the arguments of `correct_orbit`: index, tolerance, scene, unknown numbers (3,) and
+      held value.
+    - `tangents`: the tangents of these arguments, `None` for constants; only the tangents of the
+      scene and of the held value count, since the corrected orbit does not depend on the start.
+    """
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents
     root, left = correct_orbit(index, tolerance, scene, unknown, held)

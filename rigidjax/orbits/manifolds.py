@@ -106,11 +106,11 @@ def manifold_point(
     if isinstance(side, bool) or side not in (1, -1):
         raise ValueError(f"side: wanted 1 (to larger x at the orbit's start) or -1, got {side!r}")
     crossing(orbit)
-    return _manifold_point(scene, orbit, phase, branch, side, distance)
+    return _compiled_manifold_point(scene, orbit, phase, branch, side, distance)
 
 
 @eqx.filter_jit
-def _manifold_point(
+def _compiled_manifold_point(
     scene: "AbstractReversible",
     orbit: PeriodicOrbit,
     phase: Scalar,
@@ -118,6 +118,16 @@ def _manifold_point(
     side: int,
     distance: Scalar,
 ) -> tuple[Point, Scalar]:
+    """Return two things: a state near a periodic orbit, on its stable or unstable manifold; and the
+    multiplier λ, the factor by which the distance from the orbit changes in one period.
+
+    - `scene`: the equations of motion.
+    - `orbit`: the unstable periodic orbit.
+    - `phase`: the point of the orbit, in periods since `orbit.state`.
+    - `branch`: `"stable"` or `"unstable"`, the manifold.
+    - `side`: 1 or −1, the half of the manifold.
+    - `distance`: the distance of the state from the orbit, in (x, v).
+    """
     value, vector = unstable_direction(scene.monodromy(orbit))
     # The mirror image of the unstable manifold is the stable manifold, with the opposite phase.
     turned = phase if branch == "unstable" else -phase
@@ -159,12 +169,10 @@ def manifold(
       of the manifold is of the order of the square of this distance.
 
     The start lies off the orbit in the direction of the eigenvector of the monodromy matrix with
-    the
-    largest multiplier, moved along the orbit by the transition matrix. The stable manifold is the
-    mirror image, in y → −y, of the unstable manifold. **Returns** a `Manifold`. Source: Koon, Lo,
-    Marsden and Ross 2011, Dynamical
-    Systems, the Three-Body Problem and Space Mission Design, sec. 7.4. **Raises:** `ValueError` for
-    an orbit without a real multiplier of size above 1.
+    the largest multiplier, moved along the orbit by the transition matrix. The stable manifold is
+    the mirror image, in y → −y, of the unstable manifold. **Returns** a `Manifold`. Source: Koon,
+    Lo, Marsden and Ross 2011, Dynamical Systems, the Three-Body Problem and Space Mission Design,
+    sec. 7.4. **Raises:** `ValueError` for an orbit without a real multiplier of size above 1.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
@@ -217,6 +225,9 @@ def manifold_start(
 
 
 def _positive_distance(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
+    """Return `value` as one positive number in the precision `dtype` (`None` keeps its own), or
+    raise an error that begins with `name`.
+    """
     distance = _checks.array_of_shape(value, (), name)
     return _checks.require_sign(
         distance if dtype is None else distance.astype(dtype), name, "a positive number"
@@ -227,6 +238,17 @@ def _positive_distance(value: ScalarLike, name: str, dtype: DTypeLike | None) ->
 def _manifold_trajectories(
     scene: "AbstractReversible", starts: Point, ts: Array, branch: Branch
 ) -> Point:
+    """Return the motions (N, T) that start at given states on a stable or unstable manifold, NaN
+    after a collision.
+
+    Motions on a stable manifold are computed backwards in time, as the mirror images, in y → −y, of
+    motions forwards in time.
+
+    - `scene`: the equations of motion.
+    - `starts`: the N initial states, a `Point` with a leading axis.
+    - `ts`: (T,) the times since the start, ≥ 0, ascending.
+    - `branch`: `"stable"` or `"unstable"`.
+    """
     mirror = jnp.asarray(_MIRROR, ts.dtype)
     turn = branch == "stable"
 
@@ -234,11 +256,11 @@ def _manifold_trajectories(
         # The mirror image of the stable manifold is integrated forwards in time.
         return Point(state.x * mirror[:3], state.v * mirror[3:]) if turn else state
 
-    def path(start: Point) -> Point:
+    def trajectory(start: Point) -> Point:
         how = dict(saveat=dfx.SaveAt(ts=ts), event=dfx.Event(Ends(scene)))
         out = integrate(scene, mirror_if_stable(start), ts[-1], 1e-11, 1e-12, **how)
         there: Any = jnp.isfinite(jnp.asarray(out.ts))[:, None]
         ys: Any = jax.tree.map(lambda leaf: jnp.where(there, leaf, jnp.nan), out.ys)
         return jax.vmap(mirror_if_stable)(ys)
 
-    return jax.vmap(path)(starts)
+    return jax.vmap(trajectory)(starts)

@@ -1,4 +1,4 @@
-"""Describe scenes that are symmetric under time reversal: periodic orbits, families and
+"""Describe scenes that are symmetric under time reversal, with their periodic orbits, families and
 stability.
 """
 
@@ -65,8 +65,7 @@ class AbstractReversible(AbstractScene):
         λ and 1/λ are the two pairs of eigenvalues of `monodromy` other than 1, 1.
 
         The orbit is stable to first order if both indices are real with |ν| ≤ 1. For many orbits
-        use
-        `jax.vmap(scene.stability_indices)(scene.family(…))`. Source: Howell 1984,
+        use `jax.vmap(scene.stability_indices)(scene.family(…))`. Source: Howell 1984,
         doi:10.1007/BF01358403; from traces: Bray and Goudas 1967, Adv. Astron. Astrophys. 5, 71.
         """
         return continuation.stability_indices(self.monodromy(orbit))

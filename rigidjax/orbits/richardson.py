@@ -27,23 +27,26 @@ def lagrange_points(mu: Scalar) -> Float[Array, "5 3"]:
 
 
 def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Return three distances: of L1 and of L2 from the second body; and of L3 from the first
-    body.
+    """Return three distances of collinear equilibrium points from bodies, in units of the distance
+    between the bodies: of L1 and of L2 from the second body; and of L3 from the first body.
+
+    `mu` is the mass ratio μ of the second body, 0 < μ ≤ ½.
     """
     one = jnp.ones_like(mu)
     hill = jnp.cbrt(mu / (3 * (1 - mu)))
-    between = _polynomial_root([one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3))
-    beyond = _polynomial_root([one, 3 - mu, 3 - 2 * mu, -mu, -2 * mu, -mu], hill * (1 + hill / 3))
+    between = _root_near([one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3))
+    beyond = _root_near([one, 3 - mu, 3 - 2 * mu, -mu, -2 * mu, -mu], hill * (1 + hill / 3))
     rest = mu - 1
-    opposite = _polynomial_root([one, 2 + mu, 1 + 2 * mu, rest, 2 * rest, rest], 1 - 7 * mu / 12)
+    opposite = _root_near([one, 2 + mu, 1 + 2 * mu, rest, 2 * rest, rest], 1 - 7 * mu / 12)
     return between, beyond, opposite
 
 
-def _polynomial_root(coefficients: list[Scalar], start: Scalar) -> Scalar:
-    """Return a root of a polynomial by seven steps of Newton's method from `start`.
+def _root_near(coefficients: list[Scalar], start: Scalar) -> Scalar:
+    """Return a root of a polynomial by seven steps of Newton's method.
 
-    The coefficient of the highest power comes first. The starts in `distances` are so near to the
-    roots, for every μ, that seven steps are enough.
+    - `coefficients`: the coefficients, that of the highest power first.
+    - `start`: a number near the root. The starts in `distances` are so near to the roots, for every
+      mass ratio, that seven steps are enough.
     """
 
     def step(_: object, x: Scalar) -> Scalar:
@@ -62,15 +65,14 @@ def orbit_guess(
     xz-plane.
 
     Either `along_x`, the amplitude of a planar Lyapunov orbit, or `along_z`, the amplitude of a
-    halo
-    orbit, whose sign selects the branch, is a number; the other argument is `None`. The amplitude
-    is small compared with the distance from the point to the nearer body. Source:
+    halo orbit, whose sign selects the branch, is a number; the other argument is `None`. The
+    amplitude is small compared with the distance from the point to the nearer body. Source:
     Richardson 1980, Celest. Mech. 22, 241, doi:10.1007/BF01229511, at τ = 0.
     """
     if point not in (1, 2, 3):
         raise ValueError(f"point: wanted 1, 2 or 3, a collinear point, got {point}")
     unit = distances(mu)[point - 1]
-    c2, c3, c4 = (_legendre(mu, unit, point, n) for n in (2, 3, 4))
+    c2, c3, c4 = (_potential_coefficient(mu, unit, point, n) for n in (2, 3, 4))
     rate = jnp.sqrt(0.5 * (2 - c2 + jnp.sqrt((c2 - 2) ** 2 + 4 * (c2 - 1) * (1 + 2 * c2))))
     w, w2 = rate, rate * rate
     k = 2 * w / (w2 + 1 - c2)
@@ -106,9 +108,9 @@ def orbit_guess(
     b34 = -12 * c3 * k * a22 + 3 * c4 * k + 8 * s2 * w * (w * k - 1)
     b34 = -k / (16 * w) * (2 * b34 - 12 * c3 * (b22 + k * a24) - 3 * c4 * k)
     if along_z is None:
-        ax, az = _amplitude(along_x) / unit, jnp.zeros_like(unit)
+        ax, az = _checked_amplitude(along_x) / unit, jnp.zeros_like(unit)
     else:
-        az = _amplitude(along_z) / unit
+        az = _checked_amplitude(along_z) / unit
         a1 = -1.5 * c3 * (2 * a21 + a23 + 5 * d21) - 0.375 * c4 * (12 - k2)
         a2 = 1.5 * c3 * (a24 - 2 * a22) + 1.125 * c4
         square = -((a2 + 2 * w2 * s2) * az * az + w2 - c2) / (a1 + 2 * w2 * s1)
@@ -126,15 +128,22 @@ def orbit_guess(
     return PeriodicOrbit(Point(place, jnp.stack([zero, speed, zero])), 2 * math.pi / sweep)
 
 
-def _amplitude(value: ScalarLike | None) -> Scalar:
+def _checked_amplitude(value: ScalarLike | None) -> Scalar:
+    """Return the amplitude of an orbit as one finite number, or raise an error."""
     return _checks.require_finite(_checks.array_of_shape(value, (), "amplitude"), "amplitude")
 
 
-def _legendre(mu: Scalar, unit: Scalar, point: int, n: int) -> Scalar:
-    """Return the coefficient c_n of the expansion of the potential about a collinear point.
+def _potential_coefficient(mu: Scalar, unit: Scalar, point: int, n: int) -> Scalar:
+    """Return the coefficient c_n, for the power `n` of the distance, of the expansion of the
+    potential of the three-body problem about a collinear equilibrium point.
 
-    **Arguments:** `mu` μ; `unit` the distance of the point from the nearer body; `point` 1, 2 or 3
-    for L1, L2, L3. Source: Richardson 1980, eq 8.
+    The unit of length of the expansion is the distance of the point from the nearer body. Source:
+    Richardson 1980, eq 8.
+
+    - `mu`: the mass ratio μ.
+    - `unit`: the distance of the point from the nearer body, in units of the distance between the
+      bodies.
+    - `point`: 1, 2 or 3 for L1, L2, L3.
     """
     g = unit
     if point == 3:

@@ -4,8 +4,7 @@ Each function draws into your axes (`ax`) or into new ones, and returns the axes
 colours are distinct also for colour-blind readers. **Raises:** `ModuleNotFoundError`, with the
 command that installs the missing package; `TypeError` for states without the attitude that is to be
 drawn, or for flat axes where 3-D axes are needed; `ValueError` for a batch instead of one body, for
-times and states of
-different length, for an unknown unit or option, and for axes of a wrong shape.
+times and states of different length, for an unknown unit or option, and for axes of a wrong shape.
 """
 
 from rigidjax._names import show

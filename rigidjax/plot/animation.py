@@ -59,8 +59,7 @@ class Film(eqx.Module):
 
         **Arguments:** `path` ends in `.gif` or `.html`, or in `.mp4` if the program ffmpeg is
         installed; for the page of `player` it must end in `.html`. **Raises** `ValueError` for
-        another suffix,
-        `FileNotFoundError` if ffmpeg is missing.
+        another suffix, `FileNotFoundError` if ffmpeg is missing.
         """
         path = Path(path)
         suffix = path.suffix.lower()
@@ -69,7 +68,7 @@ class Film(eqx.Module):
             wanted = " or ".join(kinds)
             raise ValueError(f"save: wanted a name that ends in {wanted}, got {path.name}")
         if suffix == ".mp4":
-            _to_mp4(self.data, path)
+            _write_mp4(self.data, path)
         elif suffix == ".html" and self.kind == "gif":
             path.write_text(f"<!doctype html>\n{self._repr_html_()}\n", encoding="utf-8")
         else:
@@ -77,6 +76,7 @@ class Film(eqx.Module):
         return path
 
     def _repr_html_(self) -> str:
+        """Return the film as HTML, which a notebook shows."""
         if self.kind == "gif":
             picture = base64.b64encode(self.data).decode("ascii")
             return f'<img alt="tumbling body" src="data:image/gif;base64,{picture}">'
@@ -87,7 +87,10 @@ class Film(eqx.Module):
         )
 
 
-def _to_mp4(gif: bytes, path: Path) -> None:
+def _write_mp4(gif: bytes, path: Path) -> None:
+    """Write an animated picture, the bytes of a file `gif`, as a film to the file `path`, which
+    ends in `.mp4`; raise `FileNotFoundError` without the program ffmpeg.
+    """
     program = shutil.which("ffmpeg")
     if program is None:
         raise FileNotFoundError(
@@ -128,11 +131,11 @@ def tumble(
     >>> tumble(body, sol.ts, sol.ys, fps=2).data[:6]
     b'GIF89a'
     """
-    seconds, pictures = _duration_and_count(ts, seconds, fps)
+    seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
     body = validation.require_single_body(body, (Inertia, MassProperties), "body")
     moments, q = evenly_spaced_attitudes(ts, states, pictures)
     size = _checks.integer(size, "size", 64)
-    corners, tip, reach = _box_and_tip(body)
+    corners, tip, reach = _box_of_drawing(body)
     pyplot()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -172,10 +175,15 @@ def tumble(
     return Film(out.getvalue(), "gif", size)
 
 
-def _duration_and_count(
+def _duration_and_picture_count(
     ts: NumbersLike, seconds: float | int | None, fps: float | int
 ) -> tuple[float, int]:
-    """Return two numbers: the duration of a film, s; and the number of pictures, at least 2."""
+    """Return two numbers: the duration of a film, s; and the number of its pictures, at least 2.
+
+    - `ts`: (T,) the times of the motion, s.
+    - `seconds`: the wanted duration, s; `None` for that of the motion, but 20 s at most.
+    - `fps`: the number of pictures a second.
+    """
     if seconds is None:
         when = _checks.host_array(ts, "ts")
         seconds = min(abs(float(when[-1] - when[0])), 20.0) if when.ndim == 1 and when.size else 1.0
@@ -195,13 +203,13 @@ def player(
     """Return a page that plays the motion in 3-D; you can turn and zoom the view while it plays.
 
     The box is that of `tumble`; the line is the path of its longest axis. The page contains
-    everything, also viser's program (0.8 MB): a notebook shows it without a
-    network or a running kernel, and `.save("tumble.html")` writes it to a file. **Arguments:** as
-    `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises** as `tumble`.
+    everything, also viser's program (0.8 MB): a notebook shows it without a network or a running
+    kernel, and `.save("tumble.html")` writes it to a file. **Arguments:** as `tumble`; `height` px
+    in a notebook. **Returns** a `Film`. **Raises** as `tumble`.
     """
-    seconds, pictures = _duration_and_count(ts, seconds, fps)
+    seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
     _, q = evenly_spaced_attitudes(ts, states, pictures)
-    box = _box_and_tip(body)
+    box = _box_of_drawing(body)
     try:
         import viser
     except ModuleNotFoundError as error:
@@ -215,7 +223,7 @@ def player(
     try:
         server = viser.ViserServer(host="127.0.0.1", verbose=False)
         try:
-            page = _record(server, *box, q, seconds)
+            page = _record_page(server, *box, q, seconds)
         finally:
             server.stop()
     finally:
@@ -223,9 +231,19 @@ def player(
     return Film(page.encode("utf-8"), "html", height)
 
 
-def _record(
+def _record_page(
     server: Any, corners: np.ndarray, tip: np.ndarray, reach: float, q: np.ndarray, seconds: float
 ) -> str:
+    """Draw a tumbling box in a server of viser, and return the HTML page that plays the recorded
+    motion.
+
+    - `server`: the server, without connected browsers.
+    - `corners`: (8, 3) the corners of the box, body axes.
+    - `tip`: (3,) the end of its longest half-axis, body axes, whose path is drawn.
+    - `reach`: the half diagonal of the box.
+    - `q`: (N, 4) the attitudes, body → world, evenly spaced in time.
+    - `seconds`: the duration of the film, s.
+    """
     scene = server.scene
     scene.set_up_direction("+z")
     server.initial_camera.position = tuple(1.8 * reach * np.array([1.0, -1.2, 0.7]))
@@ -267,12 +285,12 @@ def evenly_spaced_attitudes(
     return when, between / np.linalg.norm(between, axis=1, keepdims=True)
 
 
-def _box_and_tip(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return three things: the corners (8, 3) of the body's box; the end (3,) of the longest
-    half-axis;
-    and the half diagonal.
+def _box_of_drawing(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return three things, for the uniform box that moves as the body does: its corners (8, 3); the
+    end (3,) of its longest half-axis; and half of its diagonal.
 
-    Corners and end are in body axes.
+    Corners and end are in body axes. Lengths are in m for `MassProperties`, and relative to the
+    longest half-axis for an `Inertia`.
     """
     half, turn = box_of(body)
     longest = np.argmax(half)

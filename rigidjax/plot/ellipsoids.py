@@ -33,8 +33,7 @@ def inertia_ellipsoid(
     **Arguments:** `body` an `Inertia`, a `MassProperties` or a `rigidjax.identify.Fit`; `truth` a
     body to compare with, as a broken line; `samples` the number of sampled bodies; `title`; `ax`
     three axes. **Returns** the axes (3,), for the planes xy, xz and yz of the body frame.
-    **Raises** `ValueError`
-    for a body without extension.
+    **Raises** `ValueError` for a body without extension.
 
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
     ['x, m', 'x, m', 'y, m']
@@ -44,16 +43,16 @@ def inertia_ellipsoid(
     size = 1.0 if solid else float(np.trace(np.asarray(best.second_moment)))
     if not size > 0:
         raise ValueError("body: wanted a body with an extension, got 𝔖 = 0; there is no ellipsoid")
-    shapes = {"body": np.asarray(_drawn_matrix(best))[None] / size}
+    shapes = {"body": np.asarray(_matrix_of_ellipsoid(best))[None] / size}
     if drawn is not None:
-        shapes["cloud"] = np.asarray(jax.vmap(_drawn_matrix)(drawn)) / size
+        shapes["cloud"] = np.asarray(jax.vmap(_matrix_of_ellipsoid)(drawn)) / size
     if truth is not None:
-        other = np.asarray(_drawn_matrix(truth))
+        other = np.asarray(_matrix_of_ellipsoid(truth))
         # If one of the two bodies has no size, only the shapes are compared.
         own = solid and isinstance(truth, MassProperties)
         shapes["truth"] = other[None] / (1.0 if own else float(np.trace(other)))
     ax = axes_of_shape(ax, (3,), ncols=3, figsize=(10.5, 3.9))
-    _outlines(ax, shapes, "m" if solid else "relative size")
+    _draw_outlines(ax, shapes, "m" if solid else "relative size")
     if len(shapes) > 1:
         how = dict(loc="outside lower center", ncols=3, frameon=False)
         ax[0].figure.legend(*ax[0].get_legend_handles_labels(), **how)
@@ -62,10 +61,12 @@ def inertia_ellipsoid(
 
 
 def _body_and_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
-    """Return two things: the body; and `samples` bodies that are sampled from a fit.
+    """Return two things: the body; and bodies sampled from the uncertainty of a fit, with a leading
+    axis, or `None` without a fit.
 
-    The sampled bodies, from the Gaussian approximation of the fit, have a leading axis; without a
-    fit the second is `None`. `body` is an inertia, mass properties or a fit.
+    - `body`: an `Inertia`, a `MassProperties`, or a `Fit` of one body, whose Gaussian approximation
+      is sampled.
+    - `samples`: the number of sampled bodies.
     """
     if isinstance(body, Inertia | MassProperties):
         return validation.require_single_body(body, (Inertia, MassProperties), "body"), None
@@ -83,11 +84,13 @@ def _body_and_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties
     return body.body, jax.vmap(lambda step: body.model.bodies(x + step))(steps)
 
 
-def _outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
-    """Draw outlines of ellipsoids r·A⁻¹r = 1 on the planes xy, xz and yz.
+def _draw_outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
+    """Draw the outlines of ellipsoids r·A⁻¹r = 1 on the planes xy, xz and yz, with a legend.
 
-    **Arguments:** `ax` (3,); `shapes` the matrices A (n, 3, 3) by name: `body`, and if given
-    `cloud` (sampled bodies) and `truth`; `unit` of length.
+    - `ax`: (3,) matplotlib axes, one for each plane.
+    - `shapes`: the matrices A (n, 3, 3) by name: `body`, and if given `cloud` (bodies sampled from
+      the uncertainty) and `truth`.
+    - `unit`: the unit of length, in the labels.
     """
     # The outline of r·A⁻¹r = 1 reaches √A_ii along axis i. All three panels have the same scale,
     # for comparison.
@@ -99,11 +102,13 @@ def _outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
     for one, (i, j) in zip(ax, _PLANES, strict=True):
         if "cloud" in shapes:
             for shape in shapes["cloud"]:
-                one.plot(*_outline(shape, i, j), color=COLOURS[5], lw=0.5, alpha=0.25)
+                one.plot(*_outline_of_ellipsoid(shape, i, j), color=COLOURS[5], lw=0.5, alpha=0.25)
             one.plot([], [], color=COLOURS[5], lw=1, label=label)
-        one.plot(*_outline(shapes["body"][0], i, j), color=COLOURS[0], lw=2, label="body")
+        one.plot(
+            *_outline_of_ellipsoid(shapes["body"][0], i, j), color=COLOURS[0], lw=2, label="body"
+        )
         if "truth" in shapes:
-            outline = _outline(shapes["truth"][0], i, j)
+            outline = _outline_of_ellipsoid(shapes["truth"][0], i, j)
             one.plot(*outline, color=COLOURS[1], lw=1.6, ls="--", label="truth")
         one.set_aspect("equal")
         one.set(xlim=(-reach, reach), ylim=(-reach, reach))
@@ -111,19 +116,23 @@ def _outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
         one.grid(alpha=0.3)
 
 
-def _drawn_matrix(body: Inertia | MassProperties) -> Any:
-    """Return the matrix A (3, 3) whose ellipsoid r·A⁻¹r = 1 is drawn: 5𝔖/m, or 𝔖 without a mass
-    m.
+def _matrix_of_ellipsoid(body: Inertia | MassProperties) -> Any:
+    """Return the matrix A (3, 3) of the ellipsoid r·A⁻¹r = 1 that is drawn for a body: 5𝔖/m, m²,
+    for a body with mass m and second moment 𝔖, or 𝔖 for an `Inertia`.
     """
     if isinstance(body, MassProperties):
         return body.second_moment * (5.0 / body.mass)
     return body.second_moment
 
 
-def _outline(shape: np.ndarray, i: int, j: int) -> np.ndarray:
-    """Return points (2, 121) on the silhouette of r·A⁻¹r = 1, seen along a coordinate axis.
+def _outline_of_ellipsoid(shape: np.ndarray, i: int, j: int) -> np.ndarray:
+    """Return 121 points (2, 121) on the outline of the ellipsoid r·A⁻¹r = 1, as it is seen along a
+    coordinate axis.
 
-    It is the ellipse of the 2 × 2 block of A = `shape` for the axes `i` and `j`.
+    It is the ellipse of the 2 × 2 block of A for the two other axes.
+
+    - `shape`: (3, 3) the matrix A.
+    - `i`, `j`: the indices, 0 to 2, of the two axes of the picture.
     """
     values, vectors = np.linalg.eigh(shape[np.ix_((i, j), (i, j))])
     angle = np.linspace(0, 2 * np.pi, 121)

@@ -46,7 +46,7 @@ def fit(
     count = len(record.readings)
     size, how = (max(6.2 * count, 7.5), 6), dict(squeeze=False, layout="constrained")
     figure, axes = plt.subplots(2, count, figsize=size, sharex=True, height_ratios=(2, 1), **how)
-    dense = _fill_between_samples(fit_result, record, index)
+    dense = _dense_states(fit_result, record, index)
     for column, (reading, errors) in enumerate(zip(record.readings, left, strict=True)):
         upper, lower = axes[:, column]
         _draw_sensor(upper, lower, record.t, reading, errors, dense, (seconds, rate, rate_unit))
@@ -60,13 +60,15 @@ def fit(
     return figure
 
 
-def _fill_between_samples(
-    fit_result: Any, record: Any, index: int
-) -> tuple[np.ndarray, Any] | None:
-    """Return 800 times and the fitted states at these times, for a smooth line between the
-    readings.
+def _dense_states(fit_result: Any, record: Any, index: int) -> tuple[np.ndarray, Any] | None:
+    """Return two things: 800 evenly spaced times, s; and the fitted states at these times, for a
+    smooth line between the readings.
 
     The result is `None` under a torque or for more than 300 readings.
+
+    - `fit_result`: a `Fit`.
+    - `record`: one of its recordings.
+    - `index`: the index of this recording in the fit.
     """
     model, body, state0 = fit_result.model, fit_result.body, fit_result.state0
     if model.torque is not None or record.t.shape[0] > 300:
@@ -88,21 +90,32 @@ def _draw_sensor(
     dense_states: tuple[np.ndarray, PyTree] | None,
     units: tuple[float, float, str],
 ) -> None:
+    """Draw the readings of one sensor with the fitted line above, and the residuals below.
+
+    - `upper_axes`, `lower_axes`: matplotlib axes.
+    - `ts`: (T,) the times of the readings, s.
+    - `reading`: the sensor with its readings and their mask.
+    - `errors`: (T, k) the residuals, in the unit of the sensor.
+    - `dense_states`: times and fitted states for a smooth line, as `_dense_states` returns them, or
+      `None`.
+    - `units`: the number of seconds in the unit of time, the factor from rad/s to the unit of
+      rates, and the name of this unit.
+    """
     (seconds, rate, rate_unit), seen, sensor = units, reading.host_mask, reading.sensor
     t = np.asarray(ts) / seconds
     values = np.asarray(reading.values).reshape(len(t), -1)
     names: tuple[str, ...] = ("x", "y", "z")[: values.shape[1]]
     scale, unit, line_t = 1.0, sensor.unit, t
     if sensor.reading_shape == (4,):
-        read, scale = _long_axis(values), 180 / np.pi
+        read, scale = _body_z_in_world(values), 180 / np.pi
         # The prediction is the reading, turned back by the residual.
         back = jax.vmap(lambda q, e: quaternion.multiply(q, quaternion.exp(-e)))
-        line = _long_axis(back(jnp.asarray(values), jnp.asarray(errors)))
+        line = _body_z_in_world(back(jnp.asarray(values), jnp.asarray(errors)))
         names = tuple(f"{axis} of body z" for axis in "xyz")
         upper_axes.set_ylabel("body z axis in world axes")
         unit = "deg (body axes)"
         if dense_states is not None:
-            line_t, line = dense_states[0] / seconds, _long_axis(dense_states[1].q)
+            line_t, line = dense_states[0] / seconds, _body_z_in_world(dense_states[1].q)
     else:
         if sensor.unit == "rad/s":
             scale, unit, names = rate, rate_unit, ("Ωx", "Ωy", "Ωz")
@@ -127,5 +140,6 @@ def _draw_sensor(
             lower_axes.plot(t[seen], errors[seen, axis] * scale, color=colour, alpha=0.7, **mark)
 
 
-def _long_axis(q: ArrayLike) -> np.ndarray:
+def _body_z_in_world(q: ArrayLike) -> np.ndarray:
+    """Return the body z axis (T, 3) in world axes for the attitudes `q` (T, 4), body → world."""
     return np.asarray(jax.vmap(lambda one: quaternion.rotate(one, jnp.eye(3)[2]))(jnp.asarray(q)))

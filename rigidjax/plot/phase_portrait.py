@@ -29,17 +29,15 @@ def phase_portrait(
     energy.
 
     `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ` with I₁ the moment of inertia
-    across the axis, the mass m, gravity g, the distance l of the centre
-    of mass from the pivot, and two momenta of the initial state: p_φ about the vertical and p_ψ
-    about
-    the axis of the top. The cross marks steady precession, where the energy is least. Source:
-    Landau and Lifshitz, Mechanics, § 35, problem 1.
+    across the axis, the mass m, gravity g, the distance l of the centre of mass from the pivot, and
+    two momenta of the initial state: p_φ about the vertical and p_ψ about the axis of the top. The
+    cross marks steady precession, where the energy is least. Source: Landau and Lifshitz,
+    Mechanics, § 35, problem 1.
 
     **Arguments:** `inertia` about the pivot; `top` the weight and the centre of mass, which is on
     the axis of symmetry; `states` of one body with a leading time axis; `levels` the number of thin
-    curves; `title`; `ax`. **Returns** the axes. **Raises** `ValueError` for a
-    body that is not symmetric about the axis through the centre of mass, and for one without
-    weight.
+    curves; `title`; `ax`. **Returns** the axes. **Raises** `ValueError` for a body that is not
+    symmetric about the axis through the centre of mass, and for one without weight.
 
     >>> body = rj.Inertia.from_principal(2.0, 2.0, 1.0)
     >>> top = rj.torques.HeavyTop(1.0, [0.0, 0, 1.0], [0, 0, -9.81])
@@ -53,7 +51,7 @@ def phase_portrait(
             getattr(_checks.require_instance(top, HeavyTop, "top"), name), size, f"top.{name}"
         )
     levels = _checks.integer(levels, "levels", 1)
-    across, along, axis, weight, up = _symmetric_top(inertia, top)
+    across, along, axis, weight, up = _constants_of_top(inertia, top)
     m = style.rotation_matrices(style.attitudes_on_host(states))
     omega = np.einsum("tij,tj->ti", m, rows_on_host(states.omega, 3, "states.omega"))
     first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], states)
@@ -97,14 +95,18 @@ def phase_portrait(
     return ax
 
 
-def _symmetric_top(
+def _constants_of_top(
     inertia: Inertia, top: HeavyTop
 ) -> tuple[float, float, np.ndarray, float, np.ndarray]:
-    """Return five things: the moments of inertia I₁ across and I₃ about the axis of symmetry; that
-    axis
-    (3,), body frame; m g l; and the upward unit vector (3,), world frame.
+    """Return five constants of a heavy symmetric top: the moments of inertia I₁ across and I₃ about
+    the axis of symmetry, kg m²; the axis (3,), body frame, from the pivot to the centre of mass;
+    the torque m g l, N m, of the weight m g at the distance l from the pivot; and the upward unit
+    vector (3,), world frame.
 
     Raise an error for a body without this symmetry or without weight.
+
+    - `inertia`: the inertia about the pivot.
+    - `top`: the torque of the weight, with mass, centre of mass and gravity.
     """
     tensor = np.asarray(inertia.tensor, dtype=float)
     com, gravity = np.asarray(top.com, dtype=float), np.asarray(top.gravity, dtype=float)

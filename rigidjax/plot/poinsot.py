@@ -59,8 +59,7 @@ def polhode(
     The coordinate axes are the principal axes, with the smallest moment first; the unit is h, the
     initial |Π|. Thin lines are the paths of other energies at the same h; broken lines are the
     separatrix through the middle axis. Behind the sphere the path of this motion is dotted, and all
-    other lines are faint. Source: Landau and Lifshitz,
-    Mechanics, § 37.
+    other lines are faint. Source: Landau and Lifshitz, Mechanics, § 37.
 
     **Arguments:** `inertia`; `states` of one body with a leading time axis; `energies` the number
     of thin lines; `title`; `ax` your 3-D axes. **Returns** the axes. **Raises** `ValueError`
@@ -101,7 +100,7 @@ def polhode(
     # If all moments are equal, the energy is constant on the sphere, and there are no lines to
     # draw.
     if i[2] - i[0] > 1e-9 * i[2]:
-        _draw_other_energies(ax, i, energies)
+        _draw_energy_curves(ax, i, energies)
     how = dict(hidden_style={"ls": (0, (1, 1)), "lw": 1.8}, label="this motion", zorder=5)
     style.draw_around_ball(ax, pi, color=COLOURS[1], lw=2.6, **how)
     ax.plot(*pi[:1].T, color=COLOURS[1], marker="o", ms=6, ls="", label="start", zorder=6)
@@ -117,11 +116,13 @@ def polhode(
     return ax
 
 
-def _draw_other_energies(ax: Any, i: np.ndarray, energies: int) -> None:
-    """Draw curves of equal energy, and the separatrix, on the unit momentum sphere.
+def _draw_energy_curves(ax: Any, i: np.ndarray, energies: int) -> None:
+    """Draw curves of equal energy, and the separatrix (the curve through the middle axis), on the
+    unit sphere of the angular momentum.
 
-    **Arguments:** `ax` 3-D axes; `i` (3,) ascending principal moments; `energies` the number of
-    curves without the separatrix.
+    - `ax`: 3-D axes of matplotlib.
+    - `i`: (3,) the principal moments, ascending.
+    - `energies`: the number of curves without the separatrix.
     """
     import contourpy
 
@@ -150,12 +151,10 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
 
     The invariable plane is perpendicular to the angular momentum. The motion must be free: the
     component of ω along the angular momentum h is then constant, 2T/h with the kinetic energy T.
-    The
-    circles have the least and the largest distance of this path from the momentum as radius.
-    **Arguments:** `inertia`; `states`
-    (`Attitude`) of one body with a leading time axis; `title`; `ax`. **Returns** the axes.
-    **Raises** `ValueError` for a body at rest, and for an angular momentum whose
-    direction changes by more than 1e-3 rad.
+    The circles have the least and the largest distance of this path from the momentum as radius.
+    **Arguments:** `inertia`; `states` (`Attitude`) of one body with a leading time axis; `title`;
+    `ax`. **Returns** the axes. **Raises** `ValueError` for a body at rest, and for an angular
+    momentum whose direction changes by more than 1e-3 rad.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], [0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])

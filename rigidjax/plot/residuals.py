@@ -57,6 +57,15 @@ def residuals(
 def _draw_sensor_residuals(
     row: np.ndarray, t: np.ndarray, standardised: np.ndarray, mask: np.ndarray
 ) -> None:
+    """Draw the residuals of one sensor in four panels: over time, as a histogram, as
+    autocorrelation, and as power spectrum.
+
+    - `row`: (4,) matplotlib axes.
+    - `t`: (T,) the times, in the unit of the picture.
+    - `standardised`: (T, k) the residuals divided by their standard deviation, for each axis of the
+      sensor.
+    - `mask`: (T,) true where there is a reading.
+    """
     over_time, spread, memory, spectrum = row
     colours, names = COLOURS[: standardised.shape[1]], "xyz"[: standardised.shape[1]]
     everything = standardised[mask].ravel()
@@ -104,7 +113,7 @@ def _draw_sensor_residuals(
     number = int(mask.sum())
     lags = np.arange(1, max(2, min(40, number // 2)))
     for values, colour in zip(standardised[mask].T, colours, strict=True):
-        memory.plot(lags, _correlation(values, lags), ".-", color=colour, ms=4, lw=0.8)
+        memory.plot(lags, _autocorrelation(values, lags), ".-", color=colour, ms=4, lw=0.8)
         spectrum.plot(*power_spectrum(t[mask], values), color=colour, lw=1)
     band = 2 / np.sqrt(max(number, 1))
     memory.axhspan(-band, band, color="0.9", zorder=0)
@@ -136,7 +145,12 @@ def power_spectrum(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
     return frequencies, lombscargle(t, values - values.mean(), 2 * np.pi * frequencies)
 
 
-def _correlation(values: np.ndarray, lags: np.ndarray) -> np.ndarray:
+def _autocorrelation(values: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """Return the correlation (L,) of a series with itself, at each of the given lags.
+
+    - `values`: (T,) the series; its mean is subtracted.
+    - `lags`: (L,) the lags, positive whole numbers of samples.
+    """
     centred = values - values.mean()
     whole = float(centred @ centred)
     if not whole > 0:

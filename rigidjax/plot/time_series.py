@@ -63,6 +63,14 @@ def motion(
 
 
 def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, kind: str) -> None:
+    """Draw the attitude of a body against time on matplotlib axes.
+
+    - `ax`: the axes.
+    - `t`: (T,) the times, in the unit of the picture.
+    - `q`: (T, 4) the attitudes, body → world.
+    - `kind`: `quaternion`, `axes` (the components of the body axes along world z) or `angles`
+      (3-1-3 Euler angles).
+    """
     _checks.require_option(kind, ("quaternion", "axes", "angles"), "attitude")
     if kind == "quaternion":
         names, lines, label = [f"q{n}" for n in "wxyz"], q.T, "attitude q"
@@ -78,6 +86,9 @@ def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, kind: str) -> None:
 
 
 def _angles_in_degrees(q: np.ndarray) -> np.ndarray:
+    """Return the 3-1-3 Euler angles (T, 3), degrees, of the attitudes `q` (T, 4); an angle is NaN
+    where it jumps by more than 180°, so that its curve is interrupted.
+    """
     degrees = np.degrees(np.asarray(jax.vmap(euler.from_quaternion)(jnp.asarray(q))))
     # Where an angle jumps from 180° to −180° the curve is interrupted: a line across the whole
     # picture would look like a motion.

@@ -44,21 +44,32 @@ class Sums(NamedTuple):
 
 
 def sum_table(light: tuple[Array, ...], highest: float) -> Sums:
-    """Return the table of sums up to the frequency `highest`, 1/span.
+    """Return the table of sums over the readings, from which `lattice_misfits` computes χ², up to
+    the frequency `highest`.
 
-    `light` holds three arrays (T,): the times divided by the span; the values divided by their
-    noise; and one over the noise.
+    - `light`: the light curve as three arrays (T,): the times of the readings divided by the span
+      (the time from the first to the last reading); the values divided by their noise; and one over
+      the noise.
+    - `highest`: the highest frequency of the table, 1/span.
     """
     size = math.ceil(highest * DENSE) + 2 * NEAR
     grid = (np.arange(-(-size // ROWS) * ROWS) - NEAR // 2) / DENSE
     x, z, w = light
-    window, data = _table(jnp.asarray(grid, x.dtype), x, z, w)
+    window, data = _sums_at_frequencies(jnp.asarray(grid, x.dtype), x, z, w)
     return Sums(window, data, jnp.sum(z * z))
 
 
 @jax.jit
-def _table(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
-    """Return the sums `window` and `data` of `Sums` at the frequencies `grid`."""
+def _sums_at_frequencies(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
+    """Return two arrays (F,) of complex sums over the readings of a light curve, one entry for each
+    frequency f of `grid`: `Σ w² exp 2πi f (x − ½)`; and `Σ w z exp 2πi f (x − ½)`.
+
+    - `grid`: (F,) the frequencies, 1/span, where the span is the time from the first to the last
+      reading.
+    - `x`: (T,) the times of the readings divided by the span.
+    - `z`: (T,) the values divided by their noise.
+    - `w`: (T,) one over the noise.
+    """
 
     def sums_at(f: Array) -> tuple[Array, Array]:
         angle = 2.0 * math.pi * f * (x - 0.5)
@@ -72,9 +83,17 @@ def _table(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
     return jax.lax.map(sums_at, grid, batch_size=BATCH)
 
 
-def _interpolate(table: Array, f: Array) -> Array:
-    """Return the sums at the frequencies f, 1/span, from the polynomial (Lagrange) through the
-    nearest entries of the `table`.
+def _interpolate_sums(table: Array, f: Array) -> Array:
+    """Return complex sums over the readings at the frequencies `f`, interpolated in a `table` of
+    such sums.
+
+    The interpolation is the polynomial (Lagrange) through the `NEAR` nearest entries.
+
+    - `table`: (F,) complex, the sums at the frequencies (k − NEAR/2)/DENSE for k = 0, 1, …, in
+      1/span, where the span is the time from the first to the last reading.
+    - `f`: the wanted frequencies, 1/span, an array of any shape, which is also the shape of the
+      result. The sum at a negative frequency is the complex conjugate of the sum at the opposite
+      frequency.
     """
     place = jnp.abs(f) * DENSE
     first = jnp.floor(place)
@@ -94,28 +113,40 @@ def _interpolate(table: Array, f: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnums=2)
 def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pairs"]:
-    """Return χ² of the best series `Σ c_jk exp 2πi (j f₁ + k f₂) t` for each pair (f₁, f₂).
+    """Return χ² of the best Fourier series `Σ c_jk exp 2πi (j f₁ + k f₂) t` for each pair of
+    frequencies (f₁, f₂).
 
-    The `pairs` (P, 2) are in 1/span. The sum has |j| ≤ 2 and |k| ≤ `order`.
+    The series has the multiples |j| ≤ 2 and |k| ≤ `order`; the coefficients c_jk are those of the
+    least-squares fit to the readings.
+
+    - `pairs`: (P, 2) the frequencies f₁ and f₂, 1/span, where the span is the time from the first
+      to the last reading.
+    - `table`: the sums over the readings, as `sum_table` returns them.
+    - `order`: the largest multiple of f₂.
     """
     js, ks = np.meshgrid(np.arange(-FIRST, FIRST + 1), np.arange(-order, order + 1), indexing="ij")
     js, ks = js.ravel(), ks.ravel()
     dj, dk = js[None, :] - js[:, None] + 2 * FIRST, ks[None, :] - ks[:, None] + 2 * order
 
-    def rows(values: Array, pair: Array, first: int, second: int) -> Array:
-        """Return the sums (2 first + 1, 2 second + 1) at all multiples of both frequencies of a
-        pair.
+    def sums_at_multiples(sums: Array, pair: Array, first_order: int, second_order: int) -> Array:
+        """Return the sums (2 m + 1, 2 n + 1) over the readings at the frequencies j f₁ + k f₂, for
+        |j| ≤ m and |k| ≤ n.
+
+        - `sums`: (F,) the table of these sums, as in a field of `Sums`.
+        - `pair`: (2,) the frequencies f₁ and f₂, 1/span.
+        - `first_order`: m, the largest multiple of f₁.
+        - `second_order`: n, the largest multiple of f₂.
         """
         # Only half of the sums are interpolated, since sums at opposite frequencies are complex
         # conjugates.
-        m, n = np.arange(first + 1.0), np.arange(-second, second + 1.0)
+        m, n = np.arange(first_order + 1.0), np.arange(-second_order, second_order + 1.0)
         f = jnp.asarray(m[:, None]) * pair[0] + jnp.asarray(n[None, :]) * pair[1]
-        half = _interpolate(values, f)
+        half = _interpolate_sums(sums, f)
         return jnp.concatenate([jnp.conj(half[:0:-1, ::-1]), half])
 
     def misfit_of_pair(pair: Array) -> Array:
-        window = rows(table.window, pair, 2 * FIRST, 2 * order)
-        side = jnp.conj(rows(table.data, pair, FIRST, order).ravel())
+        window = sums_at_multiples(table.window, pair, 2 * FIRST, 2 * order)
+        side = jnp.conj(sums_at_multiples(table.data, pair, FIRST, order).ravel())
         gram = window[dj, dk]
         # The small diagonal keeps the matrix definite if two columns are equal at all times of the
         # readings.
@@ -128,8 +159,11 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
 
 
 def least_squares_remainder(rows: Array, z: Array) -> tuple[Float[Array, ""], Float[Array, " k"]]:
-    """Return two things: the smallest value of `|z − cᵀ rows|²` over c, for `rows` (k, T) and z
-    (T,); and the coefficients c (k,) there.
+    """Fit z by a linear combination of rows. Return two things: the smallest value of `|z − cᵀ
+    rows|²` over the coefficients c; and the coefficients c (k,) there.
+
+    - `rows`: (k, T) the k functions whose sum is fitted, at T times.
+    - `z`: (T,) the values that are fitted.
     """
     gram, side = rows @ rows.T, rows @ z
     gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(side.size, dtype=z.dtype)
@@ -138,15 +172,25 @@ def least_squares_remainder(rows: Array, z: Array) -> tuple[Float[Array, ""], Fl
 
 
 def pad_rows(rows: np.ndarray) -> np.ndarray:
-    """Return `rows` padded with copies of its first row to the length `FEW` or a multiple of
-    `MANY`, so that few programs are compiled.
+    """Return the array `rows` (n, …) padded with copies of its first row, so that few different
+    lengths occur and few programs are compiled.
+
+    The new length is `FEW` or a multiple of `MANY`.
     """
     size = FEW if len(rows) <= FEW else -(-len(rows) // MANY) * MANY
     return np.concatenate([rows, np.repeat(rows[:1], size - len(rows), axis=0)])
 
 
 def lattice_chi2(table: Sums, pairs: np.ndarray, order: int) -> np.ndarray:
-    """Return `lattice_misfits` for any number of pairs (P, 2), as a NumPy array."""
+    """Return χ² (P,) of the best Fourier series in two frequencies for any number P of pairs, as a
+    NumPy array.
+
+    The pairs are given to `lattice_misfits` in chunks, so that few programs are compiled.
+
+    - `table`: the sums over the readings, as `sum_table` returns them.
+    - `pairs`: (P, 2) the two frequencies of each series, 1/span.
+    - `order`: the largest multiple of the second frequency.
+    """
     out = [np.zeros(0)]
     for first in range(0, len(pairs), MANY):
         chunk = pairs[first : first + MANY]
@@ -156,9 +200,12 @@ def lattice_chi2(table: Sums, pairs: np.ndarray, order: int) -> np.ndarray:
 
 
 def side_peaks(table: Sums, highest: float) -> np.ndarray:
-    """Return the positions of the highest side peaks of the spectral window, in 1/span.
+    """Return the positions (n,), n ≤ 2, of the highest side peaks of the spectral window, in
+    1/span, the highest first.
 
-    A spectral line whose frequency is shifted by such a position gives nearly the same readings.
+    The spectral window is the spectrum of the times of the readings alone, which is the field
+    `window` of the `table`. A line of the spectrum whose frequency is shifted by such a position
+    gives nearly the same readings. Peaks are sought up to the frequency `highest`, 1/span.
     """
     size = math.ceil(highest * DENSE)
     window = np.abs(np.asarray(table.window))[NEAR // 2 : NEAR // 2 + size]

@@ -164,7 +164,7 @@ def fit_light_curve(
     A&A 376:302, doi:10.1051/0004-6361:20010935. **Raises:** `ValueError` for a model with other
     sensors, several recordings or a torque; `TypeError` under a trace.
     """
-    reading = _only_reading(model)
+    reading = _require_one_brightness(model)
     _checks.integer(count, "count", 1)
     _checks.positive_float(tolerance, "tolerance")
     say = lambda line: None  # noqa: E731
@@ -180,19 +180,22 @@ def fit_light_curve(
     say(f"{len(starts)} starts")
     whole = stacking.pad_to_few_lengths(model)
     ends = search_from(whole, starts, noise_of(reading, flux, pairs.scatter), tolerance)
-    aliases = _aliases(whole, ends)
+    aliases = _distinct_motions(whole, ends)
     say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
     best = fit(whole, starts=1, initial=aliases[0].x, tolerance=tolerance)
-    result = _result(best, aliases, pairs, used >= count)
+    result = _light_curve_of_fit(best, aliases, pairs, used >= count)
     # The result has the readings without the padding that the search added.
     own = eqx.tree_at(lambda m: m.slots, model, best.model.slots)
     linear = best.linear and best.linear.first_times(model.records.t.shape[1])
     return eqx.tree_at(lambda one: (one.fit.model, one.fit.linear), result, (own, linear))
 
 
-def _only_reading(model: Model) -> Reading:
-    """Return the reading of the model's only sensor, and raise an error for another kind of
-    model.
+def _require_one_brightness(model: Model) -> Reading:
+    """Return the reading of the model's only sensor, a `Brightness`, without the axis of
+    recordings.
+
+    Raise `TypeError` for traced numbers, and `ValueError` for a model with another sensor, several
+    sensors, recordings or bodies, or a torque.
     """
     require_one(model)
     if not _checks.is_known(model):
@@ -216,11 +219,15 @@ def _only_reading(model: Model) -> Reading:
 
 @eqx.filter_jit
 def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Array]:
-    """Return two things: the logarithms (4,) of the rotation period, the precession period and the
-    two ratios of moments; and h²/2T divided by the middle moment.
+    """Return two things: the logarithms (4,) of the rotation period, s, of the precession period,
+    s, and of the two smaller moments divided by the largest; and the number h²/2T divided by the
+    middle moment.
 
     Here h is the angular momentum and T the kinetic energy. If the second result is below 1, the
-    motion is in the long-axis mode.
+    motion is in the long-axis mode, else in the short-axis mode.
+
+    - `x`: (n,) the free numbers of the model, which determine the body and its initial state.
+    - `model`: a model of one recording of a free body.
     """
     body: Any = model.bodies(x)
     inertia = Inertia(tensor_of(body))
@@ -233,14 +240,23 @@ def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Arr
 
 @eqx.filter_jit
 def _period_derivatives(x: Float[Array, " n"], model: Model) -> Float[Array, "4 n"]:
-    """Return the derivatives (4, n), with respect to the free numbers x, of the logarithms of the
-    rotation period, the precession period and the two ratios of moments.
+    """Return the derivatives (4, n) of the logarithms of the rotation period, the precession period
+    and the two ratios of moments, with respect to the free numbers.
+
+    - `x`: (n,) the free numbers of the model, at which the derivatives are taken.
+    - `model`: a model of one recording of a free body.
     """
     return jax.jacfwd(lambda x: _periods_and_ratios(x, model)[0])(x)
 
 
-def _alias(model: Model, x: Array, cost: float) -> Alias:
-    """Return the motion of the free numbers x, with half of its χ² = `cost`, as an `Alias`."""
+def _motion_of_free_numbers(model: Model, x: Array, cost: float) -> Alias:
+    """Return the motion with the free numbers `x` as an `Alias`, with its periods, mode and ratios
+    of moments.
+
+    - `model`: the model of the light curve.
+    - `x`: (n,) the free numbers.
+    - `cost`: half of χ² of the motion.
+    """
     numbers, middle = (np.asarray(v) for v in _periods_and_ratios(x, model))
     rotation, precession, *ratios = np.exp(numbers)
     mode = "long" if middle < 1 else "short"
@@ -248,15 +264,21 @@ def _alias(model: Model, x: Array, cost: float) -> Alias:
     return Alias(x, cost, *motion, explains=False)
 
 
-def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
-    """Return the different motions among the results `ends` of searches, in the order of their
-    misfits.
+def _distinct_motions(model: Model, ends: list[Attempt]) -> list[Alias]:
+    """Return one `Alias` for each different motion among the results of searches, in the order of
+    their misfits.
+
+    Results whose misfit is not finite are left out; it is an error if no result is left.
+
+    - `model`: the model of the light curve.
+    - `ends`: the results of the searches, each with its free numbers `x` and its `cost`, half of
+      χ².
     """
     out: list[Alias] = []
     for end in sorted(ends, key=lambda one: float(one.cost)):
         if not np.isfinite(float(end.cost)):
             continue
-        alias = _alias(model, end.x, float(end.cost))
+        alias = _motion_of_free_numbers(model, end.x, float(end.cost))
         if not any(_is_same_motion(alias, other, SAME) for other in out):
             out.append(alias)
     if not out:
@@ -268,8 +290,11 @@ def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
 
 
 def _is_same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
-    """Return whether two motions have the same mode, and periods and ratios of moments whose
-    logarithms differ by less than `tolerance` (4,).
+    """Return whether the motions `a` and `b` have the same mode, and nearly the same periods and
+    ratios of moments.
+
+    `tolerance` (4,) has the largest differences of the logarithms of the rotation period, the
+    precession period and the two ratios of moments.
     """
     one, other = (np.log([m.rotation, m.precession, *m.ratios]) for m in (a, b))
     return a.mode == b.mode and bool((np.abs(one - other) < tolerance).all())
@@ -277,7 +302,12 @@ def _is_same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
 
 @eqx.filter_jit
 def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
-    """Return the directions half way between sun and observer at each time, in the body frame."""
+    """Return the unit vectors (T, 3) half way between the directions to sun and observer, at the
+    times of the readings, in the axes of the moving body.
+
+    - `x`: (n,) the free numbers of the model, which determine the body and its motion.
+    - `model`: a model of one recording of a free body with a `Brightness` sensor.
+    """
     point = model.unpack(x)
     body, state0 = point.body, point.state0
     motion, t = exact.FreeBody(Inertia(tensor_of(body)), state0), model.records.t[0]
@@ -291,7 +321,14 @@ def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
 
 
 def _allow_for_shape(best: Fit) -> Fit:
-    """Return the fit `best` with a covariance that allows for a body that is not an ellipsoid."""
+    """Return the fit `best` of a light curve with a larger covariance, which allows for a body that
+    is not an ellipsoid.
+
+    The errors of the shape are consider parameters: the brightness is multiplied by 1 + n·S n,
+    where n (3,) is the direction half way between sun and observer in the body frame, and the
+    entries of S (3, 3) are independent with the standard deviation `SHAPE`. All quantities of the
+    fit get new intervals.
+    """
     linear: Any = best.linear
     reading, weight = stacking.pick_records(best.model.records.readings[0], 0), linear.weights[0][0]
     flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
@@ -317,12 +354,16 @@ def _allow_for_shape(best: Fit) -> Fit:
     )
 
 
-def _result(
+def _light_curve_of_fit(
     best: Fit, aliases: list[Alias], pairs: TwoFrequencies, is_incomplete: bool
 ) -> LightCurve:
-    """Return the `LightCurve` of the `best` fit and all motions.
+    """Return the `LightCurve` that holds the best fit and all motions, after a comparison of their
+    misfits.
 
-    `is_incomplete` says that not all pairs of frequencies were tried.
+    - `best`: the fit of the motion with the smallest misfit.
+    - `aliases`: all motions that the search found, the best first.
+    - `pairs`: the pairs of frequencies that were tried.
+    - `is_incomplete`: whether some pairs of frequencies that fit were not tried.
     """
     slopes, wider = (
         np.asarray(_period_derivatives(best.derivative_point, best.model)),
@@ -338,7 +379,7 @@ def _result(
     near = np.fmax(SAME, REACH * own)
     # The costs of the search are compared, since they all have the same noise; the fit may have
     # estimated another noise.
-    first = _alias(best.model, best.x, aliases[0].cost)
+    first = _motion_of_free_numbers(best.model, best.x, aliases[0].cost)
     others = [alias for alias in aliases if not _is_same_motion(alias, first, near)]
     # The margin between misfits is wider if the errors are larger than the noise, or
     # autocorrelated.

@@ -37,8 +37,8 @@ def light_curve(
     - `ts`: (T,) s.
     - `values`: (T,) readings, NaN for a gap.
     - `periods`: s, one, several or none.
-    - `model`: (T,) the prediction of a motion at `ts`, such as
-      `values - fit.residuals[0][:, 0]`, or `None`.
+    - `model`: (T,) the prediction of a motion at `ts`, such as `values - fit.residuals[0][:, 0]`,
+      or `None`.
     - `quantity`: `mag` (bright is up) or `flux`.
     - `time_unit`: `s`, `min`, `h` or `day`.
     - `title`: the title of the picture.

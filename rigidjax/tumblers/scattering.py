@@ -22,8 +22,8 @@ from rigidjax._types import Mat3, Numbers, Scalar, Vec3, Vec3Like
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.rotation.linalg3 import apply, cofactors, cross, determinant, dot
 
-# For arguments below _SMALL the function `_excess` of the law of Lommel and Seeliger is computed by
-# a series of _TERMS terms.
+# For arguments below _SMALL the function `_artanh_excess` of the law of Lommel and Seeliger is
+# computed by a series of _TERMS terms.
 _SMALL, _TERMS = 0.1, 16
 # Each of the two integrals of Lambert's law has this number of Gauss–Legendre points.
 _POINTS = 32
@@ -75,7 +75,7 @@ class Geometric(AbstractScattering):
         return emission
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-        p, _, more, _, _ = _lommel_seeliger_numbers(shape, sun, observer)
+        p, _, more, _, _ = _numbers_of_lit_lune(shape, sun, observer)
         return 0.5 * math.pi * _ratio_or_zero(more, p)
 
 
@@ -97,8 +97,8 @@ class LommelSeeliger(AbstractScattering):
         return 2.0 * incidence * emission / (incidence + emission)
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-        p, q, more, w, rest = _lommel_seeliger_numbers(shape, sun, observer)
-        return math.pi * _ratio_or_zero(more, p + q) * (1.0 - rest * _excess(w, rest))
+        p, q, more, w, rest = _numbers_of_lit_lune(shape, sun, observer)
+        return math.pi * _ratio_or_zero(more, p + q) * (1.0 - rest * _artanh_excess(w, rest))
 
 
 class Lambert(AbstractScattering):
@@ -116,7 +116,7 @@ class Lambert(AbstractScattering):
         return 1.5 * incidence * emission
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-        return 1.5 * _lambert(shape, sun, observer)
+        return 1.5 * _lambert_integral(shape, sun, observer)
 
 
 def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
@@ -145,11 +145,16 @@ def unit_direction(value: Vec3Like | Numbers, name: str) -> Vec3:
     return v / jnp.sqrt(dot(v, v))
 
 
-def _lommel_seeliger_numbers(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
-    """Return five numbers, as defined in the docstring of `LommelSeeliger`: |p|, |q|, |p||q| + p·q,
-    z² and 1 − z².
+def _numbers_of_lit_lune(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
+    """Return the five scalars that determine the brightness of an ellipsoid: |p|, |q|, |p||q| +
+    p·q, z² and 1 − z².
 
-    Here p and q are multiplied by the product of the semi-axes.
+    Here p = D A⁻¹ s and q = D A⁻¹ o, where s and o are the unit vectors to sun and observer, A is
+    the symmetric root of `shape`, D = det A is the product of the semi-axes, and z = |p + q|/(|p| +
+    |q|). They are computed without a loss of digits at any phase.
+
+    - `shape`: (3, 3) m², the tensor A², whose eigenvalues are the squared semi-axes.
+    - `sun`, `observer`: (3,) the unit vectors s and o, body axes.
     """
     minors = cofactors(shape)
     of_sun, turned = apply(minors, sun), cross(sun, observer)
@@ -167,10 +172,12 @@ def _lommel_seeliger_numbers(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Sc
     return p, q, more, 1.0 - rest, rest
 
 
-def _excess(w: Array, complement: Array) -> Array:
-    """Return `(artanh(√w)/√w − 1)/w`, which is 1/3 at w = 0; `complement` is 1 − w.
+def _artanh_excess(w: Array, complement: Array) -> Array:
+    """Return `(artanh(√w)/√w − 1)/w` of an array of numbers `w`, also where w is 0 and the value is
+    1/3.
 
-    The two arguments may be complex.
+    `complement` is 1 − w, given separately since a subtraction would lose its digits near w = 1.
+    The two arrays may be complex.
     """
     near = jnp.abs(w) < _SMALL
     few = jnp.where(near, w, 0.0)
@@ -187,9 +194,13 @@ def _excess(w: Array, complement: Array) -> Array:
     return jnp.where(near, series, ((jnp.log1p(z) - 0.5 * logarithm) / z - 1.0) / far)
 
 
-def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """Return `∫ μ₀ μ dA` over the lit and visible part of the ellipsoid with the tensor E =
-    `shape`.
+def _lambert_integral(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
+    """Return `∫ μ₀ μ dA`, m², over the lit and visible part of an ellipsoid, where μ₀ and μ are the
+    cosines of the angles of incidence and emission.
+
+    - `shape`: (3, 3) m², the tensor E of the ellipsoid `r·E⁻¹r = 1`, whose eigenvalues are the
+      squared semi-axes.
+    - `sun`, `observer`: (3,) unit vectors from the body, body axes.
 
     The integral is computed over the unit normals n of the surface, with dA = det E/(n·En)² dn.
     Over the whole lit part, where μ < 0 on the part that the observer does not see, the integral is
@@ -218,8 +229,12 @@ def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
 
 
 def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """Return `∫ (n·sun)(n·observer)/(n·En)² dn` over the normals n for which both factors are
-    positive, with E = `shape`.
+    """Return `∫ (n·sun)(n·observer)/(n·En)² dn` over the unit vectors n for which both n·sun and
+    n·observer are positive, which is a lune of the unit sphere.
+
+    - `shape`: (3, 3) m², the tensor E of an ellipsoid, whose eigenvalues are the squared semi-axes.
+    - `minors`: (3, 3) the matrix of cofactors of E.
+    - `sun`, `observer`: (3,) unit vectors, body axes.
     """
     pole = cross(sun, observer)
     sine, apart = _root_or_zero(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
@@ -262,14 +277,15 @@ def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scal
     root = jnp.sqrt(d)
     e = jax.lax.complex(root / along, -tilt / along)
     square = e * e
-    excess = _excess(1.0 - square, square)
+    excess = _artanh_excess(1.0 - square, square)
     inner = (e + e * (1.0 - square) * excess).real * dot(pole, e_pole) / root
     inner = inner + (square * excess).real
     return jnp.sum(weight * s * jnp.sin(width - angle) * inner / d)
 
 
 def _root_or_zero(x: Scalar) -> Scalar:
-    """Return √x, with the derivative 0 at x = 0.
+    """Return √x of a number x ≥ 0, with the derivative 0 at x = 0, where that of the root would be
+    infinite.
 
     The argument is zero if an ellipsoid without thickness is seen edge on.
     """
@@ -278,6 +294,8 @@ def _root_or_zero(x: Scalar) -> Scalar:
 
 
 def _ratio_or_zero(x: Scalar, y: Scalar) -> Scalar:
-    """Return x/y, or 0 if y is 0."""
+    """Return the quotient x/y of two scalars, or 0 with finite derivatives if the divisor y ≥ 0 is
+    0.
+    """
     is_positive = y > 0
     return jnp.where(is_positive, x / jnp.where(is_positive, y, 1.0), 0.0)

@@ -35,10 +35,13 @@ MAGNITUDE = 0.4 * np.log(10.0)
 def relative_flux(
     model: Model, reading: Reading
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return three arrays (T,): the times since the first time, s; the fluxes divided by their
-    median; and the noise of these relative fluxes.
+    """Return the light curve as three arrays (T,), without gaps: the times since the first time, s;
+    the fluxes divided by their median; and the noise of these relative fluxes.
 
-    The noise is `None` if it is not known.
+    The noise is `None` if it is not known. Magnitudes are converted to fluxes.
+
+    - `model`: the model, whose recording has the times.
+    - `reading`: the values of the one `Brightness` sensor, their mask and the sensor.
     """
     t = np.asarray(model.records.t[0])
     mask: np.ndarray = reading.host_mask
@@ -96,8 +99,11 @@ def starts_of(
 def _free_numbers_of_candidate(
     model: Model, candidate: starts.Candidate, turn: np.ndarray
 ) -> Array:
-    """Return the free numbers (n,) of a candidate motion; the matrix `turn` (3, 3) rotates
-    principal axes to body axes.
+    """Return the free numbers (n,) of the `model` for a `candidate` motion, from which a search
+    starts.
+
+    - `candidate`: principal moments, initial attitude and initial rate, all in principal axes.
+    - `turn`: (3, 3) the rotation matrix from principal axes to body axes.
     """
     moments = turn @ np.diag(candidate.moments) @ turn.T
     start = model.start(Inertia(jnp.asarray(moments)))
@@ -111,10 +117,12 @@ def _free_numbers_of_candidate(
 
 @jax.jit
 def _rotation_vector(q: Array, turn: Array, reference: Array) -> Array:
-    """Return the rotation vector (3,) from the attitude `reference` to a body whose principal axes
-    have the attitude q.
+    """Return the rotation vector (3,), rad, from a reference attitude to the attitude of a body,
+    whose principal axes have the attitude `q`.
 
-    `turn` is the rotation matrix from principal to body axes.
+    - `q`: (4,) the quaternion that maps principal axes to world axes.
+    - `turn`: (3, 3) the rotation matrix from principal axes to body axes.
+    - `reference`: (4,) the quaternion of the reference attitude, body → world.
     """
     back = quaternion.conjugate(quaternion.from_matrix(turn))
     q = quaternion.multiply(q, back)
@@ -122,10 +130,13 @@ def _rotation_vector(q: Array, turn: Array, reference: Array) -> Array:
 
 
 def noise_of(reading: Reading, flux: np.ndarray, scatter: float) -> tuple[Float[Array, "1 1"], ...]:
-    """Return the noise (1, 1) of the readings in the unit of the sensor.
+    """Return the noise of the readings in the unit of the sensor, as a tuple of one array (1, 1).
 
-    If the noise is not known, it is computed from the `scatter`, the standard deviation of the
-    squared `flux` about its best Fourier series.
+    If the noise is not known, it is computed from the `scatter`.
+
+    - `reading`: the readings of the one `Brightness` sensor.
+    - `flux`: (T,) the fluxes divided by their median.
+    - `scatter`: the standard deviation of the squared `flux` about its best Fourier series.
     """
     sensor: Any = reading.sensor
     if sensor.noise is not None:
@@ -136,8 +147,13 @@ def noise_of(reading: Reading, flux: np.ndarray, scatter: float) -> tuple[Float[
 
 
 def search_from(model: Model, starts: list[Array], noise: Noise, tolerance: float) -> list[Attempt]:
-    """Return the results of the searches: a few steps from all starts, then more steps from the
-    best of the points that were reached.
+    """Return the results of least-squares searches: a few steps from all starts, then more steps
+    from the best of the points that were reached.
+
+    - `model`: the model of the light curve.
+    - `starts`: the free numbers (n,) of each start.
+    - `noise`: the noise of the readings, as `noise_of` returns it.
+    - `tolerance`: the tolerance at which a search has converged.
     """
     points, costs = [], []
     for first in range(0, len(starts), FIRST):
@@ -170,10 +186,17 @@ def _search_from_starts(
     settings: Settings,
     count: np.ndarray | np.generic | Array,
 ) -> Attempt:
-    """Return the results of the searches from the first `count` starts, computed one after another.
+    """Return the results of least-squares searches from the first `count` of the starts, with a
+    leading axis, computed one after another.
 
     The derivatives are finite differences, because exact derivatives of the closed-form motion take
     a hundred times as long.
+
+    - `starts`: (`FIRST`, n) the free numbers of each start; starts after the first `count` only
+      fill the array.
+    - `model`: the model of the light curve.
+    - `noise`: the noise of the readings, as `noise_of` returns it.
+    - `settings`: the tolerance and the number of steps of a search.
     """
 
     def search_from_start(numbered_start: tuple[Array, Array]) -> Attempt:
@@ -199,8 +222,11 @@ def _search_from_starts(
 
 @eqx.filter_jit
 def _with_best_level(starts: Float[Array, "starts n"], model: Model) -> Float[Array, "starts n"]:
-    """Return the `starts`, each with its best-fitting level of brightness; they are unchanged if
-    the level is not free.
+    """Return the `starts` of searches, each with the level of brightness that fits the readings
+    best.
+
+    They are unchanged if the level (the flux or magnitude of a sphere of the same volume at zero
+    phase) is not a free number of the `model`. A start is a vector (n,) of free numbers.
     """
     scene = scene_template(model, model.records)
     path = leaf_at(lambda s: s.sensors[0].level, scene, "level", "the sensor")[0]

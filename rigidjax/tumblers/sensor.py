@@ -41,8 +41,8 @@ class Brightness(AbstractSensor):
     **Arguments:**
 
     - `sun`, `observer`: the directions from the body to sun and observer, world frame, of any
-      length: (3,), or a callable Module of time, t → (3,), such as
-      `torques.Linear(times, directions)`.
+      length: (3,), or a callable Module of time, t → (3,), such as `torques.Linear(times,
+      directions)`.
     - `scattering`: the law, `LommelSeeliger()` (also for `None`), `Geometric()` or `Lambert()` of
       `rj.tumblers.brightness`.
     - `noise`: the standard deviation of a reading, in its unit; `None` to estimate it.
@@ -91,8 +91,8 @@ class Brightness(AbstractSensor):
         offset: NumbersLike | None = None,
     ):
         self.sun, self.observer = (
-            _direction_source(sun, "sun"),
-            _direction_source(observer, "observer"),
+            _checked_direction(sun, "sun"),
+            _checked_direction(observer, "observer"),
         )
         self.scattering, self.noise = law_of(scattering), base.deviations_field(1)(noise)
         self.unit = _checks.require_option(unit, UNITS, "unit")
@@ -158,9 +158,13 @@ class Brightness(AbstractSensor):
 
 
 def directions(sensor: Brightness, t: ScalarLike, dtype: DTypeLike | None = None) -> list[Vec3]:
-    """Return the unit vectors to sun and observer at the time `t`, in the world frame."""
+    """Return two unit vectors (3,), the directions from the body to the sun and to the observer at
+    the time `t`, s, in the world frame.
+
+    If `dtype` is not `None`, the vectors are converted to this type.
+    """
     vectors = vector_at(sensor.sun, t, "sun"), vector_at(sensor.observer, t, "observer")
-    return [_unit_vector(v if dtype is None else v.astype(dtype)) for v in vectors]
+    return [_normalise_vector(v if dtype is None else v.astype(dtype)) for v in vectors]
 
 
 def bisector(sensor: Brightness, t: ScalarLike) -> Vec3:
@@ -168,17 +172,22 @@ def bisector(sensor: Brightness, t: ScalarLike) -> Vec3:
     frame.
     """
     sun, observer = directions(sensor, t)
-    return _unit_vector(sun + observer)
+    return _normalise_vector(sun + observer)
 
 
-def _unit_vector(v: Vec3) -> Vec3:
-    """Return the unit vector along the vector v."""
+def _normalise_vector(v: Vec3) -> Vec3:
+    """Return the unit vector (3,) along the vector `v` (3,), which is not zero."""
     return v / jnp.sqrt(dot(v, v))
 
 
-def _direction_source(source: NumbersLike | Callable[..., Any], name: str) -> Any:
-    """Return a direction as a unit vector, or a function of time unchanged; raise an error for
-    other objects.
+def _checked_direction(source: NumbersLike | Callable[..., Any], name: str) -> Any:
+    """Return the direction of a sensor after a check: a vector (3,) as its unit vector, or a
+    function of time unchanged.
+
+    Raise an error for other objects; `name` is the name of the argument in the message.
+
+    - `source`: a vector (3,) of any length, world frame; or a function that returns one at a time
+      t, s.
     """
     if callable(source):
         return _checks.require_function(source, name, "of time to (3,)")

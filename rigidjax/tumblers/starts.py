@@ -79,7 +79,7 @@ def candidates(
         forms = np.broadcast_to(areas, forms.shape)
     forms = forms / forms.mean(axis=1, keepdims=True)
     arrays = jnp.asarray(moments), jnp.asarray(forms), jnp.asarray(pair), *light
-    motions = _grid(jnp.asarray(mode == "long"), *arrays)
+    motions = _motions_on_grid(jnp.asarray(mode == "long"), *arrays)
     misfits, sides, q, omega = (np.asarray(v) for v in motions)
     # The best phase is taken for each body.
     phase, least = misfits.argmin(axis=1), misfits.min(axis=1)
@@ -88,29 +88,36 @@ def candidates(
         if not np.isfinite(least[k]):
             continue
         at = k, phase[k]
-        in_world = (np.array(product4(q0, q[at])) for q0 in _turns_to_world(sides[at], bisector))
+        in_world = (
+            np.array(product4(q0, q[at])) for q0 in _momentum_frame_to_world(sides[at], bisector)
+        )
         out += [Candidate(moments[k], one, omega[at], float(least[k])) for one in in_world]
     return out
 
 
-def _turns_to_world(side: np.ndarray, bisector: np.ndarray) -> list[tuple[Any, ...]]:
-    """Return the quaternions that turn the frame of the momentum to the world frame.
+def _momentum_frame_to_world(side: np.ndarray, bisector: np.ndarray) -> list[tuple[Any, ...]]:
+    """Return the quaternions (4,), one for each angle of `ABOUT`, that rotate the frame of the
+    angular momentum (its z axis is along the momentum) to the world frame.
 
-    In the frame of the momentum, n is the leading eigenvector of the matrix with the six numbers
-    `side`; in the world frame it is the `bisector`.
+    The rotation takes the direction n, half way between sun and observer, from one frame to the
+    other; the angle about n is not determined, and `ABOUT` has the angles that are tried.
+
+    - `side`: (6,) the entries xx, yy, zz, xy, xz, yz of the fitted matrix n nᵀ in the frame of the
+      momentum, where n is its leading eigenvector.
+    - `bisector`: (3,) the unit vector n in the world frame.
     """
     xx, yy, zz, xy, xz, yz = side
     _, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     n = axes[:, -1]
-    first = _shortest_turn(n, bisector if n @ bisector >= 0 else -bisector, np)
+    first = _shortest_rotation(n, bisector if n @ bisector >= 0 else -bisector, np)
     halves = [0.5 * angle for angle in ABOUT]
     about = [(np.cos(half), *(np.sin(half) * bisector)) for half in halves]
     return [product4(one, first) for one in about]
 
 
-def _shortest_turn(u: Any, v: Any, xp: ModuleType) -> Any:
-    """Return the shortest turn, a quaternion (4,), from the unit vector u to the unit vector v,
-    which is not opposite to u.
+def _shortest_rotation(u: Any, v: Any, xp: ModuleType) -> Any:
+    """Return the quaternion (4,) of the shortest rotation from the unit vector `u` (3,) to the unit
+    vector `v` (3,), which is not opposite to u.
 
     `xp` is the module of the arrays, `numpy` or `jax.numpy`.
     """
@@ -118,30 +125,38 @@ def _shortest_turn(u: Any, v: Any, xp: ModuleType) -> Any:
     return q / xp.sqrt((q * q).sum())
 
 
-def _rate_from_energy(moments: Array, d: Array) -> Float[Array, "3"]:
-    """Return the rate (3,) with the angular momentum h = 1 and `h²/2T = d`, whose component along
-    the middle axis is zero.
+def _rate_of_energy(moments: Array, d: Array) -> Float[Array, "3"]:
+    """Return the body rate (3,), in principal axes, of a motion with the angular momentum h = 1 and
+    `h²/2T = d`, where T is the kinetic energy, at the time at which its component along the middle
+    axis is zero.
 
-    T is the kinetic energy. The `moments` (3,) are ascending.
+    - `moments`: (3,) the principal moments, ascending.
+    - `d`: a number between the smallest and the largest moment.
     """
     a, _, c = (1.0 / moments[k] for k in range(3))
     x = jnp.clip((1.0 / d - c) / (a - c), 0.0, 1.0)
     return jnp.stack([jnp.sqrt(x), jnp.zeros_like(x), jnp.sqrt(1.0 - x)]) / moments
 
 
-def _rate_of_ratio(moments: Array, ratio: Array, long_axis: Array) -> tuple[Array, Array, Array]:
-    """Return three things: a rate (3,) of a motion whose precession period divided by its rotation
-    period is `ratio`; its precession period; and whether there is such a rate.
+def _rate_with_period_ratio(
+    moments: Array, ratio: Array, long_axis: Array
+) -> tuple[Array, Array, Array]:
+    """Return three things: the body rate (3,) of a free motion whose precession period divided by
+    its rotation period is `ratio`; its precession period; and whether there is such a motion.
 
-    The rate is sought in the mode of the long axis if `long_axis` is true, else of the short axis.
-    Bisection finds the energy.
+    The angular momentum is 1; bisection finds the energy.
+
+    - `moments`: (3,) the principal moments, ascending.
+    - `ratio`: the wanted quotient of the two periods.
+    - `long_axis`: true for a motion in the long-axis mode (the momentum circulates in the body
+      about the axis of the smallest moment), false for the short-axis mode.
     """
     body, pure = Inertia(jnp.diag(moments)), jnp.where(long_axis, moments[0], moments[2])
 
     def bisect(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high = state[:2]
         part = 0.5 * (low + high)
-        omega = _rate_from_energy(moments, pure + part * (moments[1] - pure))
+        omega = _rate_of_energy(moments, pure + part * (moments[1] - pure))
         precession = exact.precession_period(body, omega)
         quotient = precession / exact.body_period(body, omega) / ratio
         low, high = jnp.where(quotient > 1, part, low), jnp.where(quotient > 1, high, part)
@@ -158,7 +173,7 @@ def _rate_of_ratio(moments: Array, ratio: Array, long_axis: Array) -> tuple[Arra
 
 
 @jax.jit
-def _grid(
+def _motions_on_grid(
     long_axis: Array,
     moments: Array,
     forms: Array,
@@ -167,23 +182,33 @@ def _grid(
     squares: Array,
     weights: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Return four arrays for S bodies and all phases: the misfits (S, phases); the six numbers of n
-    nᵀ times the level (S, phases, 6); the initial attitudes; and the initial rates.
+    """Return four arrays for the motions of S bodies at all P = `PHASES` phases of their rotation:
+    the misfits χ² (S, P); the six fitted numbers of n nᵀ times the level (S, P, 6); the initial
+    attitudes (S, P, 4); and the initial rates (S, P, 3), rad/s.
 
-    The arguments `moments` and `forms` (S, 3) hold the moments and the numbers M of each body (see
-    the module). The light curve is `t`, `squares` and `weights`, the three arrays `light` of
-    `candidates`.
+    Here n is the direction half way between sun and observer in the frame of the angular momentum,
+    and the level is the factor between the model and the squared fluxes. All motions have the same
+    `pair` of frequencies. A body that has no such motion has the misfit infinity.
+
+    - `long_axis`: true for motions in the long-axis mode, false for the short-axis mode.
+    - `moments`: (S, 3) the principal moments of each body, ascending.
+    - `forms`: (S, 3) the numbers M = (bc)², (ca)², (ab)² of each body with the semi-axes a, b, c
+      (see the module).
+    - `pair`: (2,) the frequencies of the mean precession and of twice the rotation, 1/s.
+    - `t`: (T,) the times of the readings since the first, s.
+    - `squares`: (T,) the squared fluxes.
+    - `weights`: (T,) one over the noise of the squared fluxes.
     """
     ratio = 0.5 * pair[1] / pair[0]
 
     def shape(one: tuple[Array, Array]) -> tuple[Array, ...]:
         body, form = one
-        omega, precession, exists = _rate_of_ratio(body, ratio, long_axis)
+        omega, precession, exists = _rate_with_period_ratio(body, ratio, long_axis)
         omega = omega * (precession * pair[0])
         h = body * omega
         # The attitude q turns the angular momentum to the z axis of the world. The momentum is not
         # opposite to z, because none of its components is negative.
-        q = _shortest_turn(h / jnp.sqrt(jnp.sum(h * h)), jnp.eye(3, dtype=h.dtype)[2], jnp)
+        q = _shortest_rotation(h / jnp.sqrt(jnp.sum(h * h)), jnp.eye(3, dtype=h.dtype)[2], jnp)
         motion = exact.FreeBody(Inertia(jnp.diag(body)), Attitude(q, omega))
 
         def phase(part: Array) -> tuple[Array, ...]:

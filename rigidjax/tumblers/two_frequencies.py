@@ -144,7 +144,7 @@ def two_frequencies(
     # The table covers all combinations of multiples of the two frequencies of a pair, also after
     # the refinement has moved a pair beyond the highest frequency.
     table = sum_table(light, 2 * (FIRST + order) * (highest + 1.0))
-    pairs, misfits = _scan_pairs(table, lines, order)
+    pairs, misfits = _pairs_with_strong_line(table, lines, order)
     pairs, misfits = refine_pairs(
         table, pairs[distinct_pairs(pairs, misfits, count * TRIED)], order
     )
@@ -158,33 +158,49 @@ def two_frequencies(
 
 
 def pad_light(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array, Array]:
-    """Return the times x, values z and weights w, padded with zeros to a multiple of `BLOCK`."""
+    """Return the three arrays (T,) of a light curve, padded with zeros to a multiple of `BLOCK`, so
+    that few programs are compiled.
+
+    - `x`: the times of the readings divided by the span (the time from the first to the last
+      reading).
+    - `z`: the values divided by their noise.
+    - `w`: one over the noise; it is zero in the padding, so that the padding has no weight.
+    """
     more = -x.size % BLOCK
     return tuple(jnp.asarray(np.pad(v, (0, more))) for v in (x, z, w))  # pyright: ignore
 
 
 def strongest_lines(light: tuple[Array, Array, Array], highest: float, count: int) -> np.ndarray:
-    """Return the `count` strongest lines of the spectrum up to the frequency `highest`, in 1/span.
+    """Return the frequencies (`count`,), in 1/span, of the strongest lines of the spectrum of a
+    light curve, the strongest first.
 
-    Each line is subtracted from the `light` before the next one is sought.
+    A line is a sinusoid plus a constant. Each line is subtracted from the light curve before the
+    next one is sought.
+
+    - `light`: three arrays (T,): the times divided by the span (the time from the first to the last
+      reading); the values divided by their noise; and one over the noise.
+    - `highest`: the highest frequency that is sought, 1/span.
     """
     grid = np.arange(0.5, max(highest, 2.0), 0.2)
     x, z, w = (np.asarray(v) for v in light)
     lines = []
     for _ in range(count):
-        line, curve = (np.asarray(v) for v in _strongest_line(jnp.asarray(pad_rows(grid)), x, z, w))
+        line, curve = (np.asarray(v) for v in _best_sinusoid(jnp.asarray(pad_rows(grid)), x, z, w))
         lines.append(float(line))
         z = z - w * curve
     return np.array(lines)
 
 
 @jax.jit
-def _strongest_line(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Array, Array]:
-    """Return two things: the frequency of the `grid` whose sinusoid plus a constant fits best; and
-    the fitted sinusoid plus constant at the times x.
+def _best_sinusoid(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Array, Array]:
+    """Return two things: the frequency of `grid` whose sinusoid plus a constant fits the readings
+    best; and the fitted sinusoid plus constant (T,) at the times of the readings.
 
-    The arguments x, z and w (T,) are the times divided by the span, the values divided by their
-    noise, and one over the noise.
+    - `grid`: (F,) the frequencies that are tried, 1/span, where the span is the time from the first
+      to the last reading.
+    - `x`: (T,) the times divided by the span.
+    - `z`: (T,) the values divided by their noise.
+    - `w`: (T,) one over the noise.
     """
     x, z, w = jnp.asarray(x), jnp.asarray(z), jnp.asarray(w)
 
@@ -199,9 +215,16 @@ def _strongest_line(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tu
     return grid[best], c[best] @ rows(grid[best])
 
 
-def _scan_pairs(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return two things: all pairs (P, 2) on a grid that have one of the strongest `lines`; and the
-    misfits (P,) of these pairs.
+def _pairs_with_strong_line(
+    table: Sums, lines: np.ndarray, order: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return two things: the pairs of frequencies (P, 2), on a grid, for which one of the strongest
+    lines of the spectrum is a combination of the two frequencies; and χ² (P,) of the Fourier series
+    of each pair.
+
+    - `table`: the sums over the readings, as `sum_table` returns them.
+    - `lines`: the frequencies of the strongest lines, 1/span, the strongest first.
+    - `order`: the largest multiple of the second frequency in the series.
     """
     highest = float(lines[:LINES].max())
     grid = np.arange(0.5, 0.8 * highest + 0.5, STEP)
@@ -219,10 +242,13 @@ def _scan_pairs(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray,
 
 
 def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
-    """Return the pairs (M, 2) that may fit the same readings as the `pairs` (P, 2) do.
+    """Return the pairs of frequencies (M, 2) that may fit the same readings as the `pairs` (P, 2)
+    do, all in 1/span.
 
-    The frequencies of the result are shifted by a side peak of `peaks` or by half of a side peak,
-    or are halved, doubled or combined.
+    One or both frequencies of a pair are shifted by a side peak of the spectral window or by half
+    of one; or one is halved or doubled; or the first is added to the second or subtracted from it.
+
+    - `peaks`: (k,) the positions of the side peaks, 1/span.
     """
     moves = np.unique(np.concatenate([[0.0], *((p, -p, p / 2, -p / 2) for p in peaks)]))
     first, second = pairs.T[:, :, None]
@@ -239,10 +265,17 @@ def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
 def with_aliases(
     table: Sums, pairs: np.ndarray, misfits: np.ndarray, highest: float, order: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return two things: the `pairs` together with aliases of the best pairs; and the misfits of
-    all of these.
+    """Return two things: the `pairs` of frequencies together with aliases of the best pairs; and χ²
+    of all of these.
 
-    Aliases are sought in rounds until no alias is better than the best pair.
+    An alias is a pair that may fit the same readings (`aliases_of`). Aliases are sought in rounds
+    until no alias is better than the best pair.
+
+    - `table`: the sums over the readings, as `sum_table` returns them.
+    - `pairs`: (P, 2) in 1/span.
+    - `misfits`: (P,) χ² of the pairs.
+    - `highest`: the highest frequency of an alias, 1/span.
+    - `order`: the largest multiple of the second frequency.
     """
     peaks = side_peaks(table, highest)
     for _ in range(ROUNDS):
@@ -261,8 +294,11 @@ def with_aliases(
 
 
 def distinct_pairs(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
-    """Return the indices of `count` pairs that differ from each other, in the order of their
-    misfits.
+    """Return the indices of the best pairs of frequencies that differ from each other by more than
+    `NEAR`, in the order of their misfits, at most `count` of them.
+
+    - `pairs`: (P, 2) the two frequencies of each pair, 1/span.
+    - `misfits`: (P,) χ² of the pairs.
     """
     chosen: list[int] = []
     for index in np.argsort(misfits)[:20_000]:
@@ -274,10 +310,15 @@ def distinct_pairs(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[i
 
 
 def refine_pairs(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return two things: the pairs after a descent to a minimum of the misfit; and their misfits.
+    """Return two things: the pairs of frequencies (P, 2), each moved to a minimum of χ²; and χ²
+    (P,) there.
 
     Each pair moves to the best of its neighbours on a square grid. The grid becomes finer whenever
     no neighbour has a lower misfit.
+
+    - `table`: the sums over the readings, as `sum_table` returns them.
+    - `pairs`: (P, 2) the starts, 1/span.
+    - `order`: the largest multiple of the second frequency.
     """
     size = np.full(len(pairs), 0.08)
     least = np.full(len(pairs), np.inf)

@@ -18,11 +18,10 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
     """Draw the time against the error, log–log, for values and gradients, with the Pareto front.
 
     Each scene has a row of panels, from left to right: the time of a run; the time of a first
-    answer
-    (compilation and one run), if it is known; and the error of each value against the tolerance or
-    accuracy that was asked for. The grey band is the Pareto front of error and time of all methods;
-    rings mark the points on this front. The coloured band is the Pareto front of the methods in
-    JAX alone. Error bars are the quartiles of the time.
+    answer (compilation and one run), if it is known; and the error of each value against the
+    tolerance or accuracy that was asked for. The grey band is the Pareto front of error and time of
+    all methods; rings mark the points on this front. The coloured band is the Pareto front of the
+    methods in JAX alone. Error bars are the quartiles of the time.
 
     **Arguments:** `records` as `measure` returns them; `title` of the figure.
 
@@ -70,16 +69,21 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
 
 
 def _errors_and_times(records: list[Measurement]) -> tuple[list[float], list[float]]:
-    """Return two lists for the records: the errors, at least 1e-16; and the times, ms."""
+    """Return two lists, one entry for each of the `records` of measurements: the errors, at least
+    1e-16; and the times of a run, ms.
+    """
     return [max(r.error, 1e-16) for r in records], [1e3 * r.time for r in records]
 
 
-def _curves(
+def _curves_of_methods(
     records: list[Measurement], labels: list[tuple[str, str]]
 ) -> Iterator[tuple[list, dict]]:
-    """Yield, for each method, its records by rising setting and the style of its curve.
+    """Yield, for each method, two things: its records in the order of their settings; and the style
+    of its curve, as arguments of matplotlib.
 
-    **Arguments:** `records` of one scene; `labels` the label and the group of each method.
+    - `records`: measurements on one scene.
+    - `labels`: the label and the group (`ours`, `jax` or `peer`) of each method, in the order of
+      the charts.
     """
     import matplotlib as mpl
 
@@ -102,7 +106,14 @@ def _curves(
 def _draw_reached_errors(
     axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]
 ) -> None:
-    for of, how in _curves(records, labels):
+    """Draw the error that each method reached against the tolerance or accuracy that was asked for,
+    on matplotlib axes.
+
+    - `axis`: the axes.
+    - `records`: measurements on one scene.
+    - `labels`: the label and the group of each method.
+    """
+    for of, how in _curves_of_methods(records, labels):
         axis.plot([r.setting for r in of], [max(r.error, 1e-16) for r in of], **how)
     wanted = sorted(r.setting for r in records)
     axis.plot(wanted, wanted, color="0.6", linewidth=6, alpha=0.3, zorder=0, label="as asked")
@@ -111,7 +122,14 @@ def _draw_reached_errors(
 
 
 def _draw_times(axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]) -> None:
-    for of, how in _curves(records, labels):
+    """Draw the time of a run against the error for each method, with the Pareto fronts, on
+    matplotlib axes.
+
+    - `axis`: the axes.
+    - `records`: measurements on one scene, either of values or of gradients.
+    - `labels`: the label and the group of each method.
+    """
+    for of, how in _curves_of_methods(records, labels):
         bars = [
             [max(1e3 * (r.time - r.time_low), 0.0) for r in of],
             [max(1e3 * (r.time_high - r.time), 0.0) for r in of],
@@ -136,6 +154,9 @@ def _draw_times(axis: "Axes", records: list[Measurement], labels: list[tuple[str
 
 
 def _style_axis(axis: "Axes") -> None:
+    """Set logarithmic scales on matplotlib axes, with smaller errors to the right, and add a grid
+    and a legend.
+    """
     axis.set(xscale="log", yscale="log")
     # The error axis is reversed: a better method is further to the right and further down.
     axis.invert_xaxis()

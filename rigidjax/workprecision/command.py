@@ -88,7 +88,7 @@ def run_subcommand(options: argparse.Namespace) -> int:
         if options.thin < 1:
             raise ValueError(f"--thin: wanted 1 or more, got {options.thin}")
         before = None if options.check is None else read_csv(options.check)
-        records = _measure(options) if options.stored is None else read_csv(options.stored)
+        records = _measure_scenes(options) if options.stored is None else read_csv(options.stored)
         if options.stored is not None and options.scene:
             records = [r for r in records if r.scene in options.scene]
         if options.csv is not None:
@@ -115,7 +115,10 @@ def run_subcommand(options: argparse.Namespace) -> int:
     return 1 if wrong else 0
 
 
-def _measure(options: argparse.Namespace) -> list[Measurement]:
+def _measure_scenes(options: argparse.Namespace) -> list[Measurement]:
+    """Measure the methods on the scenes that the options of the command line name, and return the
+    records.
+    """
     quick = options.quick or options.check is not None or options.keep is not None
     names = options.scene or (QUICK if quick else [n for n, m in scenes().items() if not m().slow])
     records: list[Measurement] = []
@@ -151,7 +154,7 @@ def summary(records: Iterable[Measurement]) -> str:
     lines: list[str] = []
     for scene in dict.fromkeys(r.scene for r in records):
         if scene.startswith(DRIFT):
-            lines += _drifts(scene, [r for r in records if r.scene == scene])
+            lines += _drift_lines(scene, [r for r in records if r.scene == scene])
             continue
         for kind in ("value", "gradient"):
             of = [r for r in records if (r.scene, r.kind) == (scene, kind)]
@@ -171,7 +174,10 @@ def summary(records: Iterable[Measurement]) -> str:
     return "\n".join(lines)
 
 
-def _drifts(scene: str, records: list[Measurement]) -> list[str]:
+def _drift_lines(scene: str, records: list[Measurement]) -> list[str]:
+    """Return the lines of text that show the drifts of energy and momentum of each method in the
+    long run `scene`, from its `records`.
+    """
     head = f"\n{scene}: largest drift of energy, of momentum along gravity; s"
     return [head] + [
         f"  {r.label:38s} h = {r.setting:<5g} {r.energy:10.1e} {r.momentum:10.1e} {r.time:10.2f}"

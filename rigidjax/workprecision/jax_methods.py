@@ -69,6 +69,13 @@ def flow_of(scene: BenchmarkScene, run: Callable[[Any, Any, Any, Any], tuple[Any
 
 
 def _closed_form_flow(scene: BenchmarkScene) -> Flow | None:
+    """Return the flow of the closed form of the free body, or `None` for a scene with a torque or
+    without a body.
+
+    A flow is a function of the scene's numbers and of a setting, which the closed form does not
+    need; it returns two things: the last state as a vector; and the number of steps, here 0.
+    """
+
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         end: Any = FreeBody(body, start)(ts[1])
         return jax.tree.map(lambda leaf: leaf[None], end), jnp.zeros(())
@@ -77,10 +84,12 @@ def _closed_form_flow(scene: BenchmarkScene) -> Flow | None:
 
 
 def _simulate_flow(scene: BenchmarkScene, accuracy: bool = False) -> Flow | None:
-    """Return the flow of `simulate` with its defaults, except for the tolerance.
+    """Return the flow of `simulate` with its defaults, or `None` for a scene without a torque.
 
-    The tolerance is traced, so that one compiled program serves all settings. With `accuracy` the
-    setting is the argument `accuracy` of `simulate`. The result is `None` without a torque.
+    A flow is a function of the scene's numbers and of a setting, here the tolerance; it returns two
+    things: the last state as a vector; and the number of steps. The tolerance is traced, so that
+    one compiled program serves all settings. With `accuracy` the setting is the argument `accuracy`
+    of `simulate` instead.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -93,8 +102,11 @@ def _simulate_flow(scene: BenchmarkScene, accuracy: bool = False) -> Flow | None
 
 
 def _adaptive_flow(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
-    """Return the flow of the adaptive loop of `simulate`, differentiable in forward and reverse
-    mode.
+    """Return the flow of `solver` in the adaptive loop of `simulate`, differentiable in forward and
+    reverse mode.
+
+    A flow is a function of the numbers of the `scene` and of a setting, here the relative
+    tolerance; it returns two things: the last state as a vector; and the number of steps.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -106,7 +118,11 @@ def _adaptive_flow(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
 
 
 def fixed_steps_flow(scene: BenchmarkScene, solver: AbstractExplicit | AbstractSplitting) -> Flow:
-    """Return the flow of `solver` with equal steps; the setting is the number of steps."""
+    """Return the flow of `solver` with equal steps.
+
+    A flow is a function of the numbers of the `scene` and of a setting, here the number of steps;
+    it returns two things: the last state as a vector; and the number of steps.
+    """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         field, count = equations_of_motion(body, start, scene.torque), setting.astype(int)
@@ -115,14 +131,19 @@ def fixed_steps_flow(scene: BenchmarkScene, solver: AbstractExplicit | AbstractS
     return flow_of(scene, run)
 
 
-def _flow_in_diffrax(
+def _diffrax_flow(
     scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
-    """Return the flow of our vector field and state, solved by `solver` in diffrax's own loop."""
+    """Return the flow of our vector field and state, solved by `solver` in diffrax's own loop.
+
+    A flow is a function of the numbers of the `scene` and of a setting, here the relative
+    tolerance; it returns two things: the last state as a vector; and the number of steps. `adjoint`
+    is diffrax's way to differentiate; `None` takes its default.
+    """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         field = equations_of_motion(body, start, scene.torque)
-        return _solve_field(field, None, start, solver, adjoint, setting, scene.end)
+        return _diffrax_solve(field, None, start, solver, adjoint, setting, scene.end)
 
     return flow_of(scene, run)
 
@@ -130,13 +151,17 @@ def _flow_in_diffrax(
 def _handwritten_flow(
     scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
-    """Return the flow of equations that a user would write by hand, solved by diffrax.
+    """Return the flow of the equations that a user would write by hand, solved by `solver` in
+    diffrax; a scene without such equations takes our vector field.
 
-    The state is one array, and the constants are computed once, before the run.
+    A flow is a function of the numbers of the `scene` and of a setting, here the relative
+    tolerance; it returns two things: the last state as a vector; and the number of steps. The state
+    is one array, and the constants are computed once, before the run. `adjoint` is diffrax's way to
+    differentiate; `None` takes its default.
     """
     plain = scene.plain
     if plain is None:
-        return _flow_in_diffrax(scene, solver, adjoint)
+        return _diffrax_flow(scene, solver, adjoint)
 
     def flow(numbers: Array, setting: Array) -> tuple[Any, Any]:
         start = scene.flatten(scene.assemble(numbers)[1])
@@ -147,13 +172,13 @@ def _handwritten_flow(
         def field(t: Array, y: PyTree, constants: Sequence[Array]) -> Any:
             return by_hand(t, y, *constants)
 
-        ys, steps = _solve_field(field, constants, start, solver, adjoint, setting, scene.end)
+        ys, steps = _diffrax_solve(field, constants, start, solver, adjoint, setting, scene.end)
         return ys[-1], steps
 
     return flow
 
 
-def _solve_field(
+def _diffrax_solve(
     field: Callable[..., PyTree],
     args: PyTree,
     start: PyTree,
@@ -162,6 +187,17 @@ def _solve_field(
     setting: Array,
     end: float,
 ) -> tuple[Any, Any]:
+    """Solve an equation of motion by diffrax with adaptive steps. Return two things: the last
+    state, with a leading axis of length 1; and the number of steps.
+
+    - `field`: the vector field, a function (t, y, args).
+    - `args`: its last argument.
+    - `start`: the state at t = 0.
+    - `solver`: a solver of diffrax with an error estimate.
+    - `adjoint`: diffrax's way to differentiate; `None` takes its default.
+    - `setting`: the relative tolerance.
+    - `end`: the last time, s.
+    """
     out = dfx.diffeqsolve(
         dfx.ODETerm(field), solver, 0.0, end, None, start, args,
         stepsize_controller=dfx.PIDController(rtol=setting, atol=1e-3 * setting),
@@ -171,14 +207,17 @@ def _solve_field(
     return out.ys, out.stats["num_steps"]
 
 
-def _prepare(
+def _compile_for_scene(
     make: Make, take: Callable[..., Any] | None, scene: BenchmarkScene
 ) -> PreparedMethod | None:
-    """Return the flow of `make(scene)` compiled, or its gradient, or `None` if it cannot do the
-    scene.
+    """Return a method compiled for a scene, for its value or its gradient, or `None` if the method
+    cannot do the scene.
 
-    `take`, `jax.grad` or `jax.jacfwd`, asks for the gradient of the scene's scalar (`loss`) with
-    respect to the scene's numbers.
+    - `make`: a function of the scene that returns the flow of the method (a function of the scene's
+      numbers and of a setting that returns the last state and the number of steps), or `None`.
+    - `take`: `jax.grad` or `jax.jacfwd` for the gradient of the scene's scalar (`loss`) with
+      respect to the scene's numbers; `None` for the value.
+    - `scene`: the scene.
     """
     flow = make(scene)
     if flow is None:
@@ -207,8 +246,8 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Ti
     The solver runs on the handwritten equations of the scene (`plain`), or on our vector field for
     a scene without such equations.
 
-    **Arguments:** `solver` with an error estimate; `gradients` whether gradients are
-    measured, too, by the adjoints `forward`, `checkpointed` and `backsolve` of diffrax.
+    **Arguments:** `solver` with an error estimate; `gradients` whether gradients are measured, too,
+    by the adjoints `forward`, `checkpointed` and `backsolve` of diffrax.
 
     >>> diffrax_method(dfx.Heun()).name
     'diffrax Heun'
@@ -222,10 +261,12 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Ti
         "backsolve": (dfx.BacksolveAdjoint(), jax.grad),
     }
     slopes = {
-        name: partial(_prepare, partial(_handwritten_flow, solver=solver, adjoint=adjoint), take)
+        name: partial(
+            _compile_for_scene, partial(_handwritten_flow, solver=solver, adjoint=adjoint), take
+        )
         for name, (adjoint, take) in ways.items()
     }
-    value = partial(_prepare, partial(_handwritten_flow, solver=solver), None)
+    value = partial(_compile_for_scene, partial(_handwritten_flow, solver=solver), None)
     name = f"diffrax {type(solver).__name__}"
     return TimedMethod(name, "jax", TOLERANCES, value, slopes if gradients else {})
 
@@ -237,8 +278,20 @@ def _own_method(
     modes: Iterable[str] = (),
     equal: bool = False,
 ) -> TimedMethod:
-    slopes = {mode: partial(_prepare, make, MODES[mode]) for mode in modes}
-    return TimedMethod(name, "ours", settings, partial(_prepare, make, None), slopes, equal)
+    """Return a method of this library in the form that `measure` takes, for its value and its
+    gradients.
+
+    - `name`: the name of the method.
+    - `settings`: the tolerances, or the numbers of equal steps.
+    - `make`: a function of a scene that returns the flow of the method (a function of the scene's
+      numbers and of a setting that returns the last state and the number of steps), or `None`.
+    - `modes`: the modes of differentiation that are measured, of `"forward"` and `"reverse"`.
+    - `equal`: whether the settings are numbers of equal steps.
+    """
+    slopes = {mode: partial(_compile_for_scene, make, MODES[mode]) for mode in modes}
+    return TimedMethod(
+        name, "ours", settings, partial(_compile_for_scene, make, None), slopes, equal
+    )
 
 
 def methods_in_jax() -> list[TimedMethod]:
@@ -246,7 +299,7 @@ def methods_in_jax() -> list[TimedMethod]:
     eight = solvers.DormandPrince8()
     equal = ((EIGHT, eight), (FOUR, solvers.RungeKutta4()))
     equal += ((EIGHT, solvers.Splitting4()), (EIGHT, solvers.Splitting6()))
-    five, there = solvers.Tsitouras5(), partial(_flow_in_diffrax, solver=eight)
+    five, there = solvers.Tsitouras5(), partial(_diffrax_flow, solver=eight)
     return [
         _own_method("closed form", (0.0,), _closed_form_flow, MODES),
         _own_method("simulate", TOLERANCES, _simulate_flow, MODES),

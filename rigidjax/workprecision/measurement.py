@@ -52,7 +52,13 @@ RUNS = {
 _PARTS = ("body", "state0", "torque")
 
 
-class _Job(NamedTuple):
+class _TimedRun(NamedTuple):
+    """Hold a run that is timed: one method at one setting on one scene.
+
+    **Fields:** `record` the measurement, still without its times; `ready` the compiled method;
+    `times` the measured times, s, the first of them from the run that found the errors.
+    """
+
     record: Measurement
     ready: PreparedMethod
     times: list[float]
@@ -76,8 +82,7 @@ def measure(
 
     **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more methods;
     `gradients` whether gradients are measured, too; `thin` a number k to use every k-th setting;
-    `rounds`
-    the least number of timings of each run; `progress` is called with a line of text.
+    `rounds` the least number of timings of each run; `progress` is called with a line of text.
 
     **Raises:** `TypeError` for a `scene` that is no `BenchmarkScene`, or a method that is no
     `TimedMethod`.
@@ -92,7 +97,7 @@ def measure(
             method, TimedMethod, "methods", requirement="methods of workprecision.methods()"
         )
     right = scene.reference if scene.reference is not None else compute_reference(scene, gradients)
-    jobs: list[_Job] = []
+    jobs: list[_TimedRun] = []
     for method in chosen:
         for adjoint, make in {"": method.value, **(method.gradients if gradients else {})}.items():
             if adjoint and not right.gradient:
@@ -102,9 +107,9 @@ def measure(
                 continue
             if progress is not None:
                 progress(f"{scene.name}: {method.name} {adjoint or 'value'}")
-            for setting in _settings(scene, method, thin * (2 if adjoint else 1)):
+            for setting in _settings_for_scene(scene, method, thin * (2 if adjoint else 1)):
                 jobs += _inspect_run(scene, method, adjoint, setting, ready, right)
-    _time_jobs(jobs, rounds)
+    _time_runs(jobs, rounds)
     records = []
     for job in jobs:
         low, middle, high = (float(p) for p in np.percentile(job.times[1:], [25, 50, 75]))
@@ -120,7 +125,7 @@ def compute_reference(scene: BenchmarkScene, gradients: bool = True) -> Referenc
     100 times the machine epsilon.
     """
     counts = (4000, 2000)
-    numbers, scale = scene.numbers, max(1.0, _turn(scene) / 50)
+    numbers, scale = scene.numbers, max(1.0, _turned_angle(scene) / 50)
     flow = fixed_steps_flow(scene, solvers.DormandPrince8())
     run = jax.jit(flow)
     take = jax.jit(jax.jacfwd(lambda p, count: scene.loss(flow(p, count)[0])))
@@ -158,19 +163,30 @@ def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
     return dataclasses.replace(low, name=f"{scene.name}, float32", reference=right, plain=None)
 
 
-def _turn(scene: BenchmarkScene) -> float:
-    """Return a rough estimate of the angle that the body turns in the scene, rad, at least 50.
+def _turned_angle(scene: BenchmarkScene) -> float:
+    """Return a rough estimate of the angle by which the body turns in the `scene`, rad, at least
+    50.
 
-    For a point, which has no attitude, the result is 50: the counts of steps of a fixed length are
-    stated for a turn of 50 rad.
+    For a point, which has no attitude, the result is 50: the numbers of equal steps are stated for
+    a turn of 50 rad.
     """
     return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
 
 
-def _settings(scene: BenchmarkScene, method: TimedMethod, stride: int) -> list[float]:
+def _settings_for_scene(scene: BenchmarkScene, method: TimedMethod, stride: int) -> list[float]:
+    """Return the settings, tolerances or numbers of steps, at which a method is measured on a
+    scene.
+
+    Numbers of equal steps are scaled to the angle by which the body turns; tolerances that the
+    precision cannot reach are left out.
+
+    - `scene`: the scene.
+    - `method`: the method with its settings, from coarse to fine.
+    - `stride`: every `stride`-th setting is used, counted from the finest.
+    """
     settings = list(method.settings)[::-1][::stride][::-1]
     if method.equal:
-        return [float(round(s * _turn(scene) / 50)) for s in settings]
+        return [float(round(s * _turned_angle(scene) / 50)) for s in settings]
     # With a tolerance below about ten times the machine epsilon every step is rejected.
     least = 10 * float(jnp.finfo(scene.numbers.dtype).eps)
     return [float(s) for s in settings if s == 0 or s > least]
@@ -183,7 +199,17 @@ def _inspect_run(
     setting: float,
     prepared: PreparedMethod,
     reference: Reference,
-) -> list[_Job]:
+) -> list[_TimedRun]:
+    """Run a prepared method once for its errors. Return a list with the run, or an empty list if
+    its error is `WRONG` or more.
+
+    - `scene`: the scene.
+    - `method`: the method.
+    - `adjoint`: the way the gradient is computed, or an empty text for a value.
+    - `setting`: the tolerance or the number of steps.
+    - `prepared`: the method, compiled for the scene.
+    - `reference`: the correct last state and gradient of the scene.
+    """
     prepared.run(setting)
     begin = time.perf_counter()
     end, steps = prepared.run(setting)
@@ -195,12 +221,19 @@ def _inspect_run(
         scene.name, method.name, method.group, "gradient" if adjoint else "value", adjoint,
         setting, steps=float(steps), compile=prepared.compile, memory=prepared.memory, **errors,
     )  # fmt: skip
-    return [_Job(record, prepared, [first])]
+    return [_TimedRun(record, prepared, [first])]
 
 
 def _relative_errors(
     scene: BenchmarkScene, final_state: np.ndarray | Array, reference: Reference
 ) -> dict[str, float]:
+    """Return, by the names of fields of `Measurement`, the errors of the last state of a run and
+    the drifts of its conserved quantities.
+
+    - `scene`: the scene.
+    - `final_state`: the last state as one vector, (7,) for a body or (6,) for a point.
+    - `reference`: the correct last state.
+    """
     error, rate = state_errors(scene, final_state, reference.end)
     energy, momentum = drifts(scene, np.asarray(final_state))
     return {"error": error, "error_rate": rate, "energy": energy, "momentum": momentum}
@@ -209,6 +242,13 @@ def _relative_errors(
 def _gradient_errors(
     scene: BenchmarkScene, slope: np.ndarray | Array, reference: Reference
 ) -> dict[str, float]:
+    """Return, by the names of fields of `Measurement`, the relative errors of a gradient: of the
+    whole, and of its parts with respect to inertia, initial rate and initial attitude.
+
+    - `scene`: the scene.
+    - `slope`: the gradient of the scene's scalar (`loss`) with respect to the scene's numbers.
+    - `reference`: the correct gradient.
+    """
     gradient, wanted = np.asarray(slope, float), np.asarray(reference.gradient)
 
     def relative_error(part: slice) -> float:
@@ -242,7 +282,11 @@ def drifts(scene: BenchmarkScene, end: np.ndarray | Array) -> tuple[float, float
     return float(away.get("energy", jnp.nan)), max(momenta, default=float("nan"))
 
 
-def _time_jobs(jobs: list[_Job], rounds: int) -> None:
+def _time_runs(jobs: list[_TimedRun], rounds: int) -> None:
+    """Measure the times of the runs `jobs` in turn, and append them, s, to each run.
+
+    A run is timed in `rounds` rounds; a short run in three times as many, and a long run in three.
+    """
     for turn in range(3 * rounds):
         for job in jobs:
             first = job.times[0]
@@ -271,8 +315,7 @@ def long_drift(
     drift is bounded if both drifts are about equal, and grows with time if the drift of the whole
     run is a hundred times that of the first hundredth. In a record `setting` is the length of a
     step, s, and `error` is the drift of the energy, since the motion forgets its start long before
-    the
-    end, where no reference is possible.
+    the end, where no reference is possible.
     """
     body = Inertia.from_principal(*BODY)
     start = Attitude([0.955336489125606, 0.29552020666133955, 0.0, 0.0], [0.4, 0.3, 1.2])

@@ -107,10 +107,21 @@ def choose(records: Iterable[Measurement], wanted: Sequence[float] = WANTED) -> 
     """
     records = list_records(records)
     scenes = dict.fromkeys(r.scene for r in records)
-    return [_choice([r for r in records if r.scene == s], s, e) for s in scenes for e in wanted]
+    return [
+        _choose_for_scene([r for r in records if r.scene == s], s, e)
+        for s in scenes
+        for e in wanted
+    ]
 
 
-def _choice(records: list[Measurement], scene: str, error: float) -> Choice:
+def _choose_for_scene(records: list[Measurement], scene: str, error: float) -> Choice:
+    """Return our quickest methods for one scene and one wanted error, and any quicker method of
+    others.
+
+    - `records`: the measurements on this scene.
+    - `scene`: the name of the scene.
+    - `error`: the wanted error, rad, or the wanted relative error of a gradient.
+    """
     values, slopes = (
         times_by_method(records, "value", error),
         times_by_method(records, "gradient", error),
@@ -168,4 +179,5 @@ def table(lines: Iterable[Choice]) -> str:
 
 
 def _in_microseconds(seconds: float) -> str:
+    """Return a time, given in seconds, as text in µs with three digits, or a dash for NaN."""
     return "–" if seconds != seconds else f"{seconds * 1e6:.3g}"

@@ -24,33 +24,51 @@ TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
 
 
-def _rates(scene: BenchmarkScene, numbers: np.ndarray, **options: Any) -> Any:
-    """Return the vector field of the handwritten equations of a scene, on Python's floats."""
+def _python_vector_field(scene: BenchmarkScene, numbers: np.ndarray, **options: Any) -> Any:
+    """Return the vector field of the handwritten equations of a scene, a function (t, y) that works
+    on Python's floats.
+
+    - `scene`: the scene, whose `plain` makes the equations.
+    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
+      position and velocity of a point).
+    - `options`: further arguments of `plain`.
+    """
     plain: Any = scene.plain
     return plain(tuple(map(float, numbers)), math.sin, math.cos, math.sqrt, **options)
 
 
-def _is_written_out(scene: BenchmarkScene) -> bool:
+def _has_plain_equations(scene: BenchmarkScene) -> bool:
+    """Return whether the `scene` has handwritten equations without JAX, which other packages
+    need.
+    """
     return scene.plain is not None
 
 
 def _has_weight(scene: BenchmarkScene) -> bool:
+    """Return whether the `scene` is a body for which MuJoCo's data are known: mass, centre of mass
+    and gravity.
+    """
     return scene.notes is not None and "com" in scene.notes and scene.body is not None
 
 
-def _is_in_double(scene: BenchmarkScene) -> bool:
+def _is_plain_and_double(scene: BenchmarkScene) -> bool:
+    """Return whether the `scene` has handwritten equations and is in double precision."""
     # Importing gradsolve sets JAX to float64: gradsolve is not used for scenes of another
     # precision.
     return scene.plain is not None and scene.numbers.dtype == jnp.float64
 
 
-def _peer_decorator(
-    module: str, can: Callable[[BenchmarkScene], bool] = _is_written_out
+def _make_peer_value(
+    module: str, can: Callable[[BenchmarkScene], bool] = _has_plain_equations
 ) -> Callable[[Any], Any]:
-    """Return a decorator that makes the `value` of a `TimedMethod` from a function `make`.
+    """Return a decorator that turns a function `make` into the `value` of a `TimedMethod`: a
+    function of a scene that returns the prepared method, or `None` for a scene that it cannot do.
 
-    `make(scene, numbers, start, module)` returns the `run` of a `PreparedMethod`; its time counts
-    as compilation, but the time to import `module` does not.
+    `make(scene, numbers, start, module)` returns a function of the setting; its time counts as
+    compilation, but the time to import `module` does not.
+
+    - `module`: the name of the package that is imported.
+    - `can`: a function of a scene: whether the package can do the scene.
     """
 
     def decorate(make: Callable[[BenchmarkScene, np.ndarray, np.ndarray, Any], Any]) -> Any:
@@ -68,9 +86,16 @@ def _peer_decorator(
     return decorate
 
 
-def _run_of_stepper(
+def _make_scipy_run(
     end: float, start: np.ndarray, f: Callable[[float, np.ndarray], np.ndarray]
 ) -> Any:
+    """Return a function of the tolerance that solves an equation by SciPy's DOP853, and returns the
+    last state and the number of steps.
+
+    - `end`: the last time, s; the first is 0.
+    - `start`: the initial state as one vector.
+    - `f`: the vector field, a function (t, y).
+    """
     from scipy.integrate import DOP853
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -85,31 +110,59 @@ def _run_of_stepper(
     return run
 
 
-@_peer_decorator("scipy.integrate")
-def _scipy(scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, _: ModuleType) -> Any:
-    rates = _rates(scene, numbers)
-    return _run_of_stepper(scene.end, start, lambda t, y: np.array(rates(t, y)))
+@_make_peer_value("scipy.integrate")
+def _prepare_scipy(
+    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, _: ModuleType
+) -> Any:
+    """Return a function of the tolerance that runs the scene by SciPy's DOP853 on Python's floats,
+    and returns the last state and the number of steps.
+
+    - `scene`: the scene.
+    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
+      position and velocity of a point).
+    - `start`: the initial state as one vector.
+    """
+    rates = _python_vector_field(scene, numbers)
+    return _make_scipy_run(scene.end, start, lambda t, y: np.array(rates(t, y)))
 
 
-@_peer_decorator("numba")
-def _numba(scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, numba: ModuleType) -> Any:
-    rates = _rates(scene, numbers, wrap=numba.njit)
+@_make_peer_value("numba")
+def _prepare_numba(
+    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, numba: ModuleType
+) -> Any:
+    """Return a function of the tolerance that runs the scene by SciPy's DOP853 with a vector field
+    compiled by numba, and returns the last state and the number of steps.
+
+    - `scene`: the scene.
+    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
+      position and velocity of a point).
+    - `start`: the initial state as one vector.
+    - `numba`: the module.
+    """
+    rates = _python_vector_field(scene, numbers, wrap=numba.njit)
 
     @numba.njit
     def f(t: Any, y: Any) -> Any:
         return np.array(rates(t, y))
 
     f(0.0, start)
-    return _run_of_stepper(scene.end, start, f)
+    return _make_scipy_run(scene.end, start, f)
 
 
-@_peer_decorator("mujoco", _has_weight)
-def _mujoco(
+@_make_peer_value("mujoco", _has_weight)
+def _prepare_mujoco(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, mujoco: ModuleType
 ) -> Any:
-    """Return the run of MuJoCo's own Runge–Kutta 4 for a body on a ball joint.
+    """Return a function of the step, s, that runs a body on a ball joint by MuJoCo's own
+    Runge–Kutta 4, and returns the last state and the number of steps.
 
     Only heavy tops and free bodies have the `notes` that this needs.
+
+    - `scene`: the scene.
+    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
+      position and velocity of a point).
+    - `start`: the initial state as one vector.
+    - `mujoco`: the module.
     """
     notes, body = scene.notes, scene.body
     assert notes is not None and body is not None
@@ -139,7 +192,14 @@ def _mujoco(
     return run
 
 
-def _system(scene: BenchmarkScene, hy: ModuleType, numbers: Sequence[Any]) -> Any:
+def _heyoka_equations(scene: BenchmarkScene, hy: ModuleType, numbers: Sequence[Any]) -> Any:
+    """Return the equations of a scene in heyoka's form: a list of pairs, a variable and its time
+    derivative.
+
+    - `scene`: the scene.
+    - `hy`: the module heyoka.
+    - `numbers`: the numbers of the scene, as floats or as parameters of heyoka.
+    """
     names = "abcdxyz" if scene.body is not None else ("px", "py", "pz", "vx", "vy", "vz")
     variables = hy.make_vars(*names)
     plain: Any = scene.plain
@@ -147,12 +207,19 @@ def _system(scene: BenchmarkScene, hy: ModuleType, numbers: Sequence[Any]) -> An
     return list(zip(variables, rates, strict=True))
 
 
-def _run_of_propagator(
+def _make_heyoka_run(
     hy: ModuleType, end: float, start: np.ndarray, system: Any, **options: Any
 ) -> Any:
-    """Return a run: given a tolerance it returns the state at the end, and the number of steps.
+    """Return a function of the tolerance that runs heyoka's Taylor method, and returns the last
+    state and the number of steps.
 
-    heyoka's order and code depend on the tolerance, so that each tolerance is compiled.
+    heyoka's order and code depend on the tolerance, so that each tolerance is compiled once.
+
+    - `hy`: the module heyoka.
+    - `end`: the last time, s; the first is 0.
+    - `start`: the initial state as one vector.
+    - `system`: the equations in heyoka's form.
+    - `options`: further arguments of `heyoka.taylor_adaptive`.
     """
     made: dict[float, Any] = {}
 
@@ -169,29 +236,45 @@ def _run_of_propagator(
     return run
 
 
-@_peer_decorator("heyoka")
-def _taylor(scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, hy: ModuleType) -> Any:
-    system = _system(scene, hy, list(map(float, numbers)))
-    return _run_of_propagator(hy, scene.end, start, system)
-
-
-@_peer_decorator("heyoka")
-def _variational(
+@_make_peer_value("heyoka")
+def _prepare_taylor(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, hy: ModuleType
 ) -> Any:
-    """Return the run of the gradient of the scene's scalar, by the variational equations.
+    """Return a function of the tolerance that runs the scene by heyoka's Taylor method, and returns
+    the last state and the number of steps.
 
-    These are the equations with respect to the initial state and the inertia; their solution is
+    - `scene`: the scene.
+    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
+      position and velocity of a point).
+    - `start`: the initial state as one vector.
+    - `hy`: the module heyoka.
+    """
+    system = _heyoka_equations(scene, hy, list(map(float, numbers)))
+    return _make_heyoka_run(hy, scene.end, start, system)
+
+
+@_make_peer_value("heyoka")
+def _prepare_taylor_gradient(
+    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, hy: ModuleType
+) -> Any:
+    """Return a function of the tolerance that computes the gradient of the scene's scalar (`loss`)
+    by heyoka's variational equations, and returns the gradient and the number of steps.
+
+    The equations are those with respect to the initial state and the inertia; their solution is
     multiplied by the gradient of the scalar with respect to the last state.
+
+    - `scene`: the scene.
+    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
+      position and velocity of a point).
+    - `start`: the initial state as one vector.
+    - `hy`: the module heyoka.
     """
     size = 6 if scene.body is not None else 0
     symbols = [hy.par[i] for i in range(size)] or list(numbers)
-    system = _system(scene, hy, [*symbols, *numbers[size:]] if size else symbols)
+    system = _heyoka_equations(scene, hy, [*symbols, *numbers[size:]] if size else symbols)
     flavour = hy.var_args.vars | hy.var_args.params if size else hy.var_args.vars
     varied = hy.var_ode_sys(system, flavour, order=1)
-    end_of = _run_of_propagator(
-        hy, scene.end, start, varied, pars=numbers[:size], compact_mode=True
-    )
+    end_of = _make_heyoka_run(hy, scene.end, start, varied, pars=numbers[:size], compact_mode=True)
     n = len(start)
     chain = np.asarray(jax.jacfwd(lambda p: scene.flatten(scene.assemble(p)[1]))(scene.numbers))
     pull = jax.jit(jax.grad(scene.loss))
@@ -208,8 +291,9 @@ def _variational(
     return run
 
 
-class _Ensemble:
-    """Present a scene to gradsolve as an ensemble of one member.
+class _GradsolveEnsemble:
+    """Present a scene to the package gradsolve, which solves ensembles of equations, as an ensemble
+    of one member.
 
     The parameters of the member are the numbers of the scene.
     """
@@ -235,11 +319,20 @@ class _Ensemble:
         return getattr(self.module, name)(self, self.start, self.numbers, **options)
 
 
-@_peer_decorator("gradsolve", _is_in_double)
-def _solve_and_record(
+@_make_peer_value("gradsolve", _is_plain_and_double)
+def _prepare_gradsolve(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
 ) -> Any:
-    ensemble = _Ensemble(scene, numbers, start, module)
+    """Return a function of the tolerance that runs the scene by gradsolve's method of order 7, and
+    returns the last state and the number of steps.
+
+    - `scene`: the scene.
+    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
+      position and velocity of a point).
+    - `start`: the initial state as one vector.
+    - `module`: the module gradsolve.
+    """
+    ensemble = _GradsolveEnsemble(scene, numbers, start, module)
 
     def run(setting: float) -> tuple[Any, Any]:
         solution = ensemble.call("solve", setting)
@@ -249,15 +342,23 @@ def _solve_and_record(
     return run
 
 
-@_peer_decorator("gradsolve", _is_in_double)
-def _replay(
+@_make_peer_value("gradsolve", _is_plain_and_double)
+def _prepare_gradsolve_gradient(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
 ) -> Any:
-    """Return the run of the gradient through recorded steps.
+    """Return a function of the tolerance that computes the gradient of the scene's scalar (`loss`)
+    by gradsolve, through steps that were recorded before, and returns the gradient and the number
+    of steps.
 
-    The recording is made once for each setting, and is not timed.
+    The recording is made once for each tolerance, and is not timed.
+
+    - `scene`: the scene.
+    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
+      position and velocity of a point).
+    - `start`: the initial state as one vector.
+    - `module`: the module gradsolve.
     """
-    ensemble = _Ensemble(scene, numbers, start, module)
+    ensemble = _GradsolveEnsemble(scene, numbers, start, module)
     made: dict[float, Any] = {}
 
     def gradient_of(setting: float) -> Any:
@@ -288,15 +389,23 @@ def methods_outside() -> list[TimedMethod]:
     gradsolve's replay of the recorded steps of Verner's method of order 7: arXiv:2609.02876.
     """
     peers = {
-        "scipy": TimedMethod("scipy DOP853", "peer", TOLERANCES, _scipy),
-        "numba": TimedMethod("scipy DOP853, numba", "peer", TOLERANCES, _numba),
-        "mujoco": TimedMethod("MuJoCo RK4", "peer", STEPS, _mujoco),
+        "scipy": TimedMethod("scipy DOP853", "peer", TOLERANCES, _prepare_scipy),
+        "numba": TimedMethod("scipy DOP853, numba", "peer", TOLERANCES, _prepare_numba),
+        "mujoco": TimedMethod("MuJoCo RK4", "peer", STEPS, _prepare_mujoco),
         "heyoka": TimedMethod(
-            "heyoka Taylor", "peer", TAYLOR, _taylor, {"variational": _variational}
+            "heyoka Taylor",
+            "peer",
+            TAYLOR,
+            _prepare_taylor,
+            {"variational": _prepare_taylor_gradient},
         ),
     }
     replay = TimedMethod(
-        "gradsolve Vern7", "peer", TOLERANCES, _solve_and_record, {"replay": _replay}
+        "gradsolve Vern7",
+        "peer",
+        TOLERANCES,
+        _prepare_gradsolve,
+        {"replay": _prepare_gradsolve_gradient},
     )
     peers["gradsolve"] = replay
     return [method for name, method in peers.items() if importlib.util.find_spec(name)]

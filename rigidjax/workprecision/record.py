@@ -23,17 +23,15 @@ class Measurement:
 
     **Fields:** `scene`, `method` names; `group` `ours`, `jax` or `peer`; `kind` `value` or
     `gradient`; `adjoint` the way a gradient is computed; `setting` the tolerance, or the number of
-    equal
-    steps; `error` of the attitude, an angle in rad (for a point the relative error of its
+    equal steps; `error` of the attitude, an angle in rad (for a point the relative error of its
     position), and for a gradient the relative error |g − g*|/|g*|; `error_rate` the error of Ω
-    relative to |Ω0| (for a point the relative
-    error of the velocity); `energy`, `momentum` the relative drift of the energy,
-    and the larger drift of the conserved momenta; `by_inertia`, `by_rate`, `by_attitude` the
-    relative errors
-    of the gradient with respect to the inertia, the initial rate and the initial attitude (for a
-    point `by_rate` is for the velocity and `by_attitude` for the position); `steps`; `time`,
-    `time_low`, `time_high` median and quartiles, s; `compile` s;
-    `memory` bytes of the compiled run's temporaries. A field that does not apply is NaN.
+    relative to |Ω0| (for a point the relative error of the velocity); `energy`, `momentum` the
+    relative drift of the energy, and the larger drift of the conserved momenta; `by_inertia`,
+    `by_rate`, `by_attitude` the relative errors of the gradient with respect to the inertia, the
+    initial rate and the initial attitude (for a point `by_rate` is for the velocity and
+    `by_attitude` for the position); `steps`; `time`, `time_low`, `time_high` median and quartiles,
+    s; `compile` s; `memory` bytes of the compiled run's temporaries. A field that does not apply is
+    NaN.
 
     >>> Measurement("free-top", "closed form", "ours", "value", "", 0.0, error=1e-15).time
     nan
@@ -119,8 +117,8 @@ def differences(
     more than a factor of 2.
     """
     records, stored = list_records(records), list_records(stored, "stored")
-    now = {_key(r): r for r in records if r.group != "peer"}
-    then = {_key(r): r for r in stored if r.group != "peer"}
+    now = {_run_key(r): r for r in records if r.group != "peer"}
+    then = {_run_key(r): r for r in stored if r.group != "peer"}
     wrong, paced = [], []
     scenes = {r.scene for r in now.values()}
     for key, old in then.items():
@@ -134,7 +132,7 @@ def differences(
             wrong.append(f"{_scene_and_label(old)}: error was {old.error:.2g}, is {new.error:.2g}")
         if not math.isnan(old.steps) and abs(new.steps - old.steps) > max(STEPS * old.steps, 1):
             wrong.append(f"{_scene_and_label(old)}: steps were {old.steps:g}, are {new.steps:g}")
-    before, after = _ratios(then, set(now)), _ratios(now, set(then))
+    before, after = _time_ratios(then, set(now)), _time_ratios(now, set(then))
     for label, ratio in after.items():
         if label in before and not 1 / SLOWER <= ratio / before[label] <= SLOWER:
             change = f"was {before[label]:.2g}, is {ratio:.2g}"
@@ -159,16 +157,24 @@ def records_to_store(records: Iterable[Measurement]) -> list[Measurement]:
     ]  # fmt: skip
 
 
-def _key(record: Measurement) -> tuple[str, ...]:
+def _run_key(record: Measurement) -> tuple[str, ...]:
+    """Return the scene, kind, label and setting of a record, which identify one line in two tables
+    of measurements.
+    """
     return (record.scene, record.kind, record.label, f"{record.setting:.6g}")
 
 
 def _scene_and_label(record: Measurement) -> str:
+    """Return the scene, kind, label and setting of a record as text for a message."""
     return f"{record.scene}, {record.kind}, {record.label} at {record.setting:g}"
 
 
 def _median_times(records: Iterable[Measurement]) -> dict[tuple[str, str, str], float]:
-    """Return the median time, s, of each (scene, kind, label), over its settings."""
+    """Return the median time of a run, s, of each (scene, kind, label), over the settings in the
+    `records`.
+
+    The kind is `value` or `gradient`; the label names the method and the adjoint.
+    """
     times: dict[tuple[str, str, str], list[float]] = {}
     for r in records:
         if r.time == r.time:
@@ -176,10 +182,12 @@ def _median_times(records: Iterable[Measurement]) -> dict[tuple[str, str, str], 
     return {label: sorted(spent)[len(spent) // 2] for label, spent in times.items()}
 
 
-def _ratios(table: dict, common: set) -> dict[tuple[str, str, str], float]:
-    """Return, by (scene, kind, label), the ratio of the median time to the median time of `BASE`.
+def _time_ratios(table: dict, common: set) -> dict[tuple[str, str, str], float]:
+    """Return, by (scene, kind, label), the median time of a method divided by the median time of
+    the method `BASE` on the same scene.
 
-    The medians are over the records of `table` with a key in `common`.
+    - `table`: records of measurements, by their keys (`_run_key`).
+    - `common`: the keys of the records over which the medians are taken.
     """
     middle = _median_times(record for key, record in table.items() if key in common)
     return {

@@ -73,11 +73,17 @@ class Circle(eqx.Module):
 
 
 def _return_unchanged(x: Any) -> Any:
+    """Return `x` unchanged; it stands for a conversion or a compilation that is not needed."""
     return x
 
 
-def _torque_of_equation(kind: Callable[..., Any] | None, constants: Sequence[float]) -> Any:
-    """Return the library's torque for an equation of `workprecision.equations`."""
+def _library_torque(kind: Callable[..., Any] | None, constants: Sequence[float]) -> Any:
+    """Return the torque of this library that equals a handwritten torque, or `None` for a free
+    body.
+
+    - `kind`: the handwritten torque, a function of `workprecision.equations`, or `None`.
+    - `constants`: its constants, such as centre of mass and gravity.
+    """
     if kind is equations.heavy_top_torque:
         return HeavyTop(1.0, constants[:3], constants[3:])
     if kind is equations.gyrostat_torque:
@@ -89,7 +95,7 @@ def _torque_of_equation(kind: Callable[..., Any] | None, constants: Sequence[flo
     return None
 
 
-def _body_scene(
+def _scene_of_body(
     name: str,
     title: str,
     moments: Sequence[float],
@@ -98,6 +104,18 @@ def _body_scene(
     kind: Callable[..., Any] | None,
     constants: Sequence[float],
 ) -> BenchmarkScene:
+    """Return the standard scene of a rigid body.
+
+    - `name`: the name of the scene, by which its stored answer is found.
+    - `title`: the name in words.
+    - `moments`: the three principal moments of inertia, kg m².
+    - `omega`: the initial rate (3,), rad/s, body axes.
+    - `end`: the last time, s.
+    - `kind`: the handwritten torque, a function of `workprecision.equations`, or `None` for a free
+      body.
+    - `constants`: the constants of the torque.
+    """
+
     def plain(
         numbers: Sequence[Any],
         sin: Callable[..., Any],
@@ -119,12 +137,12 @@ def _body_scene(
     weighs = kind in (None, equations.heavy_top_torque)
     return BenchmarkScene(
         name, title, Inertia.from_principal(*moments), Attitude(TILTED, omega),
-        _torque_of_equation(kind, constants), end, plain, stored_answer(name), slow=omega[2] > 1e3,
+        _library_torque(kind, constants), end, plain, stored_answer(name), slow=omega[2] > 1e3,
         notes={"mass": 1.0, "com": com, "gravity": gravity} if weighs else None,
     )  # fmt: skip
 
 
-def _point_scene(
+def _scene_of_point(
     name: str,
     title: str,
     start: Point,
@@ -133,6 +151,17 @@ def _point_scene(
     kind: Callable[..., Any],
     constants: Sequence[float],
 ) -> BenchmarkScene:
+    """Return the standard scene of a particle.
+
+    - `name`: the name of the scene, by which its stored answer is found.
+    - `title`: the name in words.
+    - `start`: the initial state.
+    - `end`: the last time.
+    - `law`: the scene of this library with the equations of motion.
+    - `kind`: a function of `workprecision.equations` that makes the same equations by hand.
+    - `constants`: the constants of these equations.
+    """
+
     def plain(
         numbers: Sequence[Any],
         sin: Callable[..., Any],
@@ -146,20 +175,24 @@ def _point_scene(
     return BenchmarkScene(name, title, None, start, law, end, plain, stored_answer(name))
 
 
-def _foucault() -> BenchmarkScene:
-    """Return Foucault's pendulum, released at rest, for ten minutes."""
+def _foucault_scene() -> BenchmarkScene:
+    """Return the standard scene of Foucault's pendulum, released at rest and followed for ten
+    minutes.
+    """
     law = places.foucault(0.85, 67.0)
     _, north, up = (float(w) for w in law.place.angular_velocity())
-    return _point_scene(
+    return _scene_of_point(
         "foucault", "Foucault's pendulum", law.start(3.0, 0.0), 600.0, law,
         equations.foucault_rates, (float(law.place.gravity), north, up),
     )  # fmt: skip
 
 
-def _arenstorf() -> BenchmarkScene:
-    """Return Arenstorf's orbit about Earth and Moon, for one period."""
+def _arenstorf_scene() -> BenchmarkScene:
+    """Return the standard scene of Arenstorf's orbit about Earth and Moon, followed for one
+    period.
+    """
     mu, x, v, period = ARENSTORF
-    return _point_scene(
+    return _scene_of_point(
         "arenstorf", "Arenstorf's orbit", Point([x, 0.0, 0.0], [0.0, v, 0.0]), period,
         orbits.cr3bp(mu), equations.three_body_rates, (mu,),
     )  # fmt: skip
@@ -175,5 +208,5 @@ def scenes() -> dict[str, Callable[[], BenchmarkScene]]:
     >>> sorted(scenes())[:3]
     ['arenstorf', 'asymmetric-top', 'damped-gyrostat']
     """
-    bodies = {name: functools.partial(_body_scene, name, *row) for name, row in BODIES.items()}
-    return {**bodies, "foucault": _foucault, "arenstorf": _arenstorf}
+    bodies = {name: functools.partial(_scene_of_body, name, *row) for name, row in BODIES.items()}
+    return {**bodies, "foucault": _foucault_scene, "arenstorf": _arenstorf_scene}
