@@ -424,7 +424,7 @@ def _attempt_step(
     method: Method, constants: Arrays, run: Run, loop: LoopState, until: Array | None,
     dense: Any = False,
 ) -> tuple[LoopState, Array, tuple[Step, Array]]:  # fmt: skip
-    """Attempt one step of every body, and return the loop state after it, and the step itself.
+    """Compute one attempted step of every body; return the loop state after it and the step itself.
 
     - `method`: the explicit method, the field, the step controller and the limits.
     - `constants`: the arrays on which the field depends.
