@@ -48,12 +48,13 @@ class AdaptiveRun(NamedTuple):
     missed: Array | None
 
 
-class _FieldOfNumbers(eqx.Module):
-    """Convert the argument and the result of a vector field between a state and one vector.
+class _VectorFieldOnTree(eqx.Module):
+    """Evaluate a field on a state, where the field itself is a function of one vector of numbers.
 
-    The function `field(constants, t, numbers)` takes and returns all numbers of a state as one
-    vector. diffrax calls this object with the state itself; the function `tree` makes a state from
-    a vector of numbers.
+    - `constants`: the arrays on which the field depends.
+    - `field`: a function `field(constants, t, numbers)` that takes and returns all numbers of a
+      state as one vector (n,).
+    - `tree`: a function that makes a state from such a vector.
     """
 
     constants: Any
@@ -61,11 +62,12 @@ class _FieldOfNumbers(eqx.Module):
     tree: Any = eqx.field(static=True)
 
     def __call__(self, t: Any, y: Any, args: object = None) -> Any:
+        """Return dy/dt at the time t, s, and the state y, with the structure of y."""
         return self.tree(self.field(self.constants, t, ravel_pytree(y)[0]))
 
 
-def _numbers(t: Any, y: Any, args: object) -> Array:
-    """Return the numbers of the state `y` as one vector."""
+def _state_as_vector(t: Any, y: Any, args: object) -> Array:
+    """Return the numbers of the state `y` as one vector (n,), for diffrax to save."""
     return ravel_pytree(y)[0]
 
 
@@ -83,25 +85,34 @@ def integrate(
     adjoint: dfx.AbstractAdjoint = REPLAY,
     progress_meter: dfx.AbstractProgressMeter = NO_METER,
 ) -> AdaptiveRun:
-    """Run diffrax under any step size controller, and return the states at the times `ts` (T,), s.
+    """Run diffrax under any step size controller, and return the states at the times `ts`.
 
-    **Arguments:** `controller`, `adjoint` and `progress_meter` are as for `diffrax.diffeqsolve`;
-    the other arguments are as for `adaptive`. `jumps` is a list with one array of times, s, for
-    each part of the field that jumps, or `None`. If it is a list, `ts` has to increase; steps end
-    at the jumps, and at each time with which the field compares its argument t. If it is `None`, no
-    step is cut short for a jump.
+    - `solver`, `controller`, `dt0`, `max_steps`, `adjoint`, `progress_meter`: as for
+      `diffrax.diffeqsolve`.
+    - `field`: a vector field `f(t, y, args)`. If `jumps` is a list, its `args` is a list with one
+      array for each part of the field that jumps, the times at which steps end for this part;
+      `None` for at most one such part.
+    - `ts`: (T,) s, the times of the states; increasing if `jumps` is a list.
+    - `y0`: the state at `ts[0]`.
+    - `jumps`: a list with one array of times, s, for each part of the field that jumps. Steps end
+      at these times, and at each time with which the field compares its argument t. With `None` no
+      step is cut short for a jump.
+    - `halt`: a condition `halt(t, y)`, tested after each accepted step; the run ends where the
+      condition is true.
+
+    **Returns** an `AdaptiveRun`: the states and how the run ended.
     """
     missed = None
     if jumps is not None:
         numbers, tree = ravel_pytree(y0)
         of_one = lambda t, y, *sides: ravel_pytree(field(t, tree(y), sides or None))[0]  # noqa: E731
         program = program_with_stops(of_one, jumps, ts[0], ts[-1], numbers)
-        field, missed = _FieldOfNumbers(program.constants, program.field, tree), program.over
+        field, missed = _VectorFieldOnTree(program.constants, program.field, tree), program.over
         if program.stops.size:
             controller = Stopping(controller, program.stops)
     # The last of `ts` is the end of the last step, so that the state there needs no dense output.
-    subs = [dfx.SubSaveAt(t1=True, fn=_numbers)]
-    subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=_numbers)] if ts.shape[0] > 2 else []
+    subs = [dfx.SubSaveAt(t1=True, fn=_state_as_vector)]
+    subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=_state_as_vector)] if ts.shape[0] > 2 else []
     out = dfx.diffeqsolve(
         dfx.ODETerm(field), solver, ts[0], ts[-1], dt0, y0,
         saveat=dfx.SaveAt(subs=subs), stepsize_controller=controller, adjoint=adjoint,

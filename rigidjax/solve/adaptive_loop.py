@@ -41,7 +41,11 @@ _TOGETHER = 16
 
 
 class Method(NamedTuple):
-    """Hold what is not an array in a run: the tableau of the method, functions and limits."""
+    """Hold what is not an array in a run: the tableau of the method, functions and limits.
+
+    The functions work on states (n, *bodies): a state has n numbers, and `*bodies` is one last axis
+    for the bodies of a batch, or no axis for one body.
+    """
 
     tableau: Tableau
     field: Field  # on states (n, *bodies)
@@ -80,11 +84,12 @@ class Run(NamedTuple):
 class LoopState(NamedTuple):
     """Hold all that the loop over steps carries from step to step.
 
-    After the last step it describes the end of the run.
+    After the last step it describes the end of the run. In a batch every array has a last axis of
+    bodies.
     """
 
     y: Array  # (n, *bodies) the state at the time t
-    t: Array
+    t: Array  # the time that is reached
     end: Array  # the time at which the next step is to end
     stop: Array  # the index in `Run.stops` of the next stop
     steps: Array  # the number of steps so far, rejected steps included
@@ -103,9 +108,10 @@ NONE, STEP, LAST = range(3)
 
 
 def pack(loop: LoopState) -> Arrays:
-    """Return a loop state as a short list of arrays.
+    """Return a loop state as a short list of arrays, to which `unpack` is the inverse.
 
-    The first array is y (n, *bodies). All other fields are joined, with one array for each dtype.
+    The first array is the state y (n, *bodies), where `*bodies` is one last axis for the bodies of
+    a batch, or no axis for one body. All other fields are joined, with one array for each dtype.
     Few arrays are wanted because XLA makes a kernel for each array that goes into or comes out of a
     loop over blocks of bodies.
     """
@@ -117,32 +123,39 @@ def pack(loop: LoopState) -> Arrays:
 def unpack(arrays: Arrays, like: LoopState) -> LoopState:
     """Return the loop state from the `arrays` that `pack` returned for it.
 
-    `like` is a loop state of the wanted shapes and dtypes.
+    `like` is a loop state whose arrays have the wanted shapes and dtypes.
     """
     rest, tree = jax.tree.flatten(like._replace(y=None))
     parts = {}
     for (kind, leaves), array in zip(_group_by_dtype(rest).items(), arrays[1:], strict=True):
         sizes = [a.size // max(like.t.size, 1) for a in leaves]
         parts[kind] = iter(jnp.split(array, np.cumsum(sizes)[:-1]))
-    rest = [next(parts[_kind(a)]).reshape(a.shape).astype(a.dtype) for a in rest]
+    rest = [next(parts[_stored_dtype(a)]).reshape(a.shape).astype(a.dtype) for a in rest]
     return tree.unflatten(rest)._replace(y=arrays[0])
 
 
-def _kind(a: Array) -> Any:
-    """Return the dtype in which `pack` stores `a`: int32 for a boolean array, else its dtype."""
+def _stored_dtype(a: Array) -> Any:
+    """Return the dtype in which `pack` stores an array: int32 for booleans, else its own dtype."""
     return jnp.dtype(jnp.int32) if a.dtype == bool else a.dtype
 
 
 def _group_by_dtype(tree: Any) -> dict[Any, Arrays]:
-    """Return the arrays of `tree` in lists, one list for each dtype that `_kind` returns."""
+    """Return the arrays of a tree in lists, one list for each dtype.
+
+    Each key of the result is a dtype, int32 also for boolean arrays; its value is the list of
+    arrays, in the order of the tree.
+    """
     parts: dict[Any, Arrays] = {}
     for a in jax.tree.leaves(tree):
-        parts.setdefault(_kind(a), []).append(a)
+        parts.setdefault(_stored_dtype(a), []).append(a)
     return parts
 
 
 class Record(NamedTuple):
-    """Hold a recorded run: the start of each segment, and the steps of the last segment."""
+    """Hold a recorded run: the start of each of its segments, and the steps of the last segment.
+
+    A segment is a part of the run of about `SEGMENT` steps.
+    """
 
     starts: Arrays  # (S, …) the packed loop state at the start of each segment, then at the end
     rows: Rows  # the rows of the last segment
@@ -150,9 +163,9 @@ class Record(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """Hold the recorded steps of one segment of a run."""
+    """Hold the recorded steps of one segment, a part of a run of about `SEGMENT` steps."""
 
-    rows: Rows
+    rows: Rows  # one row for each attempted step
     times: Array  # the time at which each row begins, inf after the last row
     end: Array  # the time at which the segment ends
     number: Array  # the number of rows that are filled
@@ -170,24 +183,34 @@ def previous_number(t: Array) -> Array:
 
 
 def step_times(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
-    """Return the start, length and end of the steps recorded in `rows` (4 + n, *bodies).
+    """Return the start, length and end of recorded steps, s, which have derivatives.
 
-    Start, length and end have derivatives with respect to the stops. The start of a step moves with
-    the last stop before it (with `run.t0` before the first stop). The end of a step moves with a
-    stop only if the step ends at this stop.
+    Stops are the times at which steps have to end, because the field jumps there. With respect to
+    their times, the start of a step moves with the last stop before it (with `run.t0` before the
+    first stop). The end of a step moves with a stop only if the step ends at this stop.
+
+    - `run`: holds the start `t0` and the stops.
+    - `rows`: (4 + n, …) the recorded steps: in each row the start time, the length, the kind of the
+      step, the index of the next stop, and the n numbers of the state at the start.
     """
     t, h, kind, stop = lax.stop_gradient(rows[:HEAD])
     stop, last = stop.astype(jnp.int32), kind == LAST
     t, h = t.astype(run.t0.dtype), h.astype(run.t0.dtype)
-    begun = take(jnp.concatenate([run.t0[None], run.stops]), stop)
+    begun = row_of_each_body(jnp.concatenate([run.t0[None], run.stops]), stop)
     t = t + (begun - lax.stop_gradient(begun))
-    end = take(run.before, stop)
+    end = row_of_each_body(run.before, stop)
     h = jnp.where(last, end - t, h)
     return t, h, jnp.where(last, end, t + h)
 
 
-def take(a: Array, index: Array) -> Array:
-    """Return `a[index]` of each body; `a` has shape (J, *bodies), `index` (*many, *bodies)."""
+def row_of_each_body(a: Array, index: Array) -> Array:
+    """Return `a[index]` of each body; an index out of range is replaced by the nearest one.
+
+    - `a`: (J, *bodies) the rows; `*bodies` is one last axis for the bodies of a batch, or no axis.
+    - `index`: (…, *bodies) integers from 0 to J − 1.
+
+    **Returns** an array of the shape of `index`.
+    """
     count = a.shape[0]
     a = a.reshape(count, *[1] * (index.ndim + 1 - a.ndim), *a.shape[1:])
     if count == 1:
@@ -210,13 +233,16 @@ def finite(tree: Any) -> Bool[Array, ""]:
 
 
 def starting_step(size: Array, rate: Array, order: Any) -> Array:
-    """Return the length of a first step from the norms of a state and of its time derivative.
+    """Return the length of the first step of a run, s, from the sizes of the state and of its rate.
 
-    `size` is the norm of the state divided by the tolerance, and `rate` is the norm of its time
-    derivative divided by the tolerance; `order` is the order of the error estimate. The formula is
-    that of Hairer, Nørsett and Wanner (1993), II.4, with one change: the norm of the second
-    derivative is taken to be rate²/size, as for an oscillation. To measure the second derivative,
-    the field would have to be compiled once more.
+    - `size`: the norm of the state at the start, each number divided by its tolerance.
+    - `rate`: the norm of the time derivative of the state, each number divided by its tolerance,
+      1/s.
+    - `order`: the order of the error estimate.
+
+    The formula is that of Hairer, Nørsett and Wanner (1993), II.4, with one change: the norm of the
+    second derivative is taken to be rate²/size, as for an oscillation. To measure the second
+    derivative, the field would have to be compiled once more.
     """
     # A state of zeros gives no time scale, rate/size would be infinite: `size` gets a lower limit.
     quickness = rate / jnp.maximum(size, 1e-4 * rate)
@@ -225,10 +251,14 @@ def starting_step(size: Array, rate: Array, order: Any) -> Array:
 
 
 def next_step(norm: Array, order: Any, h: Any) -> tuple[Array, Array]:
-    """Return whether a step of length `h` is accepted, and the length of the next step.
+    """Return whether a step is accepted, and the length of the next step, s.
 
-    `norm` is the norm of the step's error divided by the tolerance, and `order` is the order of
-    this error. The limits of the next length are the defaults of `diffrax.PIDController`.
+    - `norm`: the norm of the step's error, divided by the tolerance; a step is accepted below 1.
+    - `order`: the order of this error.
+    - `h`: the length of the step, s.
+
+    The next length is at least 0.2 and at most 10 times `h`. These limits are the defaults of
+    `diffrax.PIDController`.
     """
     norm, h = lax.stop_gradient((norm, h))
     # NaN is treated as infinity, because it may come from a step that is too long: a shorter
@@ -243,20 +273,24 @@ def result_of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
 
     In a batch, an inertia that no real body can have has been replaced by NaN, because no error can
     be raised for a single body.
+
+    - `result`: how the run ended, a `diffrax.RESULTS`.
+    - `body`: the body of the run, or `None`.
     """
     return dfx.RESULTS.where(finite(body), result, dfx.RESULTS.nonfinite_input)  # pyright: ignore
 
 
-def per_body(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Map `function`, which takes arrays of one body, over all bodies in the last axis of a run.
+def map_over_bodies(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Map a function of the arrays of one body over all bodies, which are the last axis of a run.
 
-    If `run` has one body, `function` is returned unchanged.
+    - `run`: tells whether there is an axis of bodies. Without it `function` is returned unchanged.
+    - `function`: takes and returns arrays of one body.
     """
     return jax.vmap(function, in_axes=-1, out_axes=-1) if run.t0.ndim else function
 
 
 def initial_loop_state(run: Run) -> LoopState:
-    """Return the state of the loop before the first step of `run`."""
+    """Return the state of the loop over steps before the first step of `run`."""
     zero = jnp.zeros(run.t0.shape, jnp.int32)
     # A stop at the start or before it needs no step.
     passed = jnp.sum(run.stops[:-1] <= run.t0[None], 0, dtype=jnp.int32)
@@ -268,31 +302,47 @@ def initial_loop_state(run: Run) -> LoopState:
 
 
 def is_running(method: Method, run: Run, loop: LoopState, until: Array | None) -> Array:
-    """Return whether each body still has a step to take.
+    """Return for each body whether its run still has a step to take.
 
-    The run of a body lasts to the last of `run.stops`. If `until` is not `None`, it is the time at
-    which a segment ends, and the run lasts no longer than that.
+    A run goes on to the last of the `run.stops`, unless it fails or `method.max_steps` are taken.
+
+    - `method`: holds the largest number of steps.
+    - `run`: holds the stops, the times at which steps end; the last stop is the end of the run.
+    - `loop`: the state of the loop over steps.
+    - `until`: a time, s, at which the loop ends earlier, if a part of the run is repeated; or
+      `None`.
     """
-    well = per_body(run, lambda result: result == dfx.RESULTS.successful)(loop.result)
+    well = map_over_bodies(run, lambda result: result == dfx.RESULTS.successful)(loop.result)
     last = lax.stop_gradient(run.stops[-1])
     last = last if until is None else jnp.minimum(last, until)
     return well & (loop.t < last) & (loop.steps < method.max_steps)
 
 
 def end_of_run(method: Method, constants: Arrays, run: Run) -> LoopState:
-    """Return the loop state at the end of a run, without saving any state before the end."""
+    """Return the loop state at the end of a run, without saving any state before the end.
+
+    - `method`: the explicit method, the field and the limits.
+    - `constants`: the arrays on which the field depends.
+    - `run`: the start of the run, and the times at which steps end.
+    """
     return lax.while_loop(
         lambda loop: jnp.any(is_running(method, run, loop, None)),
-        lambda loop: _attempt(method, constants, run, loop, None)[0],
+        lambda loop: _attempt_step(method, constants, run, loop, None)[0],
         initial_loop_state(run),
     )
 
 
 def states_of_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState]:
-    """Return the states (K, n) of one body at the saved times, and the loop state at the end.
+    """Run one body, and return its states at the saved times and the loop state at the end.
 
-    The saved times are the K times `run.between`. A state that the run did not reach is NaN. The
-    stages of dense output are evaluated only in steps that contain a saved time.
+    - `method`: the explicit method, the field and the limits.
+    - `constants`: the arrays on which the field depends.
+    - `run`: the start of the run, the times at which steps end, and the K saved times
+      `run.between`.
+
+    **Returns** two things: the states (K, n), NaN at a time that the run did not reach; and the
+    loop state at the end. The stages of dense output are evaluated only in steps that contain a
+    saved time.
     """
     size = run.between.shape[0]
 
@@ -302,7 +352,7 @@ def states_of_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Arr
     def one(state: Any) -> Any:
         loop, ys, k = state
         asked = next_time(k) <= loop.end
-        after, _, (step, slopes) = _attempt(method, constants, run, loop, None, asked)
+        after, _, (step, slopes) = _attempt_step(method, constants, run, loop, None, asked)
 
         def save(state: Any) -> Any:
             ys, k = state
@@ -320,17 +370,29 @@ def states_of_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Arr
 
 
 def _states_before_the_run(run: Run) -> Array:
-    """Return the states (K, n, *bodies) before the first step: NaN, or y0 if the run ends at t0."""
+    """Return the array (K, n, *bodies) into which the states at the K saved times will be written.
+
+    Its values are NaN. They are the state at the start for a body whose run ends where it starts.
+    `*bodies` is one last axis for the bodies of a batch, or no axis for one body.
+
+    - `run`: holds the start, the end, and the saved times `run.between`.
+    """
     ended = run.stops[-1] <= run.t0
     still = jnp.where(lift(ended, run.y0), run.y0, jnp.nan)
     return jnp.broadcast_to(still[None], (run.between.shape[0], *run.y0.shape))
 
 
 def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState, Record]:
-    """Return three things: the saved states, the loop state at the end, and the record of the run.
+    """Run one body or many and record the steps, from which derivatives are computed later.
 
-    The saved states (K, n, *bodies) are the states at the K times `run.between`; a state that the
-    run did not reach is NaN. Derivatives are computed from the record.
+    - `method`: the explicit method, the field and the limits.
+    - `constants`: the arrays on which the field depends.
+    - `run`: the start of the run, the times at which steps end, and the K saved times
+      `run.between`.
+
+    **Returns** three things: the states (K, n, *bodies) at the saved times, NaN at a time that the
+    run did not reach; the loop state at the end; and the record of the run. `*bodies` is one last
+    axis for the bodies of a batch, or no axis for one body.
     """
     loop, most = initial_loop_state(run), method.max_steps + run.stops.shape[0]
     count = -(-most // SEGMENT) + 1
@@ -347,7 +409,7 @@ def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, Loop
         loop, ys, starts, rows, number, _ = state
         after, rows, count = record_segment(method, constants, run, loop, rows, None)
         if run.between.shape[0]:
-            part = segment(rows, after.t, count)
+            part = segment_of_rows(rows, after.t, count)
             ys = states_at_saved_times(method, constants, run, part, ys)
         return after, ys, put(starts, number + 1, after), rows, number + 1, count
 
@@ -358,22 +420,31 @@ def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, Loop
     return ys, loop, Record(starts, rows, each)
 
 
-def _attempt(
+def _attempt_step(
     method: Method, constants: Arrays, run: Run, loop: LoopState, until: Array | None,
     dense: Any = False,
 ) -> tuple[LoopState, Array, tuple[Step, Array]]:  # fmt: skip
-    """Return the loop state after one attempted step of every body, and the attempt itself.
+    """Compute one attempted step of every body; return the loop state after it and the step itself.
 
-    **Returns** three things: the loop state after the attempt; the recorded row of the attempt; and
-    a pair of the step and the slopes of its stages. `dense` says whether the stages of dense output
-    are evaluated, too. If a segment is run again for derivatives, `until` is the time at which it
-    ends; else `until` is `None`. Only steps that are run again have derivatives with respect to the
-    times of the run.
+    - `method`: the explicit method, the field, the step controller and the limits.
+    - `constants`: the arrays on which the field depends.
+    - `run`: the start of the run, and the times at which steps end (stops).
+    - `loop`: the loop state before the step.
+    - `until`: if recorded steps are repeated for derivatives, the time at which the repeated part
+      of the run ends, s; else `None`. Only repeated steps have derivatives with respect to the
+      times of the run.
+    - `dense`: whether the stages of dense output are evaluated, too.
+
+    **Returns** three things: the loop state after the attempt; the row (4 + n, *bodies) that
+    records the attempt; and a pair of the step and the slopes (n, s, *bodies) of its s stages.
+    `*bodies` is one last axis for the bodies of a batch, or no axis for one body.
     """
     # The loop that calls this function goes on while any body has a step to take; other bodies may
     # have none.
     on = is_running(method, run, loop, until) if run.t0.ndim else True
-    stop, end = lax.stop_gradient((take(run.stops, loop.stop), take(run.before, loop.stop)))
+    stop, end = lax.stop_gradient(
+        (row_of_each_body(run.stops, loop.stop), row_of_each_body(run.before, loop.stop))
+    )
     # A body needs no step to a stop that it has already reached, such as the second of two stops at
     # the same time.
     arrived = on & (loop.t >= stop) if run.stops.shape[0] > 1 else False
@@ -384,12 +455,14 @@ def _attempt(
     end = jnp.where(last, end, loop.end)
     if until is not None:
         last, end = last & (end <= until), jnp.minimum(end, until)
-    end = _where(moving, end, loop.t)
+    end = _choose_for_each_body(moving, end, loop.t)
     h, kind = end - loop.t, jnp.where(last, LAST, STEP)
     step = Step(loop.t, h, end, loop.y)
     if until is not None:
         head = [a.astype(loop.y.dtype) for a in (loop.t, h, kind, loop.stop)]
-        begin, length, late = _where(moving, step_times(run, jnp.stack(head)), step[:3])
+        begin, length, late = _choose_for_each_body(
+            moving, step_times(run, jnp.stack(head)), step[:3]
+        )
         step = Step(begin, length, late, loop.y)
     there = stages(method.tableau, method.field, constants, step, dense)
     y = method.project(there.end)
@@ -406,43 +479,54 @@ def _attempt(
     if until is None and method.halt is not None:
         met = accept & method.halt(t, y)
         ended = lambda met, why: dfx.RESULTS.where(met, dfx.RESULTS.event_occurred, why)  # noqa: E731
-        result = per_body(run, ended)(met, result)
+        result = map_over_bodies(run, ended)(met, result)
     reached = accept & (t >= stop) | arrived if run.stops.shape[0] > 1 else 0
     after = LoopState(
-        y=_where(accept, y, loop.y),
-        t=_where(accept, t, loop.t),
-        end=_where(moving, following, loop.end),
+        y=_choose_for_each_body(accept, y, loop.y),
+        t=_choose_for_each_body(accept, t, loop.t),
+        end=_choose_for_each_body(moving, following, loop.end),
         stop=loop.stop + jnp.asarray(reached, jnp.int32),
         steps=loop.steps + jnp.asarray(moving, jnp.int32),
         rejected=loop.rejected + jnp.asarray(moving & ~keep, jnp.int32),
-        result=_where(moving, result, loop.result),
-        state=_where(moving, state, loop.state),
+        result=_choose_for_each_body(moving, result, loop.result),
+        state=_choose_for_each_body(moving, state, loop.state),
     )
     head = (loop.t, h, jnp.where(accept, kind, NONE), loop.stop)
     row = jnp.concatenate([jnp.stack([a.astype(y.dtype) for a in head]), loop.y])
     return after, row, (step, there.slopes)
 
 
-def _where(which: Any, new: Any, old: Any) -> Any:
-    """Return the arrays (…, *bodies) of `new` for bodies with a true `which`, else those of `old`.
+def _choose_for_each_body(condition: Any, new: Any, old: Any) -> Any:
+    """Return the arrays of `new` for the bodies for which `condition` is true, else those of `old`.
 
-    If `which` is the constant `True`, the arrays of `new` are returned for all bodies, converted to
-    the dtypes of `old`.
+    - `condition`: one truth value for each body, or the constant `True`, for which `new` is
+      returned for all bodies.
+    - `new`, `old`: two trees of arrays (…, *bodies) of equal structure, where `*bodies` is one last
+      axis for the bodies of a batch, or no axis. The result has the dtypes of `old`.
     """
-    if which is True:
+    if condition is True:
         return jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), new, old)
-    choose = lambda a, b: jnp.where(lift(which, a), a, b).astype(b.dtype)  # noqa: E731
+    choose = lambda a, b: jnp.where(lift(condition, a), a, b).astype(b.dtype)  # noqa: E731
     return jax.tree.map(choose, new, old)
 
 
 def record_segment(
     method: Method, constants: Arrays, run: Run, loop: LoopState, rows: Rows, until: Any
 ) -> tuple[LoopState, Rows, Array]:
-    """Return three things: the loop state after a segment of steps; its rows; the number of the
-    rows.
+    """Take the steps of one segment (a part of a run), and return them as rows.
 
-    A segment that is recorded for the first time (`until` is `None`) ends when `rows` is full or
-    the run ends. A segment that is run again ends at the time `until`.
+    A segment that is recorded for the first time ends when the array of rows is full or the run
+    ends. For derivatives a segment is run again, up to the time at which it ended.
+
+    - `method`: the explicit method, the field and the limits.
+    - `constants`: the arrays on which the field depends.
+    - `run`: the start of the run, and the times at which steps end.
+    - `loop`: the loop state at the start of the segment.
+    - `rows`: the array into which one row is written for each attempted step.
+    - `until`: `None` for the first time; else the time at which the segment ends, s.
+
+    **Returns** three things: the loop state after the segment; its rows; and the number of the rows
+    that are filled.
     """
     many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))
     room = rows.shape[0] - (_MORE if until is None else 0) - _MOST
@@ -453,7 +537,7 @@ def record_segment(
 
     def attempt(state: Any) -> Any:
         loop, few, k = state
-        loop, row, _ = _attempt(method, constants, run, loop, until)
+        loop, row, _ = _attempt_step(method, constants, run, loop, until)
         return loop, lax.dynamic_update_slice_in_dim(few, row[None], k, 0), k + 1
 
     def block(state: Any) -> Any:
@@ -464,8 +548,13 @@ def record_segment(
     return filled(block, loop, rows, room)
 
 
-def segment(rows: Rows, end: Array, count: Array) -> Segment:
-    """Return the segment of the first `count` rows of `rows`, which ends at the time `end`."""
+def segment_of_rows(rows: Rows, end: Array, count: Array) -> Segment:
+    """Return the segment (a part of a run) whose steps are recorded in the first rows of an array.
+
+    - `rows`: (N, 4 + n, *bodies) the recorded steps.
+    - `end`: the time at which the segment ends, s.
+    - `count`: the number of rows that are filled.
+    """
     there = jnp.arange(rows.shape[0], dtype=jnp.int32).reshape(-1, *[1] * end.ndim) < count
     times = jnp.where(there, lax.stop_gradient(rows[:, 0]).astype(end.dtype), jnp.inf)
     return Segment(rows, times, lax.stop_gradient(end), count)
@@ -474,16 +563,23 @@ def segment(rows: Rows, end: Array, count: Array) -> Segment:
 def states_at_saved_times(
     method: Method, constants: Arrays, run: Run, part: Segment, ys: Array
 ) -> Array:
-    """Return `ys` (K, n, *bodies), with each state filled in whose time lies in the segment `part`.
+    """Return the array of saved states, with the states filled in whose times lie in one segment.
 
-    The K times are `run.between`.
+    - `method`: the explicit method and the field.
+    - `constants`: the arrays on which the field depends.
+    - `run`: holds the K saved times `run.between`, in increasing order.
+    - `part`: the segment, a part of the run, with its recorded steps.
+    - `ys`: (K, n, *bodies) the saved states so far; `*bodies` is one last axis for the bodies of a
+      batch, or no axis for one body.
     """
     size, many = run.between.shape[0], run.t0.ndim > 0
     width = 1 if many else min(size, _TOGETHER)
     # The steps of all saved times are looked up at once: in a loop, each look-up would be many
     # small kernels.
     ts = lax.stop_gradient(run.between)
-    search = per_body(run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1)
+    search = map_over_bodies(
+        run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1
+    )
     index = search(part.times, ts)
     inside = (index >= 0) | (part.times[0] <= lax.stop_gradient(run.t0))[None]
     index, inside = jnp.maximum(index, 0), inside & (ts <= part.end[None])
@@ -524,7 +620,16 @@ def states_at_saved_times(
 
 
 def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
-    """Return the state (n, *bodies) at the time `t` in a step from the slopes of all its stages."""
+    """Return the state (n, *bodies) at a time within a step, by dense output.
+
+    `*bodies` is one last axis for the bodies of a batch, or no axis for one body.
+
+    - `method`: holds the weights of the method, and scales a quaternion to length 1.
+    - `t`: the time, s.
+    - `step`: the start, the length and the first state of the step.
+    - `slopes`: (n, s, *bodies) the values of the field at all s stages of the step, those of dense
+      output included.
+    """
     theta = ((t - step.t) / jnp.where(step.h == 0, 1, step.h)).astype(slopes.dtype)
     # The polynomial in θ is evaluated for the weights of the slopes, which are one number for each
     # stage. To evaluate it for the rows F_r of dense output would take n numbers for each row.

@@ -25,9 +25,9 @@ from rigidjax.solve.adaptive_loop import (
     Segment,
     initial_loop_state,
     is_running,
-    per_body,
+    map_over_bodies,
     record_segment,
-    segment,
+    segment_of_rows,
     state_in_step,
     states_at_saved_times,
     step_times,
@@ -38,31 +38,35 @@ from rigidjax.solve.runge_kutta import Step, stages
 
 
 class Smooth(NamedTuple):
-    """Hold the fields of a `Run` that have derivatives, or their tangents or cotangents.
+    """Hold the arrays of a `Run` that have derivatives, or their tangents or cotangents.
 
-    The fields have the same names and shapes as in `Run`.
+    The arrays are the start of the run, the stops (times at which steps end), the saved times, and
+    the state at the start, with the shapes that they have in `Run`.
     """
 
-    t0: Array
-    stops: Array
-    between: Array
-    y0: Array
+    t0: Array  # the start of the run
+    stops: Array  # (J,) the times at which the field jumps, then the end of the run
+    between: Array  # (K,) the times whose states are saved
+    y0: Array  # (n,) the state at t0
 
 
 def smooth_numbers(run: Run) -> Smooth:
-    """Return the numbers of `run` that have derivatives."""
+    """Return the arrays of a run that have derivatives: its times, and the state at the start."""
     return Smooth(run.t0, run.stops, run.between, run.y0)
 
 
 def saved_times_before_rows(run: Run, part: Segment) -> Array:
-    """Return the number of saved times before the start of each recorded row of the segment `part`.
+    """Return the number of saved times before the start of each recorded step of a segment.
 
-    The saved times are `run.between`. One more number is appended: the number of saved times before
-    the end of the segment.
+    - `run`: holds the K saved times `run.between`.
+    - `part`: a segment (a part of a run), with one row for each of its N recorded steps.
+
+    **Returns** an array (N + 1, *bodies), where `*bodies` is one last axis for the bodies of a
+    batch, or no axis. Its last number is the number of saved times before the end of the segment.
     """
     ends = jnp.concatenate([jnp.minimum(part.times, part.end[None]), part.end[None]])
     search = lambda ts, t: jnp.searchsorted(ts, t, side="right").astype(jnp.int32)  # noqa: E731
-    count = per_body(run, search)(lax.stop_gradient(run.between), ends)
+    count = map_over_bodies(run, search)(lax.stop_gradient(run.between), ends)
     # A saved time equal to the start of the run belongs to the first step, and is not counted as
     # before it.
     return jnp.where(ends <= lax.stop_gradient(run.t0)[None], 0, count)
@@ -75,20 +79,22 @@ def transpose_saved_states(
     """Return the cotangents of a step from the cotangents of the states that are saved within it.
 
     This is the transpose of `state_in_step`, for all saved times in the step and for all bodies.
+    `*bodies` is one last axis for the bodies of a batch, or no axis for one body.
 
-    **Arguments:**
-
-    - `step`, `slopes`: the step, and the slopes (values of the field) at all its stages.
+    - `method`: the explicit method and the field.
+    - `run`: holds the K saved times `run.between`.
+    - `step`, `slopes`: the step, and the slopes (values of the field) at all its stages, (n, s,
+      *bodies).
     - `first`, `last`: the indices of the saved times in this step go from `first` to `last` − 1.
     - `bars`: (K, n, *bodies), the cotangents of all saved states.
-    - `between`: the cotangents of the saved times, as far as they are summed up, or `None` if these
-      cotangents are not wanted.
+    - `between`: (K, *bodies), the cotangents of the saved times, as far as they are summed up, or
+      `None` if these cotangents are not wanted.
 
     **Returns** three things: the array `between`, to which the cotangents of the saved times in
     this step are added (or `None`); the cotangents of the step; and the cotangents of the slopes.
     """
     state_at, most = partial(state_in_step, method), run.between.shape[0] - 1
-    pick = per_body(run, lambda a, index: a[index])
+    pick = map_over_bodies(run, lambda a, index: a[index])
 
     # The saved times in a step are treated one after the other. An axis for them would have the
     # length of the largest number of saved times in a step of any body, and most bodies have far
@@ -100,7 +106,7 @@ def transpose_saved_states(
         bar = jnp.where(inside[None], pick(bars, there), 0)
         by_t, *more = jax.vjp(state_at, t, step, slopes)[1](bar)
         if total is not None:
-            total = per_body(run, lambda a, i, b: a.at[i].add(b))(total, there, by_t)
+            total = map_over_bodies(run, lambda a, i, b: a.at[i].add(b))(total, there, by_t)
         return number + 1, total, jax.tree.map(jnp.add, by, more)
 
     start = (first, between, jax.tree.map(jnp.zeros_like, [step, slopes]))
@@ -111,12 +117,20 @@ def transpose_saved_states(
 def replay_steps(
     method: Method, constants: Arrays, run: Run, record: Record
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the states of a recorded run, computed once more by its recorded steps.
+    """Compute a recorded run once more by its recorded steps, so that it can be differentiated.
 
     The lengths of the steps are held constant for derivatives, except where a step was cut short at
-    a stop. **Returns** four things: the states (K, n, *bodies) at `run.between`; the state at the
-    end of the run; the states at the starts of the segments, followed by the state at the end; and
-    the rows of the last segment, which contain the recomputed states.
+    a stop (a time at which the field jumps). `*bodies` is one last axis for the bodies of a batch,
+    or no axis for one body.
+
+    - `method`: the explicit method and the field.
+    - `constants`: the arrays on which the field depends.
+    - `run`: the start of the run, the stops, and the K saved times `run.between`.
+    - `record`: the recorded steps, in segments, which are parts of the run.
+
+    **Returns** four things: the states (K, n, *bodies) at the saved times; the state (n, *bodies)
+    at the end of the run; the states at the starts of the segments, followed by the state at the
+    end; and the rows of the last segment, which contain the recomputed states.
     """
 
     def one(i: Array, state: tuple[Array, Array, Array, Array]) -> Any:
@@ -149,9 +163,17 @@ def cotangents(
 ) -> tuple[Arrays, Smooth]:
     """Return the cotangents of the constants and of the run: the transpose of `replay_steps`.
 
-    `bars` is a list of two arrays: the cotangents of the states at `run.between`, and the cotangent
-    of the state at the end of the run. The cotangents of the times of the run are computed only if
-    `timed` is true; else they are 0.
+    - `method`: the explicit method and the field.
+    - `constants`: the arrays on which the field depends.
+    - `run`: the start of the run, the stops (times at which the field jumps), and the saved times
+      `run.between`.
+    - `record`: the recorded steps, in segments, which are parts of the run.
+    - `bars`: a list of two arrays: the cotangents of the states at the saved times, and the
+      cotangent of the state at the end of the run.
+    - `timed`: whether the cotangents of the times of the run are computed; else they are 0.
+
+    **Returns** two things: the list of the cotangents of `constants`; and the cotangents of the
+    arrays of `run` that have derivatives, in a `Smooth`.
     """
     number, size = jnp.max(record.counts[0]), run.between.shape[0]
 
@@ -183,10 +205,10 @@ def cotangents(
                 rest = [a + b for a, b in zip(rest, (seeds.t, seeds.h, seeds.y), strict=True)]
             # The cotangents of a body without a step in this row may be NaN, and are replaced by 0.
             on = row[2] >= STEP
-            by_t, by_h, by_y = (_where(on, a) for a in rest)
+            by_t, by_h, by_y = (_zero_unless(on, a) for a in rest)
             by_t0, by_stops = of_times((by_t, by_h, jnp.zeros_like(end)))
-            total = [a + _where(on, b) for a, b in zip(total, by_constants, strict=True)]
-            of_run = of_run._replace(y0=by_y + _where(~on, of_run.y0))
+            total = [a + _zero_unless(on, b) for a, b in zip(total, by_constants, strict=True)]
+            of_run = of_run._replace(y0=by_y + _zero_unless(~on, of_run.y0))
             if between is None or not timed:
                 return total, of_run
             t0, stops = of_run.t0 + by_t0, of_run.stops + by_stops
@@ -198,17 +220,28 @@ def cotangents(
     return lax.fori_loop(0, number, one, ([jnp.zeros_like(c) for c in constants], none))
 
 
-def _where(there: Array, a: Array) -> Array:
-    """Return `a` (…, *bodies) for the bodies where `there` is true, and 0 for the others."""
-    return jnp.where(lift(there, a), a, jnp.zeros_like(a))
+def _zero_unless(condition: Array, a: Array) -> Array:
+    """Return `a` (…, *bodies) for the bodies for which `condition` is true, and 0 for the others.
+
+    `*bodies` is one last axis for the bodies of a batch, or no axis for one body. `condition` has
+    one truth value for each body.
+    """
+    return jnp.where(lift(condition, a), a, jnp.zeros_like(a))
 
 
 def _segment_of_record(
     method: Method, constants: Arrays, run: Run, record: Record, number: Array
 ) -> Segment:
-    """Return the segment of the given `number` with its rows of steps.
+    """Return one segment (a part of a run) of a record, with its rows of recorded steps.
 
-    The rows of the last segment are read from the record. Any other segment is run once more.
+    The rows of the last segment are read from the record. Any other segment is run once more. If it
+    takes more steps than there are rows, its states are set to NaN.
+
+    - `method`: the explicit method and the field.
+    - `constants`: the arrays on which the field depends.
+    - `run`: the start of the run, and the times at which steps end.
+    - `record`: the loop state at the start of each segment, and the rows of the last segment.
+    - `number`: the index of the segment.
     """
     like = initial_loop_state(run)
     loop, after = (unpack([a[i] for a in record.starts], like) for i in (number, number + 1))
@@ -225,4 +258,4 @@ def _segment_of_record(
     short = jnp.where(jnp.any(is_running(method, run, end, until)), jnp.nan, 0.0)
     rows = rows.at[:, HEAD:].add(short.astype(rows.dtype))
     count = jnp.where(again, count, filled)
-    return segment(rows, after.t, count)
+    return segment_of_rows(rows, after.t, count)

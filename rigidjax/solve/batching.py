@@ -26,23 +26,33 @@ BLOCK = 16
 
 
 class Layout(NamedTuple):
-    """Describe which arrays of a program have a last axis of bodies."""
+    """Describe which arrays of a program have a last axis for the bodies of a batch."""
 
     bodies: bool  # whether the arrays of each body have this axis; without it there is one body
     shared: tuple[bool, ...]  # for each constant, whether all bodies share it: it has no such axis
 
     def over(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Map `function(constants, t, y)`, which takes the arrays of one body, over all bodies."""
+        """Map `function(constants, t, y)`, which takes the arrays of one body, over all bodies.
+
+        The result takes and returns arrays whose last axis is that of the bodies; constants that
+        all bodies share have no such axis. Without an axis of bodies `function` is returned
+        unchanged.
+        """
         axes = [None if s else -1 for s in self.shared]
         return jax.vmap(function, (axes, -1, -1), -1) if self.bodies else function
 
     def broadcast_to_bodies(
         self, constants: Arrays, per_body: list[bool], like: Any
     ) -> tuple["Layout", Arrays]:
-        """Broadcast the shared constants that `per_body` selects along a new last axis.
+        """Broadcast some of the constants that all bodies share along a new last axis of bodies.
 
-        The new axis has one copy for each body, as many as the last axis of `like` has. `per_body`
-        has one truth value for each constant. **Returns** the new layout and the constants.
+        - `constants`: the constants of a program, some with a last axis of bodies and some without.
+        - `per_body`: for each constant, whether it needs this axis.
+        - `like`: an array whose last axis is that of the bodies; its length is the number of
+          bodies.
+
+        **Returns** two things: the new layout, which says which constants are still shared; and the
+        constants.
         """
         if not self.bodies:
             return self, constants
@@ -64,17 +74,21 @@ Program = Callable[[Layout, Arrays, Arrays], Arrays]
 def in_lanes(
     program: Program, constants: Arrays, each: Arrays, linear: int = 0, layout: Layout | None = None
 ) -> Arrays:
-    """Return the result of `program`, run with the bodies of any `jax.vmap` in the last axis.
+    """Run a program with the bodies of any `jax.vmap` in the last axis of all arrays.
 
     **Arguments:**
 
-    - `program`: see `Program`.
+    - `program`: a function `program(layout, constants, each)` that returns a list of arrays; see
+      `Program`.
     - `constants`: arrays, each of which all bodies may share.
     - `each`: arrays in which each body has values of its own.
     - `linear`: the number of arrays at the end of `each` in which the program is linear, such as
       tangents. A `jax.vmap` over these arrays alone gives several tangents of one motion; its axis
       is not treated as an axis of bodies.
-    - `layout`: the layout of the given arrays; `None` stands for one body.
+    - `layout`: says which of the given arrays have a last axis of bodies already; `None` stands for
+      one body.
+
+    **Returns** the list of arrays that the program returns.
     """
     was = Layout(False, (True,) * len(constants)) if layout is None else layout
     number = len(constants)
@@ -122,30 +136,36 @@ def in_lanes(
 
     answer: Any = jax.custom_jvp(lambda *args: call(*args))
     # The derivative rule of `custom_vmap` gives wrong shapes for a batch of tangents, so that
-    # `_jvp` is used instead.
-    answer.defjvp(partial(_jvp, program, was, number, linear), symbolic_zeros=True)
+    # `_program_and_tangent` is used instead.
+    answer.defjvp(partial(_program_and_tangent, program, was, number, linear), symbolic_zeros=True)
     return answer(*constants, *each)
 
 
-def _jvp(
+def _program_and_tangent(
     program: Program,
-    was: Layout,
+    layout: Layout,
     number: int,
     linear: int,
     primals: tuple[PyTree, ...],
     tangents: tuple[PyTree, ...],
 ) -> tuple[Arrays, Arrays]:
-    """Return the result of a program and its tangent, computed in one call of `in_lanes`.
+    """Return the result of a program and its tangent, computed together in one call of `in_lanes`.
 
-    The first `number` of `primals` are the constants. `was` is the layout of the arrays; `linear`
-    is as for `in_lanes`.
+    This is the rule for the derivatives of `in_lanes`.
+
+    - `program`: a function `program(layout, constants, each)` that returns a list of arrays.
+    - `layout`: says which arrays have a last axis of bodies.
+    - `number`: the number of constants, which are the first of `primals`. The other primals are the
+      arrays `each`, in which each body has values of its own.
+    - `linear`: the number of arrays at the end of `each` in which the program is linear.
+    - `primals`, `tangents`: the arrays that the program takes, and their tangents.
     """
     constants, each = list(primals[:number]), list(primals[number:])
     moving = [not isinstance(t, SymbolicZero) for t in tangents]
     # The tangents are passed with the arrays `each`, in which every body has values of its own. The
     # tangents of shared constants therefore need a last axis of bodies; `with_tangents` adds the
     # same axis to these constants.
-    _, along = was.broadcast_to_bodies(list(tangents[:number]), moving[:number], each[0])
+    _, along = layout.broadcast_to_bodies(list(tangents[:number]), moving[:number], each[0])
     along = [t for t, m in zip([*along, *tangents[number:]], moving, strict=True) if m]
 
     def with_tangents(layout: Layout, constants: Arrays, rest: Arrays) -> Arrays:
@@ -158,7 +178,7 @@ def _jvp(
         return [a for o, m in pairs for a in ([o, m] if eqx.is_inexact_array(o) else [o])]
 
     out, moved = [], []
-    found = iter(in_lanes(with_tangents, constants, [*each, *along], linear + len(along), was))
+    found = iter(in_lanes(with_tangents, constants, [*each, *along], linear + len(along), layout))
     for a in found:
         out.append(a)
         moved.append(next(found) if eqx.is_inexact_array(a) else zero_from_primal(a))
@@ -168,8 +188,12 @@ def _jvp(
 def _in_blocks(program: Program, layout: Layout, number: int, *args: Any) -> Arrays:
     """Return the result of a program, computed on CPU for at most `BLOCK` bodies at a time.
 
-    The first `number` of `args` are the constants; in the other arrays each body has values of its
-    own.
+    The arrays of a small block of bodies stay in the first-level cache.
+
+    - `program`: a function `program(layout, constants, each)` that returns a list of arrays.
+    - `layout`: says which arrays have a last axis of bodies.
+    - `number`: the number of constants, which are the first of `args`.
+    - `args`: the constants, then the arrays in which each body has values of its own.
     """
     constants, each = list(args[:number]), list(args[number:])
     count = each[0].shape[-1] if layout.bodies else 1
@@ -199,8 +223,9 @@ def _in_blocks(program: Program, layout: Layout, number: int, *args: Any) -> Arr
 
 
 def lift(a: Array, like: Array) -> Array:
-    """Return `a` with leading axes of length 1 added, so that it has as many axes as `like`.
+    """Return `a` with leading axes of length 1 added, so that it broadcasts against `like`.
 
-    The last axes of `like` are the axes of `a`.
+    The last axes of `like` are the axes of `a`: an array with one number for each body is lifted to
+    multiply states (n, *bodies), for example. The result has as many axes as `like`.
     """
     return a.reshape((1,) * (like.ndim - a.ndim) + a.shape)

@@ -20,7 +20,10 @@ FEW = 32
 
 
 def split(tree: Any) -> Atoms:
-    """Return the numbers of a tree of arrays as scalars; arrays longer than `FEW` are not split."""
+    """Return the numbers of a tree of arrays as a tuple of scalars, the inverse of `join`.
+
+    An array of more than `FEW` numbers is not split: it is one item of the tuple.
+    """
     parts: list[Array] = []
     for leaf in jax.tree.leaves(tree):
         leaf = jnp.asarray(leaf)
@@ -32,7 +35,10 @@ def split(tree: Any) -> Atoms:
 
 
 def join(parts: Atoms, like: Any) -> Any:
-    """Return the tree that `split` converted to `parts`; `like` is a tree of the same shapes."""
+    """Return the tree of arrays whose numbers `split` returned as the tuple `parts`.
+
+    `like` is a tree with the structure and the shapes of the result.
+    """
     leaves, structure = jax.tree.flatten(like)
     queue = iter(parts)
     out = []

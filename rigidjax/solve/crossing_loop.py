@@ -17,7 +17,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve.adaptive_loop import NONFINITE, next_step, previous_number, starting_step, take
+from rigidjax.solve.adaptive_loop import (
+    NONFINITE,
+    next_step,
+    previous_number,
+    row_of_each_body,
+    starting_step,
+)
 from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
 from rigidjax.solve.tableaus import Tableau
@@ -30,7 +36,11 @@ _MOST = 70
 
 
 class SearchMethod(NamedTuple):
-    """Hold an explicit method and the field that it solves, on states (n, *bodies)."""
+    """Hold an explicit method and the field that it solves; states are arrays (n, *bodies).
+
+    A state has n numbers. `*bodies` is one last axis for the bodies of a batch, and no axis for one
+    body.
+    """
 
     tableau: Tableau
     field: Field
@@ -44,8 +54,8 @@ class Path(NamedTuple):
     t0: Array
     stops: Array  # (J,) the times at which the field jumps, then the end of the run
     y0: Array  # (n,) the state at t0
-    rtol: Array
-    atol: Array
+    rtol: Array  # the relative tolerance of a step
+    atol: Array  # the absolute tolerance
     h0: Array  # the length of the first step, NaN if it is to be chosen
 
     @property
@@ -59,7 +69,11 @@ class Path(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Hold the motion of a body and the condition g along it, on states (n, *bodies)."""
+    """Hold the motion of a body and a condition g along it; states are arrays (n, *bodies).
+
+    A state has n numbers. `*bodies` is one last axis for the bodies of a batch, and no axis for one
+    body.
+    """
 
     # attempt(step) returns the state after the step, and the norm of its error divided by the
     # tolerance.
@@ -78,12 +92,16 @@ class Search(NamedTuple):
     """Describe the crossings to find: their direction and the largest number of them."""
 
     direction: int  # 1: g goes up through zero, −1: down, 0: both
-    many: int  # the largest number of crossings
+    max_crossings: int  # the largest number of crossings
     max_steps: int  # the largest number of passes through the loop
 
 
 class Located(NamedTuple):
-    """Hold the crossings found, and the state of the search at its end."""
+    """Hold the crossings found, which are zeros of a condition g, and the end of the search.
+
+    K is the largest number of crossings, and n the number of numbers of a state. `*bodies` is one
+    last axis for the bodies of a batch, and no axis for one body.
+    """
 
     times: Array  # (K, *bodies), NaN after the last crossing
     states: Array  # (K, n, *bodies)
@@ -94,9 +112,11 @@ class Located(NamedTuple):
     steps: Array  # the number of passes through the loop
 
 
-class _End(NamedTuple):
-    """Hold an end of the interval that contains a zero: the offset x from the start of the step, s,
-    and g and dg/dt at this offset.
+class _IntervalEnd(NamedTuple):
+    """Hold one end of an interval of time, within a step, that contains a zero of the condition g.
+
+    - `x`: the time of the end, counted from the start of the step, s.
+    - `g`, `rate`: g and dg/dt at this time.
     """
 
     x: Array
@@ -104,30 +124,36 @@ class _End(NamedTuple):
     rate: Array
 
 
-class _Body(NamedTuple):
-    """Hold the state of the search for one body, or for many in the last axis."""
+class _SearchState(NamedTuple):
+    """Hold the state of the search for zeros of g for one body, or for many in the last axis.
 
-    t: Array
-    y: Array
+    A pass of the search is one attempted step, or a part of a step that ends at a guess for a zero.
+    """
+
+    t: Array  # the time that is reached
+    y: Array  # (n, *bodies) the state at t
     h: Array  # the length of the next step
     side: Array  # the sign of g: 1 or −1; 0 if g has been zero since the start
-    g: Array
-    rate: Array  # dg/dt
-    stop: Array  # the index of the next stop
+    g: Array  # the condition at t
+    rate: Array  # dg/dt at t
+    stop: Array  # the index in `Path.stops` of the next time at which a step ends
     refining: Array  # whether a zero in a step is searched for, between `low` and `high`
-    x: Array  # the offset of the next guess
-    low: _End
-    high: _End
+    x: Array  # the next guess for the zero, as a time after the start of the step
+    low: _IntervalEnd  # the start of the interval that contains the zero
+    high: _IntervalEnd  # its end
     tries: Array  # the number of guesses for a zero, or of steps taken again because g turns
     steps: Array  # the number of passes
     found: Array  # whether a zero was found in this call of the loop
     jumped: Array  # whether g jumped over the zero found last
 
 
-def locate(motion: Motion, search: Search, run: Path) -> Located:
-    """Return the crossings between `run.t0` and the last of `run.stops`.
+def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
+    """Return the zeros of a condition g along a run, from `run.t0` to the last of `run.stops`.
 
-    The length of the first step is `run.h0`.
+    - `motion`: takes a step, and evaluates g and the round-off of g.
+    - `search`: the direction of the zeros, their largest number, and the largest number of passes.
+    - `run`: the start, the times at which steps end, the tolerances, and the length of the first
+      step.
     """
     t0, y0 = run.t0, run.y0
     g, rate, *_ = motion.condition(t0, y0)
@@ -140,13 +166,13 @@ def locate(motion: Motion, search: Search, run: Path) -> Located:
     zero, none, no = jnp.zeros(t0.shape, jnp.int32), jnp.zeros_like(g), jnp.zeros(t0.shape, bool)
     sound = jnp.isfinite(g) & jnp.isfinite(run.stops[-1]) & jnp.all(jnp.isfinite(y0), 0)
     h, x = jnp.where(sound, run.h0, jnp.nan), jnp.zeros_like(t0)
-    end = _End(x, none, none)
+    end = _IntervalEnd(x, none, none)
     g = jnp.where(there, none, g)
-    body = _Body(t0, y0, h, side, g, rate, zero, no, x, end, end, zero, zero, no, no)
+    body = _SearchState(t0, y0, h, side, g, rate, zero, no, x, end, end, zero, zero, no, no)
     on = lambda body: jnp.any(_is_running(search, run, body))  # noqa: E731
 
-    def next_zero(body: _Body) -> _Body:
-        body = lax.while_loop(on, partial(_pass, motion, search, run), body)
+    def next_zero(body: _SearchState) -> _SearchState:
+        body = lax.while_loop(on, partial(_next_search_state, motion, search, run), body)
         return body._replace(found=body.found & motion.counts(body.t, body.y, body.steps))
 
     def row(state: Any) -> Any:
@@ -159,28 +185,46 @@ def locate(motion: Motion, search: Search, run: Path) -> Located:
         jumps = lax.dynamic_update_index_in_dim(jumps, body.found & body.jumped, k, 0)
         return body, times, states, jumps, k + 1, count + body.found.astype(jnp.int32)
 
-    times = jnp.full((search.many, *t0.shape), jnp.nan, t0.dtype)
-    states = jnp.full((search.many, *y0.shape), jnp.nan, y0.dtype)
+    times = jnp.full((search.max_crossings, *t0.shape), jnp.nan, t0.dtype)
+    states = jnp.full((search.max_crossings, *y0.shape), jnp.nan, y0.dtype)
     jumps = jnp.zeros(times.shape, bool)
     body, times, states, jumps, _, count = lax.while_loop(
-        lambda state: (state[4] < search.many) & on(state[0]._replace(found=no)),
+        lambda state: (state[4] < search.max_crossings) & on(state[0]._replace(found=no)),
         row,
         (body, times, states, jumps, jnp.zeros((), jnp.int32), zero),
     )
     return Located(times, states, jumps, count, body.t, body.h, body.steps)
 
 
-def _is_running(search: Search, run: Path, body: _Body) -> Array:
-    """Return for each body whether its search goes on: before the end, and with no zero found."""
+def _is_running(search: Search, run: Path, body: _SearchState) -> Array:
+    """Return for each body whether its search for a zero goes on.
+
+    A search stops if a zero was found, at the end of the run, after the largest number of passes,
+    and if no step is left that is long enough or the run met NaN.
+
+    - `search`: holds the largest number of passes.
+    - `run`: holds the stops, the times at which steps end; the last stop is the end of the run.
+    - `body`: the state of the search.
+    """
     ahead = (body.stop < run.stops.shape[0]) & (body.steps < search.max_steps)
     return ahead & (body.h > 0) & ~body.found
 
 
-def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
-    """Return the state of the search after one more attempted step or part of a step."""
+def _next_search_state(
+    motion: Motion, search: Search, run: Path, body: _SearchState
+) -> _SearchState:
+    """Return the state of the search after one more attempted step, or part of a step.
+
+    - `motion`: takes a step, and evaluates the condition g and its round-off.
+    - `search`: the direction of the zeros that are wanted, and the largest number of passes.
+    - `run`: holds the stops, which are the times at which steps end.
+    - `body`: the state of the search before this pass; its arrays may have a last axis of bodies.
+
+    A body whose search has ended keeps its state.
+    """
     on = _is_running(search, run, body)
     t, h, y, side = body.t, body.h, body.y, body.side
-    begin, end = take(run.stops, body.stop), take(run.before, body.stop)
+    begin, end = row_of_each_body(run.stops, body.stop), row_of_each_body(run.before, body.stop)
     arrived = on & ~body.refining & (t >= begin)
     left = end - t
     last = ~body.refining & (h >= left)
@@ -194,7 +238,10 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
     other = (side * g < 0) | ((g == 0) & (body.g != 0) & (side != 0))
     wanted = -side if search.direction == 0 else jnp.full_like(side, search.direction)
     asked = -side == wanted
-    start, here = _End(jnp.zeros_like(length), body.g, body.rate), _End(length, g, rate)
+    start, here = (
+        _IntervalEnd(jnp.zeros_like(length), body.g, body.rate),
+        _IntervalEnd(length, g, rate),
+    )
 
     # If the error of a step is below the tolerance, one of three things happens: the step is
     # accepted; or the step is taken again up to the extremum of g (`shorter`); or the zero of g in
@@ -204,7 +251,7 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
     good, following = accept_and_next_step(norm, motion.order, t, length, h, last, whole)
     following = jnp.minimum(following, motion.longest)
     good = step & good
-    hidden, turn = _hidden_zero(side, start, here, blur)
+    hidden, turn = _may_hide_zeros(side, start, here, blur)
     eps = jnp.finfo(h.dtype).eps
     long_enough = turn > 8 * eps * jnp.maximum(jnp.abs(t), eps * whole)
     shorter = good & hidden & long_enough & (body.tries < _GUESSES)
@@ -217,18 +264,18 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
     # Newton's method in the interval from `low` to `high`, at whose ends g is on opposite sides of
     # zero.
     refine = on & body.refining
-    low = _choose(refine & ~other, here, body.low)
-    high = _choose(refine & other, here, body.high)
-    near, pinned, move, guess = _newton(body, low, high, here)
+    low = _choose_end(refine & ~other, here, body.low)
+    high = _choose_end(refine & other, here, body.high)
+    near, pinned, move, guess = _newton_step(body, low, high, here)
     done = refine & (near | pinned)
     move = jnp.where(done, move, jnp.zeros_like(move))
-    low, high = _choose(crossed, start, low), _choose(crossed, here, high)
+    low, high = _choose_end(crossed, start, low), _choose_end(crossed, here, high)
 
     new = accept | done
     reached = accept & last
     shifted = motion.project(after + slope * lift(move.astype(y.dtype), y))
     flipped = done | (accept & other)
-    return _Body(
+    return _SearchState(
         t=jnp.where(new, jnp.where(reached, begin, late) + move, t),
         y=jnp.where(lift(new, y), jnp.where(lift(done, y), shifted, after), y),
         h=next_h,
@@ -237,7 +284,7 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
         rate=jnp.where(new, rate, body.rate),
         stop=body.stop + (arrived | reached).astype(jnp.int32),
         refining=(body.refining | crossed) & ~done,
-        x=jnp.where(crossed, _first_guess(side, low, high), guess),
+        x=jnp.where(crossed, _guess_zero(side, low, high), guess),
         low=low,
         high=high,
         tries=jnp.where(shorter | (refine & ~done), body.tries + 1, 0).astype(jnp.int32),
@@ -247,13 +294,20 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
     )
 
 
-def _newton(body: _Body, low: _End, high: _End, here: _End) -> tuple[Array, Array, Array, Array]:
-    """Take one step of Newton's method from the guess `here`, between `low` and `high`.
+def _newton_step(
+    body: _SearchState, low: _IntervalEnd, high: _IntervalEnd, here: _IntervalEnd
+) -> tuple[Array, Array, Array, Array]:
+    """Take one step of Newton's method towards a zero of g, from a guess between two interval ends.
+
+    - `body`: the state of the search; only the time and length of the step and the number of
+      guesses so far are used.
+    - `low`, `high`: the ends of the interval, at which g is on opposite sides of zero.
+    - `here`: the guess, with g and dg/dt there.
 
     **Returns** four things: whether this step reaches the zero; whether the search has to end at
-    `here` in any case, because no floating-point time lies between `low` and `high` or all guesses
-    are used up; the length of the step, or 0 if the step does not reach the zero; and the offset of
-    the next guess.
+    the guess in any case, because no floating-point time lies between `low` and `high` or all
+    guesses are used up; the length of the step, s, or 0 if the step does not reach the zero; and
+    the next guess, as a time after the start of the step, s.
     """
     rate, eps = here.rate, jnp.finfo(body.h.dtype).eps
     move = (-here.g / jnp.where(rate == 0, jnp.ones_like(rate), rate)).astype(here.x.dtype)
@@ -269,18 +323,32 @@ def _newton(body: _Body, low: _End, high: _End, here: _End) -> tuple[Array, Arra
     return near, pinned, jnp.where(near, move, jnp.zeros_like(move)), guess
 
 
-def _choose(which: Array, a: _End, b: _End) -> _End:
-    """Return the end `a` for the bodies where `which` is true, and the end `b` for the others."""
-    return _End(*(jnp.where(which, x, y) for x, y in zip(a, b, strict=True)))
+def _choose_end(condition: Array, if_true: _IntervalEnd, if_false: _IntervalEnd) -> _IntervalEnd:
+    """Return `if_true` for the bodies for which `condition` is true, and `if_false` for the others.
+
+    - `condition`: one truth value for each body.
+    - `if_true`, `if_false`: two ends of the interval in which a zero is searched for.
+    """
+    pairs = zip(if_true, if_false, strict=True)
+    return _IntervalEnd(*(jnp.where(condition, x, y) for x, y in pairs))
 
 
-def _hidden_zero(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array, Array]:
-    """Return whether g may have zeros between `low` and `high` that its signs there do not show.
+def _may_hide_zeros(
+    side: Array, low: _IntervalEnd, high: _IntervalEnd, blur: Array
+) -> tuple[Array, Array]:
+    """Return whether g may have zeros in an interval that its signs at the ends do not show.
 
-    `side` is the sign of g at `low`; `blur` is the size that g may have from round-off alone.
-    **Returns** a second result, too: the offset of the extremum of the cubic polynomial that has
-    the values and slopes of g at `low` and `high`. If g has two zeros, one lies on each side of
-    this extremum.
+    The cubic polynomial with the values and slopes of g at both ends is examined. There may be such
+    zeros if the extremum of this polynomial is beyond zero by more than `blur`, or if the tangents
+    at both ends do not exclude a zero.
+
+    - `side`: the sign of g at `low`, 1 or −1.
+    - `low`, `high`: the ends of the interval: their times after the start of the step, s, with g
+      and dg/dt there.
+    - `blur`: the size that g may have from round-off alone.
+
+    **Returns** two things: whether there may be such zeros; and the time of the extremum, as a
+    length from `low`, s. If g has two zeros, one lies on each side of this extremum.
     """
     width = (high.x - low.x).astype(low.g.dtype)
     a, b = side * low.rate * width, side * high.rate * width
@@ -308,14 +376,16 @@ def _hidden_zero(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array
     return within(least) & (two | three), least.astype(low.x.dtype) * (high.x - low.x)
 
 
-def _first_guess(side: Array, low: _End, high: _End) -> Array:
-    """Return the first guess for a zero of g between `low` and `high`.
+def _guess_zero(side: Array, low: _IntervalEnd, high: _IntervalEnd) -> Array:
+    """Return a first guess for the time, s, of a zero of g, counted from the start of the step.
 
-    The guess is a time x since the start of the step; g is the condition that is zero at a
-    crossing. The guess is x(0), where x(g) is the cubic polynomial in g that has the times and the
-    slopes dx/dg at `low` and `high`. The guess is the middle of the interval if g moves away from
-    zero at `low` or towards zero at `high`, or if x(0) lies outside of the interval. `side` is the
-    sign of g at `low`.
+    - `side`: the sign of g at `low`, 1 or −1; at `high` the sign is the opposite one.
+    - `low`, `high`: the ends of the interval: their times x after the start of the step, s, with g
+      and dg/dt there.
+
+    The guess is x(0), where x(g) is the cubic polynomial in g that has the times and the slopes
+    dx/dg at `low` and `high`. The guess is the middle of the interval if g moves away from zero at
+    `low` or towards zero at `high`, or if x(0) lies outside of the interval.
     """
     steady = (side * low.rate < 0) & (side * high.rate < 0)
     rise = jnp.where(steady, high.g - low.g, 1)
@@ -333,9 +403,16 @@ def _first_guess(side: Array, low: _End, high: _End) -> Array:
 def step_with_error(
     method: SearchMethod, constants: Arrays, run: Path, step: Step
 ) -> tuple[Array, Array]:
-    """Return the state after the step, and the norm of its error.
+    """Return the state after a step of an explicit method, and the error divided by the tolerance.
 
-    The norm is the root mean square over the numbers of the state of error divided by tolerance.
+    - `method`: the explicit method and the field, dy/dt.
+    - `constants`: the arrays on which the field depends.
+    - `run`: holds the tolerances `rtol` and `atol`.
+    - `step`: the time and state (n, *bodies) at the start of the step, and its length, s; `*bodies`
+      is one last axis for the bodies of a batch, and no axis for one body.
+
+    **Returns** two things: the state (n, *bodies) after the step; and the root mean square, over
+    the n numbers of the state, of error divided by tolerance. This norm has no derivative.
     """
     there = stages(method.tableau, method.field, constants, step)
     right = method.project(there.end)
@@ -349,53 +426,59 @@ def step_with_error(
 
 
 def accept_and_next_step(
-    norm: Array, order: int, t: Array, h: Array, kept: Array, last: Array, length: Array
+    norm: Array, order: int, t: Array, h: Array, uncut: Array, last: Array, length: Array
 ) -> tuple[Array, Array]:
-    """Return whether a step is accepted, and the length of the next step.
+    """Return whether a step is accepted, and the length of the next step, s.
 
     The next length is 0 if a shorter step would be below the round-off of the time, and NaN if the
     step ended with NaN.
 
-    **Arguments:**
-
     - `norm`: the error divided by the tolerance, as `step_with_error` returns it.
     - `order`: the order of this error.
     - `t`, `h`: the time at which the step began, and its length, s.
-    - `last`: whether the step was the last before a stop, and was cut short to end there.
-    - `kept`: the length, s, that the step would have had if it had not been cut short.
+    - `uncut`: the length, s, that the step would have had if it had not been cut short.
+    - `last`: whether the step was the last before a stop (a time at which a step has to end), and
+      was cut short to end there.
     - `length`: the length of the run, s. Near t = 0, where the round-off of t vanishes, the
       round-off of this length is taken instead.
     """
     good, following = next_step(norm, order, h)
-    kept = lax.stop_gradient(kept)
+    uncut = lax.stop_gradient(uncut)
     eps = jnp.finfo(h.dtype).eps
     unit = 8 * eps * jnp.maximum(jnp.abs(t), eps * length)
     why = jnp.where(jnp.isfinite(norm), 0.0, jnp.nan).astype(h.dtype)
     shorter = jnp.where(following > unit, following, why)
-    longer = jnp.where(last, jnp.maximum(following, kept), following)
+    longer = jnp.where(last, jnp.maximum(following, uncut), following)
     return good, jnp.where(good, longer, shorter)
 
 
-def outcome(h: Array, t: Array, end: Array, met: Array) -> dfx.RESULTS:
-    """Return the result of a search that ended at the time `t`.
+def result_of_search(h: Array, t: Array, end: Array, is_full: Array) -> dfx.RESULTS:
+    """Return how a search for crossings ended, as a `diffrax.RESULTS`.
 
-    `h` is the length of the step that would follow (see `accept_and_next_step`), `end` is the last
-    time of the run, and `met` says whether the search found the largest allowed number of
-    crossings.
+    - `h`: the length of the step that would follow, s: 0 if no step is left that is long enough,
+      NaN if the run met NaN.
+    - `t`: the time at which the search ended, s.
+    - `end`: the time at which the run ends, s.
+    - `is_full`: whether the search found the largest allowed number of crossings.
     """
     result = dfx.RESULTS.dt_min_reached
     for there, word in (
         (jnp.isnan(h), NONFINITE),
         (h > 0, dfx.RESULTS.max_steps_reached),
         (t >= end, dfx.RESULTS.successful),
-        (met, dfx.RESULTS.event_occurred),
+        (is_full, dfx.RESULTS.event_occurred),
     ):
         result = dfx.RESULTS.where(there, word, result)
     return result
 
 
-def first_step(method: SearchMethod, constants: Arrays, run: Path) -> Array:
-    """Return the length of the first step of a search, from the state and the field at `run.t0`."""
+def first_step_length(method: SearchMethod, constants: Arrays, run: Path) -> Array:
+    """Return the length of the first step of a search, s, from the state and its slope at `run.t0`.
+
+    - `method`: the explicit method and the field, dy/dt.
+    - `constants`: the arrays on which the field depends.
+    - `run`: holds the start, the state there, and the tolerances.
+    """
     y0 = run.y0
     scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
     slope = method.field(constants, run.t0, y0)

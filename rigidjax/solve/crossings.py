@@ -54,8 +54,8 @@ from rigidjax.solve.crossing_loop import (
     Path,
     Search,
     SearchMethod,
-    first_step,
-    outcome,
+    first_step_length,
+    result_of_search,
     step_with_error,
 )
 from rigidjax.solve.explicit import AbstractExplicit, require_explicit
@@ -214,21 +214,32 @@ def crossings(
         raise ValueError(f"t1: wanted another time than t0, got {float(end):g} for both")
     ts = jnp.stack([begin, end])
     body, state0, times = validation.checked_scene(body, state0, ts, torque, throw=False)
-    state0 = checked_start(event, body, state0, torque, times[0])
+    state0 = start_with_checked_condition(event, body, state0, torque, times[0])
     if torque is None and solver is None and body is not None:
-        return _solved(ClosedFormRun(body, False), event, many, max_steps, state0, times)
+        return _crossings_of_run(ClosedFormRun(body, False), event, many, max_steps, state0, times)
     solver = require_explicit(solver)
     rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
     way = direction_of(times)
     setup = DiffraxRun(
         body, torque, solver, rtol, atol, None, None, None, REPLAY, NO_METER, way, max_steps, False
     )
-    return _solved(setup, event, many, max_steps, state0, times)
+    return _crossings_of_run(setup, event, many, max_steps, state0, times)
 
 
-def checked_start(event: Event, body: Any, state0: Any, torque: Any, t: Array) -> Any:
-    """Return `state0` with the torque's own states; refuse a condition that is no number at
-    `state0`.
+def start_with_checked_condition(
+    event: Event, body: Any, state0: Any, torque: Any, t: Array
+) -> Any:
+    """Return the start of a run with the torque's own states, and check the condition there.
+
+    If the torque has states of its own, the result is a `Coupled` of `state0` and these states; if
+    it has none, the result is `state0` itself.
+
+    - `event`: the `Event` whose condition is checked.
+    - `body`, `state0`, `torque`: as for `simulate`.
+    - `t`: the time of the start, s.
+
+    **Raises:** `TypeError` or `ValueError` if the condition at the start is not one real number,
+    reads a part that the state lacks, or is NaN.
     """
     state0 = with_own_states(body, state0, torque, t)
     try:
@@ -247,7 +258,14 @@ def checked_start(event: Event, body: Any, state0: Any, torque: Any, t: Array) -
 
 
 def value(event: Event, body: Any, t: Any, y: Any) -> Array:
-    """Return the condition of an event at the time `t` and the state `y`; refuse a truth value."""
+    """Return the value of an event's condition, and check that it is one real number.
+
+    - `event`: the `Event`, whose condition is a function `(t, state, body)`.
+    - `body`: the body of the run, or `None`.
+    - `t`, `y`: the time, s, and the state at which the condition is evaluated.
+
+    **Raises:** `TypeError` or `ValueError` if the condition gives a truth value or an array.
+    """
     found = event.condition(t, y, body)
     if jnp.issubdtype(getattr(found, "dtype", type(found)), jnp.bool_):
         raise TypeError(
@@ -264,15 +282,23 @@ _value = eqx.filter_jit(value)
 def solve_until(
     setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
-    """Return the three results of `solve` up to the event, and the time and state of the event.
+    """Return the saved states of a run that ends at its first event, and the event.
 
-    The states at times after the event are NaN. If no event occurs, its time and state are NaN.
+    - `setup`: how the run is computed: in closed form or by diffrax.
+    - `event`: the `Event` at which the run ends.
+    - `state0`: the state at `ts[0]`.
+    - `ts`: (T,) s, the times at which states are saved, in the order of the run.
+
+    **Returns** five things: the states at `ts`, NaN at the times after the event; the dict of step
+    counts that becomes `Solution.stats`; the `diffrax.RESULTS`, which is `event_occurred` if there
+    was an event; the time of the event, s; and the state at the event. If no event occurs, its time
+    and state are NaN.
     """
     state0 = project_to_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
     given = setup.max_steps if isinstance(setup, DiffraxRun) else None
     steps = 1_000_000 if given is None else given
-    found = located(crossed, Search(event.direction, 1, steps), numbers)
+    found = locate_crossings(crossed, Search(event.direction, 1, steps), numbers)
     met, last = found.number > 0, lax.stop_gradient(ts[-1])
     end = jnp.where(met, crossed.time(found.times[0]), last)
     before = ~(crossed.time(ts) > crossed.time(end))
@@ -290,16 +316,22 @@ def solve_until(
     time, y = (jnp.where(met, leaf, jnp.nan) for leaf in (crossed.time(s), y))
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
     ys = nan_derivatives(jax.tree.map(rows, ys), inputs)
-    time, state = _with_derivatives((time, crossed.state(time, y)), jumps, inputs)
+    time, state = _set_unknown_derivatives_to_nan((time, crossed.state(time, y)), jumps, inputs)
     return ys, stats, dfx.RESULTS.where(met, dfx.RESULTS.event_occurred, result), time, state
 
 
-def _with_derivatives(crossing: Any, jumps: Array, inputs: Any) -> Any:
-    """Return the arrays of `crossing`, but with NaN derivatives in two cases.
+def _set_unknown_derivatives_to_nan(crossing: Any, jumps: Array, inputs: Any) -> Any:
+    """Return the arrays of `crossing` with their values, and with NaN for unknown derivatives.
 
-    The derivatives are with respect to `inputs`. The cases are: an array element that is NaN
-    itself; and a crossing at which g jumps over zero, which `jumps` marks. All other derivatives
-    stay as they are.
+    - `crossing`: a tree of arrays: the times and states of crossings, which are the zeros of the
+      condition g.
+    - `jumps`: whether g jumps over zero at each crossing. Its axes are the first axes of each array
+      in `crossing`.
+    - `inputs`: a tree of all numbers with respect to which derivatives are taken.
+
+    The derivatives become NaN in two cases: if a number is NaN itself, and if g jumps over zero at
+    the crossing, because then it is not known how the crossing depends on the inputs. All other
+    derivatives stay as they are.
     """
 
     def lost(leaf: Array) -> Array:
@@ -312,21 +344,29 @@ def _with_derivatives(crossing: Any, jumps: Array, inputs: Any) -> Any:
 
 
 @eqx.filter_jit
-def _solved(
-    setup: ClosedFormRun | DiffraxRun, event: Event, many: int, max_steps: int, state0: Any,
-    ts: Array,
+def _crossings_of_run(
+    setup: ClosedFormRun | DiffraxRun, event: Event, max_crossings: int, max_steps: int,
+    state0: Any, ts: Array,
 ) -> Crossings:  # fmt: skip
-    """Return at most `many` crossings of `event` in a run of `setup` from `ts[0]` to `ts[1]`."""
+    """Return the crossings of a run, with their derivatives.
+
+    - `setup`: how the run is computed: in closed form or by diffrax.
+    - `event`: an `Event`, which holds the condition that is zero at a crossing, and the direction.
+    - `max_crossings`: K, the largest number of crossings; the run ends at crossing number K.
+    - `max_steps`: the largest number of steps, parts of steps included.
+    - `state0`: the state at `ts[0]`.
+    - `ts`: (2,) s, the times at which the run begins and ends.
+    """
     state0 = project_to_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
-    found = located(crossed, Search(event.direction, many, max_steps), numbers)
+    found = locate_crossings(crossed, Search(event.direction, max_crossings, max_steps), numbers)
     times, states = _with_derivatives_of_scene(
         found.times, found.states, found.jumps, setup, event, state0, ts
     )
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
     out = crossed.time(times), jax.vmap(crossed.state)(crossed.time(times), states)
-    times, states = _with_derivatives(out, found.jumps, inputs)
-    result = outcome(found.h, found.t, crossed.time(ts[-1]), found.number >= many)
+    times, states = _set_unknown_derivatives_to_nan(out, found.jumps, inputs)
+    result = result_of_search(found.h, found.t, crossed.time(ts[-1]), found.number >= max_crossings)
     result = result_of_body(result, setup.body)
     return Crossings(times, states, found.number, result, found.steps)
 
@@ -335,12 +375,25 @@ def _solved(
 def _with_derivatives_of_scene(
     times: Array, states: Array, jumps: Array, *scene: Any
 ) -> tuple[Array, Array]:
-    """Return the `times` and `states` of crossings; only derivatives run the `scene` again."""
+    """Return `times` and `states` as they are; their derivatives come from a second run.
+
+    The second run is that of `_crossings_of_scene`. It is computed only if derivatives are taken.
+
+    - `times`, `states`: the K crossings found, shapes (K,) and (K, n). The times are s = σt, where
+      σ is 1 for a run forwards in time t and −1 for a run backwards.
+    - `jumps`: (K,), whether the condition jumps over zero at each crossing.
+    - `scene`: the arguments `setup`, `event`, `state0` and `ts` of `_crossings_of_scene`.
+    """
     return times, states
 
 
 @_with_derivatives_of_scene.def_jvp
-def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
+def _jvp_of_crossings(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
+    """Return the crossings found before, and their tangents from a second run of the scene.
+
+    - `primals`: the arguments of `_with_derivatives_of_scene`: times, states, jumps and the scene.
+    - `tangents`: the tangents of these arguments; only those of the scene are used.
+    """
     found, jumps, scene = primals[:2], primals[2], primals[3:]
     moved, along = eqx.filter_jvp(
         partial(_crossings_of_scene, found[0], jumps), scene, tangents[3:]
@@ -352,11 +405,21 @@ def _crossings_of_scene(
     times: Array, jumps: Array, setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any,
     ts: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return the times and states of the crossings near the fixed `times`, with derivatives.
+    """Return the times and states of known crossings, computed once more to be differentiated.
 
-    The derivatives are with respect to all numbers of the scene, that is of `setup`, `event`,
-    `state0` and `ts`. `jumps` says for each crossing whether g jumps over zero there. The `times`
-    and the times returned are s = σt, as in `Section`.
+    The motion is computed up to the fixed `times`, and each crossing near such a time is found by
+    one step of Chebyshev's method.
+
+    - `times`: (K,) the times of the crossings, s = σt, where σ is 1 for a run forwards in time t
+      and −1 for a run backwards; NaN after the last crossing.
+    - `jumps`: (K,), whether the condition jumps over zero at each crossing.
+    - `setup`: how the run is computed: in closed form or by diffrax.
+    - `event`: an `Event`, which holds the condition that is zero at a crossing.
+    - `state0`: the state at `ts[0]`.
+    - `ts`: (T,) s, of which the first and the last are the times at which the run begins and ends.
+
+    **Returns** the times (K,), again s = σt, and the states (K, n). They have derivatives with
+    respect to all numbers of `setup`, `event`, `state0` and `ts`.
     """
     crossed, (constants, *_) = section(setup, event, state0, ts)
     there = jnp.isfinite(times)
@@ -376,33 +439,48 @@ _CLEAR = 16
 
 
 class Section(NamedTuple):
-    """Hold a section and a motion as functions of the time s = σt, which increases along the run.
+    """Hold a condition g and a motion y as functions of the time s = σt, which grows along the run.
 
-    σ is 1 if the run goes forwards in time t, and −1 if it goes backwards.
+    σ is 1 if the run goes forwards in time t, and −1 if it goes backwards. The section is the set
+    of states with g = 0. The functions take the arrays that they depend on as a first argument, the
+    `constants`.
     """
 
     solver: AbstractExplicit | None  # `None` is the closed form
-    motion: Callable[[Arrays, Array, Array], Array]  # dy/ds; in closed form y itself
-    rates: Callable[[Arrays, Array, Array], tuple[Array, Array, Array]]  # g, dg/ds and dy/ds
+    # motion(constants, s, y) → dy/ds, or, in closed form, y at the time s.
+    motion: Callable[[Arrays, Array, Array], Array]
+    # rates(constants, s, y) → g, dg/ds and dy/ds.
+    rates: Callable[[Arrays, Array, Array], tuple[Array, Array, Array]]
     tree: Callable[[Array], Any]  # the state from the vector of its numbers
     sizes: list[int]  # how many numbers each array of the state has
     sign: Array  # σ
-    form: ByMomentum | None = None  # if given, the numbers that are integrated instead of the state
+    # If the inertia is a function of time, `form` replaces the body rate of a state by the momentum
+    # divided by a fixed inertia, and back. `None`: the state itself is integrated.
+    form: ByMomentum | None = None
 
     def vector(self, t: Array, state: Any) -> Array:
-        """Return the vector of the numbers that are integrated from the state at the time `t`."""
+        """Return the vector (n,) of the numbers that are integrated, made from a state.
+
+        - `t`: the time of the state, s.
+        - `state`: the state, such as an `Attitude`. If the inertia is a function of time, the body
+          rate is replaced by the momentum divided by the inertia at the start (see `ByMomentum`).
+        """
         return ravel_pytree(state if self.form is None else self.form.enter(t, state))[0]
 
     def state(self, t: Array, y: Array) -> Any:
-        """Return the state at the time `t` from the vector `y` of the numbers integrated."""
+        """Return the state that belongs to a vector of integrated numbers, the inverse of `vector`.
+
+        - `t`: the time of the state, s.
+        - `y`: (n,) the numbers that are integrated.
+        """
         return self.tree(y) if self.form is None else self.form.leave(t, self.tree(y))
 
     def project(self, y: Array) -> Array:
-        """Return the vector `y` with its quaternion, if it has one, scaled to length 1."""
+        """Return the vector `y` (n,) of a state with its quaternion, if any, scaled to length 1."""
         return ravel_pytree(project_to_group(self.tree(y)))[0]
 
     def time(self, s: Array) -> Array:
-        """Return the time t at `s`, or s at the time t: each is σ times the other."""
+        """Convert the time s of a run to t = σs, or t to s = σt, where σ is 1 or −1."""
         return self.sign.astype(s.dtype) * s
 
 
@@ -413,7 +491,16 @@ Numbers = tuple[Arrays, Path, Array]
 def section(
     setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
 ) -> tuple[Section, Numbers]:
-    """Return the section of a run from `ts[0]` to `ts[-1]`, and the `Numbers` of its functions."""
+    """Return the condition and the motion of a run as functions of a time that grows along the run.
+
+    - `setup`: how the run is computed: in closed form or by diffrax.
+    - `event`: an `Event`, which holds the condition g and the longest step.
+    - `state0`: the state at `ts[0]`.
+    - `ts`: (T,) s, of which the first and the last are the times at which the run begins and ends.
+
+    **Returns** two things: a `Section`, which holds the functions; and the tuple `Numbers`, which
+    holds their constants, the run that is searched for crossings, and its longest step, s.
+    """
     form = by_momentum(setup.body, state0, setup.torque) if isinstance(setup, DiffraxRun) else None
 
     def condition(t: Array, y: Any) -> Array:
@@ -448,7 +535,7 @@ def section(
     else:
         solver, free = None, FreeMotion(setup.body, state0)
         motion = lambda s, _: ravel_pytree(free(sign.astype(s.dtype) * s - ts[0]))[0]  # noqa: E731
-        longest = jnp.minimum(longest, _spacing(setup.body, state0, length))
+        longest = jnp.minimum(longest, _sampling_interval(setup.body, state0, length))
         rtol, atol, h0 = jnp.zeros((), y0.dtype), jnp.zeros((), y0.dtype), longest
     (of_motion, of_rates), constants = constants_of([motion, rates], along[0], y0)
     stops = jnp.concatenate([program.stops, along[1:]])
@@ -458,12 +545,16 @@ def section(
     return crossed, (constants, run, longest)
 
 
-def _spacing(body: Any, state0: Any, whole: Array) -> Array:
-    """Return the interval between samples of a free body's condition, s.
+def _sampling_interval(body: Any, state0: Any, length: Array) -> Array:
+    """Return the interval between samples of a free body's condition, in which zeros are sought, s.
 
     The interval is the period of one turn at the largest rate that energy and momentum allow,
     divided by 16. If the run is so short that the body turns by less than a radian at this rate,
-    the interval is the length `whole` of the run divided by 16.
+    the interval is the length of the run divided by 16.
+
+    - `body`: an `Inertia`, or a body with an `inertia`.
+    - `state0`: the state at the start, with the body rate `omega`, rad/s.
+    - `length`: the length of the run, s.
     """
     inertia = body if isinstance(body, Inertia) else body.inertia
     tensor, omega = lax.stop_gradient((inertia.tensor, state0.omega))
@@ -471,26 +562,45 @@ def _spacing(body: Any, state0: Any, whole: Array) -> Array:
     least = jnp.linalg.eigvalsh(tensor)[0]
     by_energy = jnp.sqrt(jnp.sum(momentum * omega) / least)
     rate = jnp.minimum(by_energy, jnp.sqrt(jnp.sum(momentum**2)) / least)
-    return jnp.where(rate * whole > 1, 2 * np.pi / (_SAMPLES * rate), whole / _SAMPLES)
+    return jnp.where(rate * length > 1, 2 * np.pi / (_SAMPLES * rate), length / _SAMPLES)
 
 
-def located(section: Section, what: Search, numbers: Numbers) -> Located:
-    """Return the first crossings of a run, at most the number in `what`, without derivatives."""
+def locate_crossings(section: Section, search: Search, numbers: Numbers) -> Located:
+    """Return the first crossings of a run, without derivatives.
+
+    - `section`: the condition and the motion as functions of s = σt (see `Section`).
+    - `search`: the direction of the crossings, their largest number, and the largest number of
+      steps.
+    - `numbers`: the constants of the functions of the section, the run that is searched, and its
+      longest step.
+    """
     constants, run, longest = lax.stop_gradient(numbers)
-    program = partial(_located, section, what)
+    program = partial(_locate_in_lanes, section, search)
     return Located(*in_lanes(program, constants, [*run, longest]))
 
 
-def _located(
-    section: Section, what: Search, layout: Layout, constants: Arrays, each: Arrays
+def _locate_in_lanes(
+    section: Section, search: Search, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    """Return the fields of `Located` in a list: the program of `located` for `in_lanes`."""
+    """Return the fields of `Located` in a list: the crossings of one body, or of many at once.
+
+    `in_lanes` calls this function, and puts the bodies of a batch into the last axis of every
+    array.
+
+    - `section`: the condition and the motion as functions of s = σt (see `Section`).
+    - `search`: the direction of the crossings, their largest number, and the largest number of
+      steps.
+    - `layout`: which arrays have a last axis of bodies.
+    - `constants`: the arrays on which the functions of the section depend.
+    - `each`: the fields of a `Path`, which is the run that is searched, followed by its longest
+      step.
+    """
     run, longest = Path(*each[:-1]), each[-1]
     solver, motion = section.solver, layout.over(section.motion)
     project = jax.vmap(section.project, -1, -1) if layout.bodies else section.project
     seen, clear = (
         partial(layout.over(partial(f, section)), constants)
-        for f in (_condition_and_round_off, _clearness)
+        for f in (_condition_and_round_off, _rate_relative_to_round_off)
     )
 
     def counts(s: Array, y: Array, steps: Array) -> Array:
@@ -503,63 +613,93 @@ def _located(
     attempt: Any = lambda step: (motion(constants, step.end, step.y), still)  # noqa: E731
     if solver is not None:
         method = SearchMethod(solver.tableau, motion, project, section.sizes)
-        h0 = first_step(method, constants, run)
+        h0 = first_step_length(method, constants, run)
         h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), longest)
         run = run._replace(h0=h0)
         attempt, order = partial(step_with_error, method, constants, run), solver.tableau.order
     moving = Motion(attempt, order, longest, seen, counts, project)
-    return list(crossing_loop.locate(moving, what, run))
+    return list(crossing_loop.locate_zeros(moving, search, run))
 
 
-def _lengths(sizes: list[int], a: Array) -> Array:
-    """Return for each number of the vector `a` the norm of that part of `a` to which it belongs.
+def _norms_of_arrays(sizes: list[int], vector: Array) -> Array:
+    """Return for each number of a vector the Euclidean norm of the array to which it belongs.
 
-    The vector `a` consists of arrays in a row; `sizes` are the numbers of elements of these arrays.
+    - `sizes`: the numbers of elements of the arrays that are joined in the vector. For the state
+      (Ω, x), for example, they are 3 and 3.
+    - `vector`: (n,) the joined arrays, such as the numbers of a state or of its time derivative.
+
+    **Returns** an array (n,), in which all elements of one array have the same value.
     """
     which = np.repeat(np.arange(len(sizes)), sizes)
-    same = jnp.asarray(which[:, None] == which[None], a.dtype)
-    return jnp.sqrt(jnp.sum(same * (a * a)[None], 1))
+    same = jnp.asarray(which[:, None] == which[None], vector.dtype)
+    return jnp.sqrt(jnp.sum(same * (vector * vector)[None], 1))
 
 
-def _push(sizes: list[int], y: Array) -> Array:
-    """Return a test change of the state `y`: each number changes by up to the norm of its array.
+def _test_change(sizes: list[int], y: Array) -> Array:
+    """Return a change (n,) of the state `y` (n,), with which the effect of round-off is measured.
 
-    The change has components along all axes of the body. `sizes` is as for `_lengths`.
+    Each number changes by at most the norm of the array to which it belongs. The factors, cosines
+    of 1, 2, …, differ from number to number, so that the change has components along all axes of
+    the body.
+
+    - `sizes`: the numbers of elements of the arrays that are joined in `y`.
+    - `y`: (n,) the numbers of a state.
     """
-    return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _lengths(sizes, y)
+    return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _norms_of_arrays(sizes, y)
 
 
 def _condition_and_round_off(
     section: Section, constants: Arrays, s: Array, y: Array
 ) -> tuple[Array, ...]:
-    """Return g, dg/ds and dy/ds at the time `s` and the state `y`, and the round-off of g.
+    """Return the condition g at a state, its rate, the slope of the state, and the round-off of g.
 
-    g is the condition of the `section`, which is zero at a crossing.
+    - `section`: holds g, which is zero at a crossing, and the motion (see `Section`).
+    - `constants`: the arrays on which the functions of the section depend.
+    - `s`, `y`: the time s = σt and the numbers (n,) of the state.
+
+    **Returns** four things: g; dg/ds along the motion; dy/ds (n,); and the size that g may have
+    from round-off alone.
     """
     of_g = lambda s, y: section.rates(constants, s, y)[0]  # noqa: E731
-    noise = jax.jvp(of_g, (s, y), (s, _push(section.sizes, y)))[1]
+    noise = jax.jvp(of_g, (s, y), (s, _test_change(section.sizes, y)))[1]
     blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)
     g, rate, slope = section.rates(constants, s, y)
     return jnp.asarray(g), jnp.asarray(rate), slope, blur
 
 
-def _clearness(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
-    """Return |dg/ds| at a zero of g, divided by the rate that round-off alone could cause there."""
+def _rate_relative_to_round_off(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
+    """Return |dg/ds| at a zero of a condition g, divided by the rate that round-off could cause.
+
+    At a true crossing this ratio is large. If g is zero only by round-off, the ratio is about 1.
+
+    - `section`: holds g and the motion (see `Section`).
+    - `constants`: the arrays on which the functions of the section depend.
+    - `s`, `y`: the time s = σt and the numbers (n,) of the state at the zero.
+    """
     rates, sizes = partial(section.rates, constants, s), section.sizes
     _, rate, slope = rates(y)
-    shift = jax.jvp(lambda y: rates(y)[2], (y,), (_push(sizes, y),))[1]
+    shift = jax.jvp(lambda y: rates(y)[2], (y,), (_test_change(sizes, y),))[1]
     by_s, by_y = jax.jacfwd(lambda s, y: section.rates(constants, s, y)[0], (0, 1))(s, y)
-    lengths = _lengths(sizes, slope) + _lengths(sizes, shift)
+    lengths = _norms_of_arrays(sizes, slope) + _norms_of_arrays(sizes, shift)
     terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * lengths)
     return jnp.abs(rate) / (jnp.finfo(y.dtype).eps * terms)
 
 
 def correction(
-    section: Section, constants: Arrays, s: Array, y: Array, there: Array
+    section: Section, constants: Arrays, s: Array, y: Array, is_crossing: Array
 ) -> tuple[Array, Array]:
-    """Return the time and state of the crossing near `s`, by one step of Chebyshev's method.
+    """Return the time and the state of a crossing by one step of Chebyshev's method from nearby.
 
-    `y` is the state at the time `s`. If `there` is false, the step has the length 0.
+    The step makes the first and second derivatives of the crossing correct (see the formula in the
+    module).
+
+    - `section`: holds the condition g and the motion (see `Section`).
+    - `constants`: the arrays on which the functions of the section depend.
+    - `s`, `y`: the fixed time s = σt near the crossing, and the numbers (n,) of the state there.
+    - `is_crossing`: a truth value; if it is false, nothing is zero near `s`, and the step has the
+      length 0.
+
+    **Returns** two things: the time s of the crossing, and the numbers (n,) of the state there.
     """
     rates = partial(section.rates, constants)
     g, rate, slope = rates(s, y)
@@ -568,8 +708,10 @@ def correction(
     here = lax.stop_gradient((s, y))
     _, moved = jax.jvp(rates, here, (jnp.ones_like(s), lax.stop_gradient(slope)))
     _, second, turn = lax.stop_gradient(moved)
-    rate = jnp.where(there, rate, jnp.ones_like(rate))
+    rate = jnp.where(is_crossing, rate, jnp.ones_like(rate))
     newton = -g / rate
-    move = jnp.where(there, newton * (1 - 0.5 * newton * second / rate), jnp.zeros_like(newton))
+    move = jnp.where(
+        is_crossing, newton * (1 - 0.5 * newton * second / rate), jnp.zeros_like(newton)
+    )
     state = y + slope * move + 0.5 * turn * move * move
     return s + move.astype(s.dtype), section.project(state)

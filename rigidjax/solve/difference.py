@@ -31,7 +31,7 @@ _UNSURE = 10.0
 
 
 class Slopes(NamedTuple):
-    """Hold the slopes of a function along one direction, in the shape of its value.
+    """Hold two slopes of a function at a point x, along one direction, in the shape of its value.
 
     **Fields:**
 
@@ -50,7 +50,7 @@ class Slopes(NamedTuple):
 def size_of(leaf: Array) -> Array:
     """Return the size of each number of an array: its absolute value, or 1 if all are zero.
 
-    If all numbers are zero, their natural size is not known, and 1 is taken.
+    If all numbers of the array `leaf` are zero, their natural size is not known, and 1 is taken.
     """
     return jnp.where(jnp.all(leaf == 0), jnp.ones_like(leaf), jnp.abs(leaf))
 
@@ -59,8 +59,15 @@ def size_of(leaf: Array) -> Array:
 def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple[Array, Any]:
     """Return the length of a step, and the two points one step from `x` in a random direction.
 
-    The two points are stacked in a new first axis. `value`, `value_error` and `derivative` are
-    those of the function at `x`.
+    The values of a function f at the two points give its slope, to be compared with its derivative.
+
+    - `x`: a tree of the numbers at which f is differentiated.
+    - `value`, `value_error`: f(x), and the error of each of its numbers.
+    - `derivative`: df/dx, a tree of arrays whose axes are those of f(x) and then those of x.
+
+    **Returns** two things: the length h () of the step, relative to the sizes of the numbers of
+    `x`; and the two points x − h d and x + h d, where d is the direction, as a tree with the two
+    points in a new first axis of each array.
     """
     rng = np.random.default_rng(2)
 
@@ -72,7 +79,7 @@ def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple
         return jnp.where(size == 0, jnp.max(size), size) * jnp.asarray(way, leaf.dtype)
 
     way = jax.tree.map(random_way, x)
-    rise = jnp.max(jnp.abs(_change(derivative, way)))
+    rise = jnp.max(jnp.abs(_change_along(derivative, way)))
     size = jnp.maximum(jnp.max(jnp.abs(value)), _SLOW * rise)
     unsure = jnp.maximum(jnp.max(value_error), float(jnp.finfo(value.dtype).eps) * size)
     # The length of the step is chosen such that the value changes by the geometric mean of its size
@@ -89,9 +96,13 @@ def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple
 
 
 def values_at(value: Callable[[Any, Any], Array], sides: Any, tolerances: Array) -> Array:
-    """Return the values of the function at the two points `sides`; NaN at a point that it refuses.
+    """Return the values of a function at two points; NaN at a point that the function refuses.
 
     Under `jit` the numbers of the points are not known, and the function cannot refuse them.
+
+    - `value`: the function, called as `value(x, tolerances)`.
+    - `sides`: a tree of arrays with the two points in the first axis.
+    - `tolerances`: passed to the function.
     """
     if not _checks.is_known((sides, tolerances)):
         return lax.map(lambda x: value(x, tolerances), sides)
@@ -114,14 +125,15 @@ def slopes_of(x: Any, middle: Array, step: Array, sides: Any, values: Array, err
 
     - `x`: the numbers at which the derivative is taken.
     - `middle`: the value at `x`, computed with the same tolerances as `values`.
-    - `step`, `sides`: the results of `sides_of`.
+    - `step`, `sides`: the results of `sides_of`: the length of the step, and the two points, one
+      step from `x` on either side.
     - `values`: the values at the two points `sides`, NaN if there is none.
     - `error`: a `FunctionError` with the derivative, and with the errors of value and derivative.
     """
     # The numbers of the two points have been rounded, so that their difference is not exactly along
     # the direction.
     moved = jax.tree.map(lambda side, leaf: side - leaf[None], sides, x)
-    rises = jax.vmap(lambda way: _change(error.derivative, way))(moved)
+    rises = jax.vmap(lambda way: _change_along(error.derivative, way))(moved)
     there = jnp.isfinite(values)
     # A missing value is replaced by 2 `middle` minus the other value.
     values = jnp.where(there, values, 2 * middle[None] - values[::-1])
@@ -132,7 +144,7 @@ def slopes_of(x: Any, middle: Array, step: Array, sides: Any, values: Array, err
     eps = jnp.finfo(error.value.dtype).eps
     unsure = jnp.max(bend + _CLOSER * error.value_error) + 8 * float(eps) * size
     ways = jax.tree.map(lambda side: jnp.abs(side[1] - side[0]) / (2 * step), sides)
-    of_derivative = _change(error.derivative_error, ways)
+    of_derivative = _change_along(error.derivative_error, ways)
     curved = rise * rise * step / jnp.maximum(size, _SLOW * rise)
     curved = jnp.where(rise > 0, curved, 0)
     allowed = _UNSURE * (unsure / step + of_derivative + curved)
@@ -142,10 +154,16 @@ def slopes_of(x: Any, middle: Array, step: Array, sides: Any, values: Array, err
 
 @jax.jit
 def errors_of_numbers(slopes: Slopes) -> Any:
-    """Return the error of the derivative with respect to each number of x.
+    """Return the error of a function's derivative with respect to each number of its argument x.
 
-    The error with respect to each number is so large that it alone would explain the whole
-    difference of the two slopes.
+    Two slopes along one direction are compared. The error with respect to each number is so large
+    that it alone would explain the whole difference between the slope by the derivative and the
+    slope by values. It is 0 where the slopes agree.
+
+    - `slopes`: the two slopes and the direction.
+
+    **Returns** a tree of the structure of x; the axes of each array are those of the value, then
+    those of the array in x.
     """
     slope = jnp.where(slopes.differ, jnp.abs(slopes.difference - slopes.derivative), 0)
 
@@ -157,7 +175,10 @@ def errors_of_numbers(slopes: Slopes) -> Any:
 
 
 def warn_of_slopes(slopes: Slopes) -> None:
-    """Warn that the derivative misses a change of values, if the slopes are known and differ."""
+    """Warn that a derivative misses a change of values, if the `slopes` are known and differ.
+
+    - `slopes`: the slope of a function by its derivative, and by a difference of its values.
+    """
     if not _checks.is_known(slopes) or not np.any(slopes.differ):
         return
     index = np.argmax(np.ravel(slopes.differ))
@@ -172,8 +193,14 @@ def warn_of_slopes(slopes: Slopes) -> None:
     )
 
 
-def _change(derivative: Any, way: Any) -> Array:
-    """Return the change of the value for the change `way` of x: the derivative times `way`."""
+def _change_along(derivative: Any, way: Any) -> Array:
+    """Return the change of a function's value for the change `way` of its argument x: df/dx · way.
+
+    - `derivative`: df/dx, a tree of arrays whose axes are those of the value and then those of x.
+    - `way`: a tree of the structure of x.
+
+    **Returns** an array of the shape of the value.
+    """
 
     def of_leaf(derivative: Array, way: Array) -> Array:
         many = derivative.ndim - way.ndim

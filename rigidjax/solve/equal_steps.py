@@ -25,13 +25,16 @@ Field = Callable[[Any, Any], Any]
 
 
 class StepWithLoopedStages(eqx.Module):
-    """Wrap the explicit method `solver`, so that the stages of its steps are a loop."""
+    """Wrap the explicit method `solver`, so that the stages of its steps are computed in a loop."""
 
     solver: AbstractExplicit
 
 
 def roll_steps(solver: Any) -> Any:
-    """Return an explicit method of order 4 or 5 with its stages in a loop; others are unchanged."""
+    """Return an explicit method of order 4 or 5 with its stages in a loop; others are unchanged.
+
+    - `solver`: the method. With a loop its program compiles faster.
+    """
     few = isinstance(solver, AbstractExplicit) and solver.tableau.order <= 5
     return StepWithLoopedStages(solver) if few else solver
 
@@ -44,42 +47,70 @@ def change_in(
     y: Any,
     end: Any,
 ) -> Any:
-    """Return the change of the state `y` in a step from the time `t` to `end`, of the length `h`,
-    s.
+    """Return the change of a state in one step of an explicit method.
 
     The quaternion of the state is not scaled to length 1.
+
+    - `solver`: the method; its stages are written out one after the other, or computed in a loop.
+    - `field`: a function `field(t, y)` that returns dy/dt.
+    - `t`, `end`: the times at the start and at the end of the step, s.
+    - `h`: the length of the step, s, which is `end` − `t` but for rounding.
+    - `y`: the state at the start, a tree of arrays.
+
+    **Returns** a tree of the structure of `y`.
     """
     if isinstance(solver, StepWithLoopedStages):
-        return _change_in_one_step(solver.solver.tableau, field, t, h, y, end)
+        return _change_by_looped_stages(solver.solver.tableau, field, t, h, y, end)
     return change_and_slope(solver.tableau, field, t, h, y, end)[0]
 
 
 def advance(tableau: Tableau, field: Field, t: Any, h: Array, y: Any) -> Any:
-    """Return the state after one step from `y`, whose quaternion is not scaled to length 1."""
+    """Return the state after one step of an explicit method.
+
+    The quaternion of the state is not scaled to length 1.
+
+    - `tableau`: the weights of the method.
+    - `field`: a function `field(t, y)` that returns dy/dt.
+    - `t`, `h`: the time at the start of the step, and its length, s.
+    - `y`: the state at the start, a tree of arrays.
+    """
     return jax.tree.map(jnp.add, y, change_and_slope(tableau, field, t, h, y)[0])
 
 
 def change_and_slope(
     tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any = None
 ) -> tuple[Any, Any]:
-    """Return the change of the state `y` in one step, and the slope dy/dt at the start of the step.
+    """Return the change of a state in one step, and the slope dy/dt at the start of the step.
 
-    The stages are written out, and the quaternion of the state is not scaled to length 1. `t` and
-    `h` are the time at the start of the step and its length, s. `end` is the time of the stages at
-    the end of the step; `None` is the rounded sum `t + h`. The barriers are needed because XLA
-    would otherwise make one kernel for each result, and each kernel would repeat all stages before
-    it.
+    The stages are written out one after the other, and the quaternion of the state is not scaled to
+    length 1.
+
+    - `tableau`: the weights of the method.
+    - `field`: a function `field(t, y)` that returns dy/dt.
+    - `t`, `h`: the time at the start of the step, and its length, s.
+    - `y`: the state at the start, a tree of arrays.
+    - `end`: the time of the stages at the end of the step, s; `None` is the rounded sum `t + h`.
+
+    The barriers are needed because XLA would otherwise make one kernel for each result, and each
+    kernel would repeat all stages before it.
     """
     end = t + h if end is None else end
     slopes = [barrier(field(t, y))]
     for node, row in zip(tableau.c, tableau.a, strict=True):
-        place = barrier(jax.tree.map(jnp.add, y, _along(h, row, slopes)))
+        place = barrier(jax.tree.map(jnp.add, y, _weighted_sum(h, row, slopes)))
         slopes.append(barrier(field(end if node == 1 else t + node * h, place)))
-    return _along(h, tableau.b, slopes), slopes[0]
+    return _weighted_sum(h, tableau.b, slopes), slopes[0]
 
 
-def _along(h: Array, row: Row, slopes: list[Any]) -> Any:
-    """Return `h` times the sum of the slopes, each multiplied by its weight in `row`."""
+def _weighted_sum(h: Array, row: Row, slopes: list[Any]) -> Any:
+    """Return `h` times the sum of the slopes of some stages, each multiplied by its weight.
+
+    - `h`: the length of the step, s.
+    - `row`: a dict of the weights, whose keys are the indices of the stages.
+    - `slopes`: dy/dt at each stage so far, trees of arrays.
+
+    **Returns** a tree of the structure of one slope.
+    """
 
     def moved(*slopes: Array) -> Array:
         first, *rest = [w * k for w, k in zip(row.values(), slopes, strict=True)]
@@ -88,10 +119,20 @@ def _along(h: Array, row: Row, slopes: list[Any]) -> Any:
     return jax.tree.map(moved, *[slopes[i] for i in row])
 
 
-def _change_in_one_step(tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any) -> Any:
-    """Return the change of the state `y` in a step whose stages are a loop.
+def _change_by_looped_stages(
+    tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any
+) -> Any:
+    """Return the change of a state in one step of an explicit method whose stages are a loop.
 
     The loop carries the slopes of the last few stages, as many as the rows of the tableau need.
+
+    - `tableau`: the weights of the method.
+    - `field`: a function `field(t, y)` that returns dy/dt.
+    - `t`, `end`: the times at the start and at the end of the step, s.
+    - `h`: the length of the step, s.
+    - `y`: the state at the start, a tree of arrays.
+
+    **Returns** a tree of the structure of `y`.
     """
     count = len(tableau.a) + 1
     rows = np.zeros((count, max(i - min(row) for i, row in enumerate(tableau.a, 1))))
@@ -104,9 +145,9 @@ def _change_in_one_step(tableau: Tableau, field: Field, t: Any, h: Array, y: Any
         (total, before), (time, row, share) = now, given
         place = y
         for i, slope in enumerate(before):
-            place = _plus(place, row[i] * h, slope)
+            place = _add_multiple(place, row[i] * h, slope)
         slope = barrier(field(time, barrier(place)))
-        return (_plus(total, share * h, slope), [slope, *before[:-1]]), None
+        return (_add_multiple(total, share * h, slope), [slope, *before[:-1]]), None
 
     rest = [jax.tree.map(jnp.zeros_like, y)] * rows.shape[1]
     each = [jnp.stack([jnp.asarray(time, h.dtype) for time in times])]
@@ -114,6 +155,9 @@ def _change_in_one_step(tableau: Tableau, field: Field, t: Any, h: Array, y: Any
     return lax.scan(stage, (jax.tree.map(jnp.zeros_like, y), rest), each)[0][0]
 
 
-def _plus(y: Any, part: Array, slope: Any) -> Any:
-    """Return the tree `y` plus `part` times the tree `slope`."""
-    return jax.tree.map(lambda a, k: a + part.astype(a.dtype) * k, y, slope)
+def _add_multiple(y: Any, factor: Array, slope: Any) -> Any:
+    """Return y + factor · slope, where `factor` is a scalar array.
+
+    `y` and `slope` are trees of arrays with equal structure.
+    """
+    return jax.tree.map(lambda a, k: a + factor.astype(a.dtype) * k, y, slope)

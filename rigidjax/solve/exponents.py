@@ -134,25 +134,39 @@ def lyapunov_exponents(
             "f(t, y, None)"
         )
     how = (solver, many, intervals, transient, max_steps)
-    return _solved(how, field, state0, begin, length, rtol, atol)
+    return _exponents_of_run(how, field, state0, begin, length, rtol, atol)
 
 
-def _product(a: Array, b: Array) -> Array:
-    """Return the product `a @ b` of small matrices, which XLA fuses with the code around it."""
+def _small_product(a: Array, b: Array) -> Array:
+    """Return the product `a @ b` of small matrices, which XLA fuses with the code around it.
+
+    - `a`: (n, m) and `b`: (m, k). The result is (n, k).
+    """
     return jnp.sum(a[:, :, None] * b[None], 1)
 
 
 @eqx.filter_jit
-def _solved(
-    how: Any, field: Any, state0: Any, t0: Array, length: Array, rtol: Any, atol: Any
+def _exponents_of_run(
+    options: Any,
+    field: Callable[..., Any],
+    state0: Any,
+    t0: Array,
+    length: Array,
+    rtol: Any,
+    atol: Any,
 ) -> Exponents:
-    """Return the exponents of `field` over the time `length` from `t0`.
+    """Return the Lyapunov exponents along a motion, without a check of the arguments.
 
-    `how` is a tuple of the solver and of four integers of `lyapunov_exponents`: the number of
-    exponents, `intervals`, `transient` and `max_steps`.
+    - `options`: a tuple of the solver and of four integers: the number of exponents, the number of
+      intervals of the run, the number of intervals at the beginning that are not counted, and the
+      largest number of steps in one interval.
+    - `field`: a vector field `f(t, y, args)`.
+    - `state0`: the state at `t0`.
+    - `t0`, `length`: the start and the length of the run, s.
+    - `rtol`, `atol`: the relative and the absolute tolerance of each step.
     """
     # Whole numbers of Python are not arrays: `filter_jit` compiles anew for other numbers.
-    solver, many, intervals, transient, max_steps = how
+    solver, many, intervals, transient, max_steps = options
     state0 = project_to_group(state0)
     step = length / intervals
 
@@ -167,12 +181,12 @@ def _solved(
 
         # The frame is held orthonormal to second order: the equations of a frame that is not
         # orthonormal are unstable.
-        frame = 1.5 * frame - 0.5 * _product(frame, _product(frame.T, frame))
+        frame = 1.5 * frame - 0.5 * _small_product(frame, _small_product(frame.T, frame))
         push = jax.linearize(rate, jnp.zeros(frame.shape[0], t.dtype))[1]
         pushed = jax.vmap(push, -1, -1)(frame)
-        grown = _product(frame.T, pushed)
+        grown = _small_product(frame.T, pushed)
         upper = jnp.triu(grown) + jnp.tril(grown, -1).T
-        return Coupled(slope, (pushed - _product(frame, upper), jnp.diagonal(grown)))
+        return Coupled(slope, (pushed - _small_product(frame, upper), jnp.diagonal(grown)))
 
     def interval(carry: Any, i: Array) -> Any:
         state, frame = carry

@@ -16,7 +16,7 @@ from rigidjax.frames import AbstractScene, MovingFrame
 from rigidjax.motion.coupled import Coupled
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
-from rigidjax.solve.crossings import Event, checked_start, solve_until
+from rigidjax.solve.crossings import Event, solve_until, start_with_checked_condition
 from rigidjax.solve.error import estimate_error_of_run, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected
@@ -247,7 +247,7 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
             ys, stats, result = solve(setup, state0, times)
         else:
             event = event if isinstance(event, Event) else Event(event)
-            state0 = checked_start(event, setup.body, state0, setup.torque, times[0])
+            state0 = start_with_checked_condition(event, setup.body, state0, setup.torque, times[0])
             ys, stats, result, event_time, event_state = solve_until(setup, event, state0, times)
     except RuntimeError as error:
         raise words_of_steps(setup, state0, times, _checks.own_sentence(error)) from None

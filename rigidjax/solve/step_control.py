@@ -17,8 +17,8 @@ from rigidjax.solve.adaptive_loop import (
     finite,
     next_step,
     previous_number,
+    row_of_each_body,
     starting_step,
-    take,
 )
 
 # The default norm of an error. It has the same value for a state as for the vector of all its
@@ -274,7 +274,7 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         If `index` is beyond the last stop, the two results are infinite.
         """
         none = jnp.full_like(self.stops[:1], jnp.inf)
-        stop = take(jnp.concatenate([self.stops, none]), index)
+        stop = row_of_each_body(jnp.concatenate([self.stops, none]), index)
         still = lax.stop_gradient(stop)
         gap = jnp.where(jnp.isinf(still), 0, previous_number(still) - still)
         return stop, stop + gap
@@ -299,6 +299,6 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         length = lax.stop_gradient(right - left)
         length = jnp.where(reached, jnp.maximum(length, kept), length)
         left = jnp.where(reached, stop, left)
-        index = jnp.where(reached, take(self.following, index), index)
+        index = jnp.where(reached, row_of_each_body(self.following, index), index)
         right = jnp.minimum(left + length, self._stop_and_moment_before(index)[1])
         return keep, left, right, jumped | reached, (inner, length, index), result

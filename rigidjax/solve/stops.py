@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.switching import MOST, Analysis, analysis_of
-from rigidjax.solve.switching_times import by_sides, separate_times, times_of
+from rigidjax.solve.switching_times import field_with_stops, separate_times, times_of
 
 
 def say_unseen(analysis: Analysis) -> None:
@@ -116,7 +116,7 @@ def program_with_stops(
     # The values at the switches are one array, because a loop that carries many arrays is slower.
     places = lax.stop_gradient((own, found._replace(times=own[:0])))
     one, unpacked = ravel_pytree(jax.tree.map(lambda leaf: leaf.astype(a.dtype), places))
-    more, field = [*(sides if likes else []), one], by_sides(analysis)
+    more, field = [*(sides if likes else []), one], field_with_stops(analysis)
 
     def call(given: Arrays, t: Array, y: Array) -> Array:
         *sides, one = given[number:]

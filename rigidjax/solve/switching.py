@@ -37,7 +37,7 @@ _PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 # `COMPARISONS`: primitives whose result changes when the first operand becomes equal to the second.
 # `_LEVELS`: primitives whose result changes when the first operand (for `rem` the quotient of the
 # two operands) passes a whole number. `sign`, which changes when its operand passes zero, is in
-# `_jumps`.
+# `_may_jump`.
 COMPARISONS = {"lt", "le", "gt", "ge", "lt_to", "le_to"}
 _LEVELS = {"floor", "ceil", "round", "convert_element_type", "rem"}
 # Primitives whose result has a kink when two operands become equal or, for `abs`, when the operand
@@ -80,39 +80,44 @@ NEAR = 16  # the number of places between grid points where a bent switch is sea
 class Node(NamedTuple):
     """Hold an equation of a flat program, in which each value is identified by an integer.
 
-    The inputs of the equation are such integers or literals, and its outputs are such integers.
+    A flat program is a traced function as one list of equations. An input of an equation is such an
+    integer or a literal, and an output is such an integer.
     """
 
     primitive: Any
     params: dict[str, Any]
     inputs: list[Any]
     outputs: list[int]
-    kinds: list[Any]  # the dtype of each input
+    dtypes: list[Any]  # the dtype of each input that has one
     shapes: list[Any]  # the shape and dtype of each output
-    source: Any
+    source: Any  # where in the user's code the equation was written
     declared: bool  # whether it belongs to a part that declares its jumps
 
     @property
     def name(self) -> str:
-        """Return the name of the primitive; for a call of `searchsorted` this name."""
-        return _name(self)
+        """Return the primitive's name, or "searchsorted" for a call of `jnp.searchsorted`."""
+        return _primitive_name(self)
 
 
 class Program(NamedTuple):
-    """Hold a function f(t, y, …) as a flat list of equations; integers identify their values.
+    """Hold a function f(t, y, …) as a flat list of equations; integers identify its values.
 
     Value 0 is the time t, and value 1 is the state y.
     """
 
-    nodes: list[Node]
-    constants: list[int]
+    nodes: list[Node]  # the equations, in the order of evaluation
+    constants: list[int]  # the values that are constants of the traced function
     inner: dict[int, Any]  # the constants of inner calls, by their numbers
-    inputs: list[int]
-    output: Any
+    inputs: list[int]  # the values that are arguments of the function
+    output: Any  # the value that the function returns
 
 
 class Switch(NamedTuple):
-    """Hold an equation whose result jumps, or has a kink, at times independent of the state."""
+    """Hold an equation whose result jumps, or has a kink, at times independent of the state.
+
+    An example is the comparison in `jnp.where(t < 1, push, 0.0)`. A comparison of arrays has
+    several elements, each of which changes at times of its own.
+    """
 
     node: Node
     degree: int  # how the operands depend on the time: `STRAIGHT`, …
@@ -120,19 +125,19 @@ class Switch(NamedTuple):
     jumps: bool  # whether the result jumps; else it has a kink
 
     @property
-    def most(self) -> int:
-        """Return how often an element can change at most if its operand only rises or falls."""
+    def most_changes(self) -> int:
+        """Return how often an element can change at most while its operand only rises or falls."""
         return MOST if self.node.name in _LEVELS else 1
 
     @property
     def places(self) -> int:
-        """Return the number of changes that the search for switching times can store."""
-        return MOST + 2 * NEAR if self.degree == BENT else self.size * self.most
+        """Return the number of changes that the search for the switching times can store."""
+        return MOST + 2 * NEAR if self.degree == BENT else self.size * self.most_changes
 
     @property
     def exact(self) -> bool:
         """Return whether no element can change more often than the search can store."""
-        return self.degree < BENT and self.most == 1
+        return self.degree < BENT and self.most_changes == 1
 
     @property
     def line(self) -> str:
@@ -141,7 +146,11 @@ class Switch(NamedTuple):
 
 
 class Analysis(NamedTuple):
-    """Hold the switches of a program, and the lines of code whose switches cannot be found."""
+    """Hold the switches of a program, and the lines of code whose switches cannot be found.
+
+    A switch is an equation, such as the comparison `t < 1`, whose result jumps or has a kink at
+    times that do not depend on the state.
+    """
 
     program: Program
     switches: list[Switch]
@@ -152,8 +161,12 @@ class Analysis(NamedTuple):
     unseen: list[str]  # the lines that may switch at times that cannot be searched for
 
 
-def _bodies(params: dict[str, Any]) -> Iterator[tuple[Any, Any]]:
-    """Yield each program among the parameters of an equation, with its constants."""
+def _inner_programs(params: dict[str, Any]) -> Iterator[tuple[Any, Any]]:
+    """Yield each program (a `Jaxpr`) among the parameters of an equation, with its constants.
+
+    - `params`: the parameters of an equation of a `Jaxpr`; a `cond`, for example, has one program
+      for each branch.
+    """
     for value in params.values():
         for part in value if isinstance(value, list | tuple) else (value,):
             if isinstance(part, ClosedJaxpr):
@@ -162,46 +175,79 @@ def _bodies(params: dict[str, Any]) -> Iterator[tuple[Any, Any]]:
                 yield part, ()
 
 
-def _name(eqn: Any) -> str:
+def _primitive_name(eqn: Any) -> str:
+    """Return the name of a primitive, or "searchsorted" for a call of `jnp.searchsorted`.
+
+    - `eqn`: an equation of a `Jaxpr`, or a `Node`.
+    """
     called = eqn.params.get("name")
     return "searchsorted" if called == "searchsorted" else eqn.primitive.name
 
 
-def _kinds(eqn: Any) -> list[Any]:
+def _dtypes_of_inputs(eqn: Any) -> list[Any]:
+    """Return the dtypes of the inputs of `eqn`, an equation of a `Jaxpr`.
+
+    An input without a dtype is left out.
+    """
     return [atom.aval.dtype for atom in eqn.invars if hasattr(atom.aval, "dtype")]
 
 
-def _is_float(kind: Any) -> bool:
-    return jnp.issubdtype(kind, jnp.floating)
+def _is_float(dtype: Any) -> bool:
+    """Return whether `dtype` is a floating-point dtype."""
+    return jnp.issubdtype(dtype, jnp.floating)
 
 
-def _jumps(name: str, params: dict[str, Any], kinds: list[Any]) -> bool:
-    """Return whether the result of an equation may jump when its real operands do not jump."""
-    if not kinds or not _is_float(kinds[0]):
+def _may_jump(name: str, params: dict[str, Any], dtypes: list[Any]) -> bool:
+    """Return whether the result of an equation may jump when its real operands do not jump.
+
+    - `name`, `params`: the name and the parameters of its primitive, such as "lt" for `t < 1`.
+    - `dtypes`: the dtypes of its operands.
+    """
+    if not dtypes or not _is_float(dtypes[0]):
         return False
     if name == "convert_element_type":
         return not _is_float(params["new_dtype"])
     return name in COMPARISONS | _LEVELS | _CHOICES | {"sign", "atan2", "searchsorted"}
 
 
-def _bends(name: str, kinds: list[Any]) -> bool:
-    """Return whether the result of an equation may have a kink when its operands have none."""
-    return bool(kinds) and _is_float(kinds[-1]) and name in KINKS
+def _may_bend(name: str, dtypes: list[Any]) -> bool:
+    """Return whether the result of an equation may have a kink when its operands have none.
+
+    - `name`: the name of its primitive, such as "abs".
+    - `dtypes`: the dtypes of its operands.
+    """
+    return bool(dtypes) and _is_float(dtypes[-1]) and name in KINKS
 
 
-def _any_switch(jaxpr: Any, bent: bool = False) -> bool:
-    """Return whether a program, or one inside it, may jump or, if `bent` is true, have a kink."""
+def _contains_switch(jaxpr: Jaxpr, with_kinks: bool = False) -> bool:
+    """Return whether a program, or a program inside it, has an equation whose result may jump.
+
+    The answer is also yes for an equation whose content cannot be read, such as a callback.
+
+    - `jaxpr`: the program.
+    - `with_kinks`: whether an equation whose result may have a kink counts, too.
+    """
     for eqn in jaxpr.eqns:
-        name, kinds = _name(eqn), _kinds(eqn)
-        if _jumps(name, eqn.params, kinds) or (bent and _bends(name, kinds)) or name in _OPAQUE:
+        name, dtypes = _primitive_name(eqn), _dtypes_of_inputs(eqn)
+        if (
+            _may_jump(name, eqn.params, dtypes)
+            or (with_kinks and _may_bend(name, dtypes))
+            or name in _OPAQUE
+        ):
             return True
-        if any(_any_switch(body, bent) for body, _ in _bodies(eqn.params)):
+        if any(_contains_switch(body, with_kinks) for body, _ in _inner_programs(eqn.params)):
             return True
     return False
 
 
 def flatten(closed: ClosedJaxpr) -> Program:
-    """Return a traced function as one flat list of equations, including the bodies of calls."""
+    """Return a traced function as one flat list of equations, in which calls are written out.
+
+    The bodies of calls that cannot be written out, such as `cond`, are in the list after the call,
+    so that switches in them are found.
+
+    - `closed`: the traced function f(t, y, …).
+    """
     numbers, nodes, inner = count(), [], {}
 
     def enter(jaxpr: Any, consts: Any, inputs: list[Any], declared: bool) -> list[Any]:
@@ -209,21 +255,21 @@ def flatten(closed: ClosedJaxpr) -> Program:
         scope |= dict(zip(jaxpr.constvars, consts, strict=True))
         read = lambda atom: atom if isinstance(atom, Literal) else scope[atom]  # noqa: E731
         for eqn in jaxpr.eqns:
-            args, name = [read(atom) for atom in eqn.invars], _name(eqn)
+            args, name = [read(atom) for atom in eqn.invars], _primitive_name(eqn)
             own = declared or DECLARED in str(eqn.source_info.name_stack)
             if name in _CALLS:
-                ((body, held),) = _bodies(eqn.params)
+                ((body, held),) = _inner_programs(eqn.params)
                 outputs = enter(body, kept(held), args, own)
             else:
                 outputs = [next(numbers) for _ in eqn.outvars]
                 shapes = [variable.aval for variable in eqn.outvars]
                 node = Node(
-                    eqn.primitive, eqn.params, args, outputs, _kinds(eqn), shapes,
+                    eqn.primitive, eqn.params, args, outputs, _dtypes_of_inputs(eqn), shapes,
                     eqn.source_info, own,
                 )  # fmt: skip
                 nodes.append(node)
                 if name in _WHOLE:
-                    for body, held in _bodies(eqn.params):
+                    for body, held in _inner_programs(eqn.params):
                         enter(body, kept(held), args[len(args) - len(body.invars) :], own)
             scope.update(zip(eqn.outvars, outputs, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
@@ -240,16 +286,21 @@ def flatten(closed: ClosedJaxpr) -> Program:
 
 
 def degree_of(node: Node, operands: list[int]) -> int:
-    """Return how the result of an equation depends on the time: `CONSTANT`, `PIECES`, … or `BENT`.
+    """Return how the result of an equation depends on the time.
 
-    `operands` says the same of each operand.
+    The result is `CONSTANT`, `PIECES` (constant except for jumps), `STRAIGHT` (linear), `MONOTONE`
+    (only rising or only falling), or `BENT` (in any other way).
+
+    - `node`: the equation.
+    - `operands`: for each operand one of these values, which says how the operand depends on the
+      time.
     """
     timed, name = [d for d in operands if d != CONSTANT], node.name
     if not timed:
         return CONSTANT
     if max(timed) == PIECES:
         return PIECES
-    if _jumps(name, node.params, node.kinds):
+    if _may_jump(name, node.params, node.dtypes):
         return BENT if name in _SAWS else PIECES
     if name in ("gather", "dynamic_slice") and max(operands[1:], default=CONSTANT) > CONSTANT:
         return BENT
@@ -270,9 +321,13 @@ def degree_of(node: Node, operands: list[int]) -> int:
 def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
     """Return the switches of a traced field f(t, y, …), or `None` if it has nothing that switches.
 
-    This function looks only at the equations; the module `switching_times` finds the times.
+    A switch is an equation, such as the comparison `t < 1`, whose result jumps or has a kink at
+    times that do not depend on the state. Only the equations are looked at: the times are found
+    later, in the module `switching_times`.
+
+    - `closed`: the traced field, whose first two arguments are the time and the state.
     """
-    if not _any_switch(closed.jaxpr, bent=True):
+    if not _contains_switch(closed.jaxpr, with_kinks=True):
         return None
     program = flatten(closed)
     degrees, of_state = {program.inputs[0]: STRAIGHT}, set(program.inputs[1:])
@@ -287,10 +342,15 @@ def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
             of_state.update(node.outputs)
         # A value that is constant between the times of other switches needs no search of its own.
         timed = max(operands, default=CONSTANT) > PIECES
-        if not (timed or stateful) or node.declared or not _may_switch(node) or _is_ours(node):
+        if (
+            not (timed or stateful)
+            or node.declared
+            or not _may_switch(node)
+            or _is_of_this_package(node)
+        ):
             continue
         where = f"{node.name}, {summarize(node.source)}"
-        jumps = _jumps(node.name, node.params, node.kinds)
+        jumps = _may_jump(node.name, node.params, node.dtypes)
         if jumps and stateful:
             by_state.append(where)
         elif _may_hide_switches(node):
@@ -305,29 +365,48 @@ def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
     return Analysis(program, switches, kinks if bent else [], by_state, unseen)
 
 
-def _is_ours(node: Node) -> bool:
-    """Return whether this package wrote an equation: its laws declare their jumps."""
+def _is_of_this_package(node: Node) -> bool:
+    """Return whether this package, and not the user's code, wrote the equation `node`.
+
+    The laws of this package declare their jumps, so that their equations need no search.
+    """
     return summarize(node.source).startswith(_PACKAGE)
 
 
 def _may_switch(node: Node) -> bool:
-    """Return whether an equation has a jump or a kink, or may have one inside."""
+    """Return whether the equation `node` may jump or have a kink, or contains a program.
+
+    The result of an equation that contains a program, such as `cond`, may jump inside this program.
+    The answer is also yes for an equation whose content cannot be read, such as a callback.
+    """
     name = node.name
-    jumps = _jumps(name, node.params, node.kinds) or _bends(name, node.kinds)
-    return jumps or name in _OPAQUE or any(True for _ in _bodies(node.params))
+    jumps = _may_jump(name, node.params, node.dtypes) or _may_bend(name, node.dtypes)
+    return jumps or name in _OPAQUE or any(True for _ in _inner_programs(node.params))
 
 
 def _may_hide_switches(node: Node) -> bool:
-    """Return whether an equation may switch at times that cannot be searched for."""
+    """Return whether the equation `node` may switch at times that cannot be searched for.
+
+    Examples are `argmax` of an array, a callback, and a loop that contains a comparison.
+    """
     if node.name in _CHOICES | {"atan2"}:
         return True
     if node.name in _WHOLE | {"searchsorted"}:
         return False
-    return node.name in _OPAQUE or any(_any_switch(body) for body, _ in _bodies(node.params))
+    return node.name in _OPAQUE or any(
+        _contains_switch(body) for body, _ in _inner_programs(node.params)
+    )
 
 
 def _switch_of(program: Program, node: Node, operands: list[int], jumps: bool) -> Switch:
-    """Return an equation as a `Switch`; `operands` says how each operand depends on the time."""
+    """Return an equation as a `Switch`, which says how often, and in which way, its result changes.
+
+    - `program`: the program that contains the equation.
+    - `node`: the equation, whose result depends on the time but not on the state.
+    - `operands`: how each operand depends on the time: `CONSTANT`, `PIECES`, `STRAIGHT`, `MONOTONE`
+      or `BENT`.
+    - `jumps`: whether the result jumps; else it has a kink.
+    """
     name = node.name
     compared = operands[: 1 if name in _LEVELS - {"rem"} else 3]
     timed = [d for d in compared if d != CONSTANT]
@@ -339,25 +418,32 @@ def _switch_of(program: Program, node: Node, operands: list[int], jumps: bool) -
     if name == "searchsorted":
         # A search for one time among sorted edges is a switch. A search for many times is treated
         # as a table, which is no switch.
-        size = _edges(program, node) if shape == () else _FEW + 1
+        size = _number_of_edges(node) if shape == () else _FEW + 1
     return Switch(node, max(timed) if steady else BENT, size, jumps)
 
 
-def _edges(program: Program, node: Node) -> int:
-    """Return the number of edges among which a call of `searchsorted` searches."""
-    ((body, _),) = _bodies(node.params)
+def _number_of_edges(node: Node) -> int:
+    """Return the length of the sorted array (the edges) in which a call of `searchsorted` searches.
+
+    - `node`: the equation that calls `searchsorted`.
+    """
+    ((body, _),) = _inner_programs(node.params)
     return int(np.prod(body.invars[0].aval.shape))
 
 
 def evaluator(
     program: Program, wanted: list[Any], replaced: dict[int, Any] | None = None
 ) -> Callable[..., list[Any]]:
-    """Return a function of (constants, *inputs) that returns the `wanted` values of a program.
+    """Return a function that evaluates the `wanted` values of a program, and nothing else.
 
-    The function evaluates only the equations that these values need. `replaced` is a dict; its keys
-    are the integers of outputs whose equations are replaced, and its values are objects with two
-    members: `value(read, inputs)` returns the output, and `reads` lists the inputs of the equation
-    that it needs.
+    - `program`: the program, in which each value is identified by an integer.
+    - `wanted`: the values to be returned: integers, or literals.
+    - `replaced`: a dict whose keys are the integers of outputs whose equations are not evaluated,
+      and whose values are objects with two members: `value(read, inputs)` returns the output, and
+      `reads` lists the inputs of the equation that `value` needs. `None` replaces nothing.
+
+    **Returns** a function of `(constants, *inputs)`, the constants and the arguments of the
+    program, that returns the list of wanted values.
     """
     replaced = replaced or {}
     needed, nodes = {i for i in wanted if not isinstance(i, Literal)}, []

@@ -35,11 +35,19 @@ _HALVINGS = {"float64": 62, "float32": 36}
 _GRID = 4096  # the number of points of the grid on which a bent switch is searched for
 
 
-def _gap(switch: Switch, x: Any, *rest: Any) -> Any:
-    """Return the gap (see the module `switching`) of each element of a switch.
+def _gap_of_operands(switch: Switch, x: Any, *rest: Any) -> Any:
+    """Return the gap of each element of a switch, a function of time that is zero where it changes.
 
-    An element changes when its gap passes zero or, for functions such as `floor`, a whole number.
-    `x` is the first operand of the equation; `rest` are the other operands and the result.
+    A switch is an equation, such as the comparison `t < 1`, whose result changes at certain times.
+    The gap is the difference of its two operands, here t − 1. For functions such as `floor` it is
+    the operand (for `rem` the quotient of the two operands), and the result changes where the gap
+    passes a whole number.
+
+    - `switch`: the equation.
+    - `x`: its first operand.
+    - `rest`: its other operands, followed by its result.
+
+    **Returns** an array (m,), with one number for each of the m elements.
     """
     name = switch.node.name
     if name == "clamp":
@@ -51,20 +59,27 @@ def _gap(switch: Switch, x: Any, *rest: Any) -> Any:
     return jnp.ravel(x / rest[0] if name == "rem" else x)
 
 
-def _value(switch: Switch, x: Any, *rest: Any) -> Any:
-    """Return the value of each element of a switch, which is constant between its changes.
+def _value_of_operands(switch: Switch, x: Any, *rest: Any) -> Any:
+    """Return the value of each element of a switch, constant except where the element changes.
 
-    `x` is the first operand of the equation; `rest` are the other operands and the result.
+    - `switch`: the equation, such as the comparison `t < 1`.
+    - `x`: its first operand.
+    - `rest`: its other operands, followed by its result.
+
+    **Returns** an array (m,), with one value for each of the m elements. It is a truth value,
+    whether the gap (the difference of the operands) is positive, for `searchsorted` and for
+    operations with a kink, such as `max`.
     """
     name = switch.node.name
     if name in KINKS | {"searchsorted"}:
-        return _gap(switch, x, *rest) > 0
+        return _gap_of_operands(switch, x, *rest) > 0
     return jnp.ravel(jnp.trunc(x / rest[0]) if name == "rem" else rest[-1])
 
 
 class Times(NamedTuple):
     """Hold the times at which the switches of a field may change, in k places.
 
+    A switch is an equation, such as the comparison `t < 1`, whose result changes at certain times.
     Each place stores one change of one element of one switch.
     """
 
@@ -76,41 +91,67 @@ class Times(NamedTuple):
     over: Array  # whether an element changes more often than it has places
 
 
-class _Watched(NamedTuple):
-    """Evaluate the elements of a switch of a program at any time; it holds the constants."""
+class _TimedSwitch(NamedTuple):
+    """Evaluate the elements of a switch at any time; a switch is an equation such as `t < 1`.
+
+    - `program`: the program that contains the equation.
+    - `switch`: the equation.
+    - `constants`: the constants of the program.
+    """
 
     program: Program
     switch: Switch
     constants: Arrays
 
     @property
-    def still(self) -> "_Watched":
+    def still(self) -> "_TimedSwitch":
         """Return this object with its constants held fixed in derivatives."""
         return self._replace(constants=lax.stop_gradient(self.constants))
 
     def operands(self, t: Array) -> list[Any]:
-        """Return the operands and the result of the equation at the time t, s."""
+        """Return the operands of the equation, followed by its result, at the time t (), s."""
         node = self.switch.node
         wanted = [*node.inputs, node.outputs[0]]
         return evaluator(self.program, wanted)(self.constants, t)
 
     def value(self, t: Array) -> Array:
-        return _value(self.switch, *self.operands(t)).astype(t.dtype)
+        """Return the values (m,) of the elements at the time t (), s, as floating-point numbers."""
+        return _value_of_operands(self.switch, *self.operands(t)).astype(t.dtype)
 
     def gap(self, t: Array) -> Array:
-        return _gap(self.switch, *self.operands(t)).astype(t.dtype)
+        """Return the gaps (m,) of the elements at the time t (), s.
+
+        The gap of a comparison is the difference of its operands; the element changes where it is
+        zero.
+        """
+        return _gap_of_operands(self.switch, *self.operands(t)).astype(t.dtype)
 
     def values(self, t: Array, element: Any) -> Array:
-        """Return the value of one `element` at each of the times t (k,), s."""
-        return self._of_each(self.value, t, element)
+        """Return the value of one element at each time: (k,) for the times t (k,), s.
+
+        - `element`: (k,) the index of the element, for each time.
+        """
+        return self._at_each_time(self.value, t, element)
 
     def gaps(self, t: Array, element: Any) -> Array:
-        return self._of_each(self.gap, t, element)
+        """Return the gap of one element at each time: (k,) for the times t (k,), s.
 
-    def _of_each(self, of: Callable[[Array], Array], t: Array, element: Any) -> Array:
+        The gap of a comparison is the difference of its operands; the element changes where it is
+        zero.
+
+        - `element`: (k,) the index of the element, for each time.
+        """
+        return self._at_each_time(self.gap, t, element)
+
+    def _at_each_time(self, function: Callable[[Array], Array], t: Array, element: Any) -> Array:
+        """Return one number of the array `function(t)` at each time: (k,) for the times t (k,), s.
+
+        - `function`: returns one number for each element of the switch at a time ().
+        - `element`: (k,) the index of the element whose number is returned, for each time.
+        """
         if self.switch.size == 1:
-            return jax.vmap(lambda t: of(t).reshape(()))(t)
-        return jax.vmap(lambda t, i: of(t)[i])(t, element)
+            return jax.vmap(lambda t: function(t).reshape(()))(t)
+        return jax.vmap(lambda t, i: function(t)[i])(t, element)
 
 
 # The times, elements and changes at the places of a switch, and whether the switch has more changes
@@ -118,19 +159,27 @@ class _Watched(NamedTuple):
 _Places = tuple[Array, Array, Array, Array]
 
 
-def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times:
-    """Find the times after a and until b, s, at which the switches of a field change."""
-    start, end = lax.stop_gradient((a, b))
+def times_of(analysis: Analysis, constants: Arrays, t0: Array, t1: Array) -> Times:
+    """Return the times after t0 and until t1, s, at which the switches of a field change.
+
+    A switch is an equation, such as the comparison `t < 1`, whose result changes at certain times.
+    The times have derivatives with respect to the constants.
+
+    - `analysis`: the program of the field, and its switches.
+    - `constants`: the constants of this program.
+    - `t0`, `t1`: the start and the end of the run, s.
+    """
+    start, end = lax.stop_gradient((t0, t1))
     # If a switch changes within 8 units of round-off after the start, it is treated as if it had
     # changed before the start.
-    start = start + 8 * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end - start))
-    watched = [_Watched(analysis.program, s, constants) for s in analysis.switches]
-    others = [_Watched(analysis.program, s, constants) for s in analysis.kinks]
-    steady = [one for one in watched + others if one.switch.degree <= MONOTONE]
+    start = start + 8 * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end - start))
+    timed_switches = [_TimedSwitch(analysis.program, s, constants) for s in analysis.switches]
+    others = [_TimedSwitch(analysis.program, s, constants) for s in analysis.kinks]
+    steady = [one for one in timed_switches + others if one.switch.degree <= MONOTONE]
     found = _switchings_of_monotonic(steady, start, end)
     known = [places[0] for places in found]
     parts: list[_Places] = []
-    for one in watched:
+    for one in timed_switches:
         if one.switch.degree == BENT:
             parts.append(_switchings_of_bent(one, start, end, known))
             known.append(parts[-1][0])
@@ -138,30 +187,44 @@ def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times
             parts.append(found.pop(0))
     t, element, change = (jnp.concatenate([part[i] for part in parts]) for i in range(3))
     over = jnp.any(jnp.stack([part[3] for part in parts]))
-    first = [one.still.value(start) for one in watched]
+    first = [one.still.value(start) for one in timed_switches]
     outputs = [
         one.still.operands(start)[-1] if one.switch.node.name == "searchsorted" else start[None][:0]
-        for one in watched
+        for one in timed_switches
     ]
-    return Times(jnp.where(t < end, t, b), element, change, first, outputs, over)
+    return Times(jnp.where(t < end, t, t1), element, change, first, outputs, over)
 
 
-def _switchings_of_monotonic(watched: list[_Watched], start: Array, end: Array) -> list[_Places]:
-    """Return the times between `start` and `end` at which switches change whose gap is monotonic.
+def _switchings_of_monotonic(
+    timed_switches: list[_TimedSwitch], start: Array, end: Array
+) -> list[_Places]:
+    """Return the times at which switches change whose gap only rises or only falls in time.
 
-    The gap of a switch is the function of time whose sign the switch tests.
+    A switch is an equation, such as the comparison `t < 1`. Its gap, here t − 1, is the function of
+    time whose sign the equation tests.
+
+    - `timed_switches`: the switches.
+    - `start`, `end`: the times between which changes are searched for, s.
+
+    **Returns** for each switch four things: the times (k,), s; the elements (k,) that change; the
+    changes (k,) of their values, 0 in a place where nothing changes; and whether there are more
+    changes than places.
     """
     starts, rises, elements, levels = [], [], [], []
-    for one in watched:
-        element, level = (np.ravel(a) for a in np.mgrid[: one.switch.size, 1 : one.switch.most + 1])
+    for one in timed_switches:
+        element, level = (
+            np.ravel(a) for a in np.mgrid[: one.switch.size, 1 : one.switch.most_changes + 1]
+        )
         first, last = one.still.value(start), one.still.value(end)
         starts, rises = [*starts, first[element]], [*rises, last - first]
         elements, levels = [*elements, element], [*levels, level.astype(start.dtype)]
     edges = [(jnp.full(a.shape, start), jnp.full(a.shape, end)) for a in elements]
-    found = _bisect(watched, edges, elements, starts, levels)
+    found = _bisect(timed_switches, edges, elements, starts, levels)
     parts = []
-    for one, t, element, level, change in zip(watched, found, elements, levels, rises, strict=True):
-        rise, most = change[element], one.switch.most
+    for one, t, element, level, change in zip(
+        timed_switches, found, elements, levels, rises, strict=True
+    ):
+        rise, most = change[element], one.switch.most_changes
         there = jnp.abs(rise) >= level
         t, _ = _differentiable_times(one, jnp.where(there, t, end), element, there)
         over = jnp.any(jnp.abs(change) > most) & (most > 1)
@@ -170,19 +233,32 @@ def _switchings_of_monotonic(watched: list[_Watched], start: Array, end: Array) 
     return parts
 
 
-def _switchings_of_bent(one: _Watched, start: Array, end: Array, known: list[Array]) -> _Places:
-    """Return the times at which a switch changes whose gap may rise and fall, found on a grid.
+def _switchings_of_bent(
+    timed_switch: _TimedSwitch, start: Array, end: Array, known: list[Array]
+) -> _Places:
+    """Return the times, found on a grid, at which a switch changes whose gap may rise and fall.
 
-    The grid includes the `known` times at which other switches change.
+    A switch is an equation, such as the comparison `t < 1`. Its gap, here t − 1, is the function of
+    time whose sign the equation tests.
+
+    - `timed_switch`: the switch.
+    - `start`, `end`: the times between which changes are searched for, s.
+    - `known`: arrays of times, s, at which other switches change. The grid includes these times.
+
+    **Returns** four things: the times (k,), s; the elements (k,) that change; the changes (k,) of
+    their values, 0 in a place where nothing changes; and whether there are more changes than
+    places.
     """
     before = jnp.concatenate(known) if known else jnp.zeros(0, start.dtype)
-    low, high, element, over = _cells(one.still, start, end, lax.stop_gradient(before))
-    base = one.still.values(low, element)
+    low, high, element, over = _intervals_with_one_change(
+        timed_switch.still, start, end, lax.stop_gradient(before)
+    )
+    base = timed_switch.still.values(low, element)
     level = np.full(low.shape, 0.5, start.dtype)
-    (t,) = _bisect([one], [(low, high)], [element], [base], [level])
-    value = one.still.values(t, element)
+    (t,) = _bisect([timed_switch], [(low, high)], [element], [base], [level])
+    value = timed_switch.still.values(t, element)
     there = value != base
-    t, moves = _differentiable_times(one, jnp.where(there, t, end), element, there)
+    t, moves = _differentiable_times(timed_switch, jnp.where(there, t, end), element, there)
     if known:
         # If the switch changes because an operand jumps, the time of the change is the time of the
         # jump.
@@ -192,20 +268,26 @@ def _switchings_of_bent(one: _Watched, start: Array, end: Array, known: list[Arr
     return t, element, jnp.where(there, value - base, 0), over
 
 
-def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array, ...]:
+def _intervals_with_one_change(
+    timed_switch: _TimedSwitch, start: Array, end: Array, known: Array
+) -> tuple[Array, ...]:
     """Return k intervals of time, in each of which one element of a switch changes at most once.
 
-    **Returns** four things: the starts (k,) of the intervals; their ends (k,); the element for each
-    interval; and whether there are more changes than intervals.
+    - `timed_switch`: the switch, an equation such as the comparison `t < 1`.
+    - `start`, `end`: the times between which changes are searched for on a grid, s.
+    - `known`: (j,) s, times at which other switches change. The grid includes these times.
+
+    **Returns** four things: the starts (k,) of the intervals, s; their ends (k,), s; the index (k,)
+    of the element for each interval; and whether there are more changes than intervals.
     """
-    size, dtype = one.switch.size, start.dtype
+    size, dtype = timed_switch.switch.size, start.dtype
     grid = start + (end - start) * jnp.linspace(0.0, 1.0, max(256, _GRID // size), dtype=dtype)
     if known.shape[0]:
         beside = jnp.nextafter(known, jnp.full_like(known, -jnp.inf))
         grid = jnp.sort(
             jnp.concatenate([grid, jnp.clip(jnp.stack([known, beside]), start, end).ravel()])
         )
-    value, gap = jax.vmap(one.value)(grid), jax.vmap(one.gap)(grid)
+    value, gap = jax.vmap(timed_switch.value)(grid), jax.vmap(timed_switch.gap)(grid)
     changes = jnp.ravel(value[1:] != value[:-1])
     many = jnp.sum(changes)
     # `top_k` finds the first changes; `nonzero` would take five times as long to compile.
@@ -229,7 +311,7 @@ def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array
     def shorter(_: Any, ends: Any) -> Any:
         left, right = ends
         third = (right - left) / 3
-        ends = (one.gaps(t, which) for t in (left + third, right - third))
+        ends = (timed_switch.gaps(t, which) for t in (left + third, right - third))
         falls = sign * next(ends) > sign * next(ends)
         return jnp.where(falls, left + third, left), jnp.where(falls, right, right - third)
 
@@ -240,26 +322,35 @@ def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array
 
 
 def _bisect(
-    watched: list[_Watched], edges: Any, elements: Any, bases: list[Array], levels: Any
+    timed_switches: list[_TimedSwitch], edges: Any, elements: Any, bases: list[Array], levels: Any
 ) -> list[Array]:
-    """Find for each switch the times (k,) at which its elements change, by halving intervals.
+    """Return for each switch the times at which its elements change, found by halving intervals.
 
-    `bases` are the values of the elements before the change, and `levels` the sizes of the changes:
-    an element has changed when its value differs from its base by at least its level. `edges` are
-    the starts and ends of the intervals, and `elements` the indices of the elements.
+    A switch is an equation, such as the comparison `t < 1`, with one or more elements. Each of the
+    following lists has one entry for each switch, with arrays for k intervals of this switch:
+
+    - `timed_switches`: the switches.
+    - `edges`: the starts (k,) and the ends (k,) of the intervals, s.
+    - `elements`: the indices (k,) of the elements.
+    - `bases`: the values (k,) of these elements before the change.
+    - `levels`: the sizes (k,) of the changes: an element has changed when its value differs from
+      its base by at least its level.
+
+    **Returns** a list of arrays (k,), s; if nothing changes in an interval, the time is the end of
+    the interval.
     """
 
     def half(_: Any, edges: Any) -> Any:
         halves = []
         for one, (low, high), element, base, level in zip(
-            watched, edges, elements, bases, levels, strict=True
+            timed_switches, edges, elements, bases, levels, strict=True
         ):
             middle = low + 0.5 * (high - low)
             new = jnp.abs(one.still.values(middle, element) - base) >= level
             halves.append((jnp.where(new, low, middle), jnp.where(new, middle, high)))
         return halves
 
-    if not watched:
+    if not timed_switches:
         return []
     edges = lax.stop_gradient(edges)
     count = _HALVINGS[edges[0][0].dtype.name]
@@ -267,20 +358,32 @@ def _bisect(
 
 
 def _differentiable_times(
-    one: _Watched, t: Array, element: Any, there: Array
+    timed_switch: _TimedSwitch, t: Array, element: Any, has_change: Array
 ) -> tuple[Array, Array]:
-    """Return the times `t` with their derivatives, and for each time whether it has derivatives.
+    """Return the times at which elements of a switch change, with their derivatives.
 
-    Each time is an implicit function of the constants of the field. `there` says for each time
-    whether the `element` does change at that time.
+    A switch is an equation, such as the comparison `t < 1`. Its gap, here t − 1, is zero at these
+    times, which are therefore implicit functions of the constants of the field.
+
+    - `timed_switch`: the switch.
+    - `t`: (k,) s, the times, without derivatives.
+    - `element`: (k,) the index of the element that changes at each time.
+    - `has_change`: (k,), whether the element does change at each time.
+
+    **Returns** two things: the times (k,), s; and for each time whether it has derivatives.
     """
-    degree = one.switch.degree
-    still, moves, slope, here = lax.stop_gradient(t), there, jnp.zeros_like(t), jnp.zeros_like(t)
+    degree = timed_switch.switch.degree
+    still, moves, slope, here = (
+        lax.stop_gradient(t),
+        has_change,
+        jnp.zeros_like(t),
+        jnp.zeros_like(t),
+    )
     t = still
     # Each of these steps of Newton's method leaves the values of `t` as they are, and makes
     # derivatives of one more order correct.
     for _ in range(1 if degree == STRAIGHT else 2):
-        gaps = lambda t: one.gaps(t, element)  # noqa: E731
+        gaps = lambda t: timed_switch.gaps(t, element)  # noqa: E731
         here, slope = jax.jvp(gaps, (t,), (jnp.ones_like(t),))
         moves = moves & jnp.isfinite(slope) & (slope != 0)
         rise = here - lax.stop_gradient(here)
@@ -290,13 +393,17 @@ def _differentiable_times(
         # no implicit function given by the gap.
         beside = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
         step, eps = jnp.abs(slope) * (still - beside), jnp.finfo(t.dtype).eps
-        jump = jnp.abs(here - one.gaps(beside, element))
+        jump = jnp.abs(here - timed_switch.gaps(beside, element))
         moves = moves & (jump <= 64 * (step + eps * (1 + jnp.abs(here))))
     return t, moves
 
 
-class _Side(NamedTuple):
-    """Compute the result of a comparison from the stops that a step has passed."""
+class _ResultFromStops(NamedTuple):
+    """Compute the result of a comparison from the stops that a step has passed.
+
+    The stops are the times at which steps end because the comparison, such as `t < 1`, changes
+    there.
+    """
 
     switch: Switch
     number: int  # the index of the switch in the analysis
@@ -308,10 +415,11 @@ class _Side(NamedTuple):
         return [] if self.switch.exact else self.switch.node.inputs
 
     def value(self, read: Callable[[Any], Any], inputs: tuple[Any, ...]) -> Any:
-        """Return the result at the time `inputs[0]`, s.
+        """Return the result of the comparison at a time.
 
-        `inputs[-1]` is a pair of the stops, s, and the `Times`; `read` returns the value of an
-        input of the equation.
+        - `read`: a function that returns the value of an input of the equation.
+        - `inputs`: the arguments of the field. The first is the time, s; the last is a pair of the
+          stops, s, and the `Times`.
         """
         node, (stops, found) = self.switch.node, inputs[-1]
         past = inputs[0] >= stops[self.places]
@@ -339,28 +447,43 @@ class _Side(NamedTuple):
         return jnp.where(found.over > 0, node.primitive.bind(*operands, **params), here)
 
 
-def by_sides(analysis: Analysis) -> Callable[..., Array]:
-    """Return the field f(constants, t, y, …, (stops, `Times`)), whose jumps are at the stops."""
+def field_with_stops(analysis: Analysis) -> Callable[..., Array]:
+    """Return a field whose comparisons with the time are replaced by stops.
+
+    The stops are the times at which the results of these comparisons change; steps end at the
+    stops. The result of a comparison depends on whether a step has passed its stop.
+
+    - `analysis`: the program of the field, and its switches, which are these comparisons.
+
+    **Returns** the field as a function `f(constants, t, y, …, (stops, times))`. Its last argument
+    is a pair of the stops, s, and the `Times`.
+    """
     replaced, begin = {}, 0
     for number, switch in enumerate(analysis.switches):
         if switch.jumps:
             places = slice(begin, begin + switch.places)
-            replaced[switch.node.outputs[0]] = _Side(switch, number, places)
+            replaced[switch.node.outputs[0]] = _ResultFromStops(switch, number, places)
         begin += switch.places
     evaluate = evaluator(analysis.program, [analysis.program.output], replaced)
     return lambda constants, *inputs: evaluate(constants, *inputs)[0]
 
 
-def separate_times(times: Array, a: Array, b: Array) -> tuple[Array, Array]:
-    """Return two things: the stops from a to b in order, and the stop for each of the `times` (k,),
-    s.
+def separate_times(times: Array, t0: Array, t1: Array) -> tuple[Array, Array]:
+    """Return the times at which steps end (stops), in order, with equal times moved slightly apart.
 
-    If two times are equal, their stops are moved apart by some units of round-off. Two jumps at the
-    same time then have a very short step between them, so that each jump has its own derivative.
+    Two stops at the same time are moved apart by some units of round-off. Two jumps at the same
+    time then have a very short step between them, so that each jump has its own derivative.
+
+    - `times`: (k,) s, the times of jumps, in any order.
+    - `t0`, `t1`: the start and the end of the run, s. A time outside of the run is replaced by the
+      nearer of the two.
+
+    **Returns** two things: the stops (k,) in order, s; and for each of the `times` its stop (k,),
+    s.
     """
-    inside = (times > a) & (times < b)
-    t = jnp.where(inside, times, jnp.where(times <= a, a, b))
-    still, last = lax.stop_gradient((t, b))
+    inside = (times > t0) & (times < t1)
+    t = jnp.where(inside, times, jnp.where(times <= t0, t0, t1))
+    still, last = lax.stop_gradient((t, t1))
     count = np.arange(t.shape[0])
     # For so few times, comparing all pairs is faster than sorting.
     earlier = still[None] < still[:, None]
@@ -370,7 +493,7 @@ def separate_times(times: Array, a: Array, b: Array) -> tuple[Array, Array]:
     ordered = lambda a: jnp.sum(jnp.where(here, a[None], 0), 1)  # noqa: E731
     t = ordered(t)
     still, inside = lax.stop_gradient(t), ordered(inside.astype(t.dtype)) > 0
-    gap = 4 * jnp.finfo(t.dtype).eps * lax.stop_gradient(jnp.maximum(jnp.abs(a), jnp.abs(b)))
+    gap = 4 * jnp.finfo(t.dtype).eps * lax.stop_gradient(jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
     shift = gap * count.astype(t.dtype)
     pushed = lax.cummax(jnp.where(inside, still - shift, -jnp.inf)) + shift
     apart = jnp.where(inside, jnp.maximum(still, jnp.minimum(pushed, last)), still)
