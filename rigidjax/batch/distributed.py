@@ -114,7 +114,7 @@ def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyT
     - `tree`: arrays, which have the same shapes on every process.
     - `checkpoint`: a folder to which `save` first writes the arrays of this process, or `None`.
 
-    **Raises:** as `gather`.
+    **Raises:** `TypeError` for traced arrays; `RuntimeError` if another process has ended.
 
     >>> total(jnp.ones(2)).tolist()
     [1.0, 1.0]

@@ -421,14 +421,14 @@ def _scales_by_name(ys: Any) -> dict[str, Array]:
     return sizes
 
 
-def _largest_relative_distance(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
+def _largest_relative_distance(distances: dict[str, Array], sizes: dict[str, Array]) -> Array:
     """Return the largest relative distance of two states, at each of T times.
 
-    `apart` has one array (T,) of distances for each array of a state, by its name (`q`, `omega`,
-    …); `sizes` has the scale by which the distances of this name are divided. **Returns** an array
-    (T,): the largest quotient over all names.
+    `distances` has one array (T,) for each array of a state, by its name (`q`, `omega`, …); `sizes`
+    has the scale by which the distances of this name are divided. **Returns** an array (T,): the
+    largest quotient over all names.
     """
-    return jnp.max(jnp.stack([apart[name] / sizes[name] for name in apart]), 0)
+    return jnp.max(jnp.stack([distances[name] / sizes[name] for name in distances]), 0)
 
 
 @eqx.filter_jit

@@ -140,12 +140,20 @@ def step(
 def delayed_rows(
     delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: Any, before: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Return where in step `i` each delayed input changes, and its values before and after.
+    """Return where within a step each delayed input changes, and its values before and after.
+
+    An input of a torque is constant during each step; if it is delayed, it changes within a step.
+
+    **Arguments:**
+
+    - `delays`: the name and the delay, s, of each of the m delayed inputs.
+    - `h`: the length of each step, s.
+    - `i`: the number of the step.
+    - `inputs`: an array for each named input, with one row for each step.
+    - `before`: row `before + i` of an array belongs to step `i`.
 
     **Returns** three things: the places (m,) of the changes, from 0 at the start of the step to 1
     at its end; a list of the m values before the changes; and a list of the m values after them.
-    `delays` has the name and the delay, s, of each of the m delayed inputs; `h`, `inputs` and
-    `before` are as for `step`.
     """
     parts, early, late = [], [], []
     for name, delay in delays:

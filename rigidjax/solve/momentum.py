@@ -7,6 +7,7 @@ state of the run has Ω̃ = I₀⁻¹ p in the place of Ω, where I₀ is the in
 suit Ω̃.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -49,10 +50,11 @@ class _EquationsUnderChangingInertia(eqx.Module):
 
 
 class ByMomentum(eqx.Module):
-    """Compute the time derivative of a state of the run, and convert between Ω and Ω̃.
+    """Compute the time derivative of a state whose inertia changes, and convert between two rates.
 
-    A state of the run has Ω̃ = I₀⁻¹ p in the place of the body rate Ω (see the module). The method
-    `enter` replaces Ω by Ω̃, and `leave` replaces Ω̃ by Ω.
+    A state of the run has the rate Ω̃ = I₀⁻¹ p in the place of the body rate Ω: p = I(t) Ω is the
+    momentum, I(t) the inertia at the time t, and I₀ the inertia of the body that `simulate` was
+    given. The method `enter` replaces Ω by Ω̃, and `leave` replaces Ω̃ by Ω.
     """
 
     field: Any  # a `_EquationsUnderChangingInertia`, or the `CoupledEquations` of one
@@ -61,17 +63,24 @@ class ByMomentum(eqx.Module):
         return self.field(t, self.leave(t, y))
 
     def enter(self, t: Any, y: Any) -> Any:
-        """Return the state `y` at the time `t`, s, with the body rate Ω replaced by Ω̃."""
+        """Return the state `y` with its body rate Ω replaced by I₀⁻¹ I(t) Ω, a form of momentum.
+
+        I(t) is the inertia at the time `t`, s, and I₀ that of the body that `simulate` was given.
+        """
         return self._with_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
 
     def leave(self, t: Any, y: Any) -> Any:
-        """Return the state `y` of the run at the time `t`, s, with Ω̃ replaced by Ω."""
+        """Return the state `y` of the run with body rates: the inverse of `enter`.
+
+        Its rate w becomes Ω = I(t)⁻¹ I₀ w, where I(t) is the inertia at the time `t`, s, and I₀
+        that of the body that `simulate` was given.
+        """
         return self._with_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
 
-    def _with_rate(self, y: Any, rate: Any, t: Any) -> Any:
+    def _with_rate(self, y: Any, new_rate: Callable[..., Array], t: Any) -> Any:
         """Return the state `y` with its body rate, rad/s, replaced by another one.
 
-        `rate(I, I₀, w)` computes the new rate from three arrays: the inertia (3, 3) at the time
+        `new_rate(I, I₀, w)` computes the new rate from three arrays: the inertia (3, 3) at the time
         `t`, s; the inertia (3, 3) of the body that `simulate` was given; and the rate w (3,) of
         `y`.
         """
@@ -80,7 +89,7 @@ class ByMomentum(eqx.Module):
         inner: Any = self.field.field if isinstance(self.field, CoupledEquations) else self.field
         now = freeze(inner.law, own).tensor(jnp.asarray(t, dtype)) if own else inner.law.tensor(t)
         fixed = tensor_of(inner.body).astype(dtype)
-        omega = rate(now.astype(dtype), fixed, motion.omega)
+        omega = new_rate(now.astype(dtype), fixed, motion.omega)
         return eqx.tree_at(lambda s: motion_of(s).omega, y, omega)
 
 

@@ -25,33 +25,37 @@ Field = Callable[[Arrays, Array, Array], Array]
 class Step(NamedTuple):
     """Hold a step: the times of its start and end, its length, and the state at its start."""
 
-    t: Array  # (*bodies), s
-    h: Array  # (*bodies), s
+    t: Array  # (*bodies), s: the time at the start
+    h: Array  # (*bodies), s: the length
     # (*bodies), s: the end, equal to t + h but for rounding. If the step ends at a jump of the
     # field, this is the last floating-point number before the time of the jump.
     end: Array
-    y: Array  # (n, *bodies)
+    y: Array  # (n, *bodies) the state at the start
 
 
 class Stages(NamedTuple):
     """Hold the s stages of a step and the state at its end; a slope is a value of the field."""
 
-    times: Array  # (s, *bodies)
+    times: Array  # (s, *bodies) s
     places: Array  # (n, s, *bodies) the states at which the field is evaluated
     slopes: Array  # (n, s, *bodies)
-    end: Array  # (n, *bodies)
+    end: Array  # (n, *bodies) the state at the end of the step
     number: Any  # the number of stages that were computed
 
 
 class Weights(NamedTuple):
-    """Hold a tableau as arrays over s stages: the stages of a step, then those for dense output."""
+    """Hold the numbers of a Runge–Kutta method as arrays over its s stages.
 
-    a: Array  # (s, s)
-    b: Array  # (s,)
-    c: Array  # (s,)
+    First come the stages of a step, then those that only dense output needs, which is the state at
+    any time within the step.
+    """
+
+    a: Array  # (s, s) the weights of the slopes in the state of each stage
+    b: Array  # (s,) the weights of the slopes in the state at the end of the step
+    c: Array  # (s,) the times of the stages, from 0 at the start of the step to 1 at its end
     last: Array  # (s,) whether c is 1
     dense: Array  # (r, s) the rows of dense output
-    errors: Array  # (1 or 2, s)
+    errors: Array  # (1 or 2, s) the weights of the slopes in the estimates of the error
     plain: int  # the number of stages of a step without dense output
 
 

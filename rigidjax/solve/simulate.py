@@ -195,7 +195,12 @@ def simulate(
     return _solve_run(setup, event, state0, times)
 
 
-def _solver_of_run(solver: Any, adjoint: Any, event: Any, max_steps: int | None) -> Any:
+def _solver_of_run(
+    solver: dfx.AbstractSolver | None,
+    adjoint: dfx.AbstractAdjoint | None,
+    event: Event | Callable[..., Any] | None,
+    max_steps: int | None,
+) -> dfx.AbstractSolver:
     """Return the solver that a run uses, one that keeps attitudes unit quaternions.
 
     The arguments are those of `simulate` with the same names. If `solver` is `None`, the fastest
@@ -232,7 +237,11 @@ def _adjoint_of_run(setup: DiffraxRun) -> dfx.AbstractAdjoint:
 
 
 def _solve_to_accuracy(
-    setup: DiffraxRun, event: Any, state0: Any, times: Array, accuracy: Any
+    setup: DiffraxRun,
+    event: Event | Callable[..., Any] | None,
+    state0: Any,
+    times: Array,
+    accuracy: ScalarLike,
 ) -> Solution:
     """Solve to a wanted accuracy: find a tolerance, and return the solution with its error.
 

@@ -39,9 +39,11 @@ from rigidjax.solve.tableaus import parse_numbers
 
 
 class Composition(NamedTuple):
-    """Hold a symmetric composition `B(b1) A(a1) … B(b1)` by its order and weights.
+    """Hold a splitting method B(b1) A(a1) B(b2) … A(a1) B(b1) by its order and its weights.
 
-    `flows` are the weights a1, a2, … of A, and `kicks` the weights b1, b2, … of B (see the module).
+    A(a) is the exact motion of the free body during the time a h, where h is the length of a step.
+    B(b) is a kick, which adds b h times the torque to the momentum. `flows` are the weights a1, a2,
+    …, and `kicks` the weights b1, b2, ….
     """
 
     order: int

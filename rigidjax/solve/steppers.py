@@ -150,7 +150,7 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
     return _stepper_of_slope(solver, slope, split(y0), lambda y: join(y, y0), y0)
 
 
-class _Turning(NamedTuple):
+class _InertiaAndTorque(NamedTuple):
     """Hold the inertia and the torque of a body that only turns, in the precision of its state."""
 
     inertia: Inertia
@@ -158,7 +158,7 @@ class _Turning(NamedTuple):
     torque: Any  # the torque law, or `None` for a free body
 
 
-def _inertia_and_torque(field: Any, y0: Any) -> _Turning | None:
+def _inertia_and_torque(field: Any, y0: Any) -> _InertiaAndTorque | None:
     """Return the inertia and the torque of a body that only turns, or `None` for other motions.
 
     `field` is the vector field of the body, and `y0` its state at the start.
@@ -168,7 +168,7 @@ def _inertia_and_torque(field: Any, y0: Any) -> _Turning | None:
         return None
     dtype = y0.omega.dtype
     inertia = jax.tree.map(lambda a: a.astype(dtype), euler.inertia)
-    return _Turning(
+    return _InertiaAndTorque(
         inertia, _entries_of_symmetric_matrix(euler.inverse.astype(dtype)), euler.torque
     )
 
@@ -229,7 +229,7 @@ def _entries_of_symmetric_matrix(a: Array) -> Six:
     return a[0, 0], a[1, 1], a[2, 2], *off
 
 
-def _stepper_of_magnus(turning: _Turning, state0: Attitude) -> Stepper:
+def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
     """Return the object that takes fixed steps by Magnus' method, under a torque.
 
     The torque may read the time and the body rate, not the attitude. `turning` holds the inertia
@@ -260,7 +260,7 @@ def _stepper_of_magnus(turning: _Turning, state0: Attitude) -> Stepper:
 
 
 def _stepper_of_explicit_method(
-    solver: AbstractExplicit | StepWithLoopedStages, turning: _Turning, state0: Any
+    solver: AbstractExplicit | StepWithLoopedStages, turning: _InertiaAndTorque, state0: Any
 ) -> Stepper:
     """Return the object that takes fixed steps of an explicit method for a body that only turns.
 
@@ -296,7 +296,11 @@ def _stepper_of_explicit_method(
 
 
 def _stepper_of_slope(
-    solver: Any, slope_under: Any, start: Atoms, state: Any, like: Any
+    solver: AbstractExplicit | StepWithLoopedStages,
+    slope_under: Callable[[Any], Callable[[Any, Atoms], Atoms]],
+    start: Atoms,
+    state: Callable[[Atoms], Any],
+    like: Any,
 ) -> Stepper:
     """Return the object that takes fixed steps of an explicit method, for a slope dy/dt.
 

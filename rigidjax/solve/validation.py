@@ -29,7 +29,7 @@ def checked_scene(
 
     **Arguments:**
 
-    - `body`, `state0`, `ts`, `torque`: as for `simulate`.
+    - `body`, `state0`, `ts`, `torque`: the arguments of `simulate` with these names.
     - `throw`: whether invalid numbers raise an error. With `False` invalid traced numbers become
       NaN instead; known invalid numbers raise an error in any case.
 
