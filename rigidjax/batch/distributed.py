@@ -76,13 +76,15 @@ def share(tree: PyTree) -> PyTree:
 def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyTree:
     """Return, on every process, the joined rows of all processes, in the order of the processes.
 
-    **Arguments:** `tree` of arrays with the rows of this process, as from `share`; `checkpoint` a
-    folder to which `save` first writes the rows of this process. **Returns** the tree with the rows
-    of all processes, in host memory.
+    **Arguments:**
+
+    - `tree`: arrays with the rows of this process, as `share` returns them.
+    - `checkpoint`: a folder to which `save` first writes the rows of this process, or `None`.
+
+    **Returns** the tree with the rows of all processes, in host memory.
 
     **Raises:** `TypeError` for traced arrays; `RuntimeError` if another process has ended. After
-    this
-    error end this process, too: its JAX arrays cannot be used any more.
+    this error end this process, too: its JAX arrays cannot be used any more.
 
     >>> gather(jnp.arange(3)).tolist()
     [0, 1, 2]
@@ -99,29 +101,33 @@ def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> Py
         sent = np.asarray(multihost_utils.process_allgather(jnp.asarray(filled)))
         return np.concatenate([part[:n] for part, n in zip(sent, counts, strict=True)])
 
-    return _send_arrays(rows_of_all, _copy_to_host(tree, "gather"), checkpoint)
+    return _exchange_arrays(rows_of_all, _copy_to_host(tree, "gather"), checkpoint)
 
 
 def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyTree:
-    """Return the sum of each array of a tree over all processes, equal to the last bit on every
-    process.
+    """Return the sum of each array of a tree over all processes.
 
-    **Arguments:** `tree` of arrays, which have the same shapes on every process; `checkpoint` as
-    for `gather`.
+    The sum is equal, to the last bit, on every process.
 
-    **Raises:** as `gather`.
+    **Arguments:**
+
+    - `tree`: arrays, which have the same shapes on every process.
+    - `checkpoint`: a folder to which `save` first writes the arrays of this process, or `None`.
+
+    **Raises:** `TypeError` for traced arrays; `RuntimeError` if another process has ended.
 
     >>> total(jnp.ones(2)).tolist()
     [1.0, 1.0]
     """
     add = lambda leaf: multihost_utils.process_allgather(jnp.asarray(leaf)).sum(axis=0)  # noqa: E731
-    return _send_arrays(add, _copy_to_host(tree, "total"), checkpoint)
+    return _exchange_arrays(add, _copy_to_host(tree, "total"), checkpoint)
 
 
 def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
-    """Write the rows of this process, a `tree` of arrays, to `folder/share-<process>.npz`.
+    """Write the arrays of this process, a `tree`, to the file `folder/share-<process>.npz`.
 
-    The file appears only when it is complete. **Returns** the path of the file.
+    `<process>` is the index of this process, from 0. The file appears only when it is complete.
+    **Returns** the path of the file.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -148,8 +154,10 @@ def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
 def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
     """Return the trees that `save` wrote to `folder`, one for each process, in order.
 
-    **Arguments:** `like` a tree with the structure of the saved trees; the values of its arrays are
-    not used; `folder` the folder given to `save`.
+    **Arguments:**
+
+    - `like`: a tree with the structure of the saved trees; the values of its arrays are not used.
+    - `folder`: the folder that was given to `save`.
 
     **Raises:** `FileNotFoundError` for a folder without shares; `ValueError` for a file that `save`
     did not write, that is cut short, or that has another number of arrays than `like`.
@@ -183,8 +191,10 @@ def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
 
 
 def _copy_to_host(tree: PyTree, name: str) -> PyTree:
-    """Return `tree` with NumPy arrays; raise `TypeError`, with the function's `name`, if it is
-    traced.
+    """Return a tree whose arrays are copied to host memory, as NumPy arrays.
+
+    Raise `TypeError` if an array is traced; the message begins with `name`, that of the public
+    function that was called.
     """
     if not _checks.is_known(tree):
         raise TypeError(
@@ -194,13 +204,21 @@ def _copy_to_host(tree: PyTree, name: str) -> PyTree:
     return jax.tree.map(np.asarray, tree)
 
 
-def _send_arrays(
+def _exchange_arrays(
     send: Callable[[np.ndarray], np.ndarray | Array],
     tree: PyTree,
     checkpoint: str | os.PathLike[str] | None,
 ) -> PyTree:
-    """Return `send(array)` for every array of `tree`; before, write `tree` to the folder
-    `checkpoint`.
+    """Return the arrays of a tree, joined or summed over all processes.
+
+    **Arguments:**
+
+    - `send`: a function that sends an array of this process to all processes, and returns the
+      joined rows, or the sum, of the arrays of all processes.
+    - `tree`: the arrays of this process. If there is one process only, `tree` is returned as it is.
+    - `checkpoint`: a folder to which `tree` is written before, or `None`.
+
+    Raise `RuntimeError` if another process does not answer.
     """
     if checkpoint is not None:
         try:

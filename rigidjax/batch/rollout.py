@@ -114,18 +114,16 @@ def rollout(
       several in a tuple); or a tree like the torque, with 0 for each array that has the axis N and
       `None` for each array that has not.
     - `solver`: `None` takes `Magnus4` for the attitude of a free body or under a torque that does
-      not
-      depend on the attitude, and `rigidjax.solvers.RungeKutta4` otherwise. Any explicit method of
-      `rigidjax.solvers` may be given; its steps agree with those of `diffrax` to round-off. Runs of
-      10 000 steps or more use compensated addition (the digits that one addition loses enter the
+      not depend on the attitude, and `rigidjax.solvers.RungeKutta4` otherwise. Any explicit method
+      of `rigidjax.solvers` may be given; its steps agree with those of `diffrax` to round-off. Runs
+      of 10 000 steps or more use compensated addition (the digits that one addition loses enter the
       next addition), so that the round-off of n steps grows as √n, not as n.
     - `save_every`: `None` returns the last states only; a number k returns the states after k, 2k,
       … steps.
     - `reduce`, `initial`: a function `(carried, t, state) → carried` of one body, which is called
-      after
-      every `save_every` steps (every step by default), and the first carried value. With `reduce`
-      only the last states are returned. Define the function once, best as a Module: each new
-      function compiles again.
+      after every `save_every` steps (every step by default), and the first carried value. With
+      `reduce` only the last states are returned. Define the function once, best as a Module: each
+      new function compiles again.
     - `t0`: s, the time of the first step.
     - `inputs`: the inputs of the torque, by the names of its `rigidjax.torques.Input`s: arrays (N,
       num_steps, *k). Row i of a body is constant during step i; a `rigidjax.torques.Delayed` input
@@ -140,25 +138,21 @@ def rollout(
       moved after each chunk; without `devices`.
 
     **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
-    (N, num_steps // save_every); with `reduce` the pair (last states, carried
-    value). Under a torque with states of its own the returned states have two fields: `.motion`, of
-    the type of `states0`, and `.own`, the states of the torque.
+    (N, num_steps // save_every); with `reduce` the pair (last states, carried value). Under a
+    torque with states of its own the returned states have two fields: `.motion`, of the type of
+    `states0`, and `.own`, the states of the torque.
 
     The memory needed is that of the inputs, of the results and of one chunk, also in reverse mode.
-    A
-    reverse-mode gradient takes five to ten times as long as the value. In forward and reverse mode
-    the
-    derivatives are the exact derivatives of the discrete steps. A body that becomes NaN changes no
-    other body. For calls inside your own
-    `jax.jit` see `compiler_options`.
+    A reverse-mode gradient takes five to ten times as long as the value. In forward and reverse
+    mode the derivatives are the exact derivatives of the discrete steps. A body that becomes NaN
+    changes no other body. For calls inside your own `jax.jit` see `compiler_options`.
 
     **Raises:** `TypeError` if bodies, states, torque and solver do not fit together; `ValueError`
     for shapes that do not agree, an input that is missing or that no torque reads, a step that is
     not positive, or a `save_every` that does not divide `num_steps`. Known numbers are checked too:
     `ValueError` for an inertia that no mass has, for a moment of zero, and for a quaternion that is
     not unit. A traced inertia of this kind, or of NaN, makes the states of its body NaN and those
-    of no
-    other body.
+    of no other body.
 
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))
@@ -189,20 +183,26 @@ def rollout(
     return out
 
 
-def _take_steps(
+def _take_steps_of_bodies(
     steps: tuple[Solver, int, int, bool],
     division: Division,
     reduce: Reduce | None,
     constants: PyTree,
     numbers: tuple[PyTree, ...],
 ) -> PyTree:
-    """Return what `rollout` returns, from its checked arguments.
+    """Take fixed steps of many bodies, and return what `rollout` returns.
 
-    **Arguments:** `steps` the solver, the number of steps, the number of steps between two saved
-    states, and whether states are saved; `division` the size of a chunk, the devices and the
-    progress meter; `constants` the leaves of the batch that are no arrays; `numbers` five things:
-    the arrays that all bodies share; the arrays with a row for each body, with the inputs;
-    the first carried value; the step size, s; and t0, s.
+    **Arguments:**
+
+    - `steps`: four things: the solver; the number of steps; the number of steps between two saved
+      states; and whether these states are saved (otherwise only the last states are returned).
+    - `division`: three things: the number of bodies that a device computes at a time; the mesh of
+      devices, or `None` for the default device; and the progress meter.
+    - `reduce`: a function `(carried, t, state) → carried` of one body, called at each saved state,
+      or `None`.
+    - `constants`: the leaves of bodies, states and torque that are no arrays.
+    - `numbers`: five things: the arrays that all bodies share; the arrays with a row for each body,
+      with the inputs; the first carried value; the step size, s; and the time of the first step, s.
     """
     (solver, count, every, keep), (shared, per_body, initial, h, t0) = steps, numbers
 
@@ -243,4 +243,4 @@ def _take_steps(
     return map_bodies(step_body, (shared, initial, h, t0), per_body, division)
 
 
-_compiled = CompiledFunction(_take_steps)
+_compiled = CompiledFunction(_take_steps_of_bodies)

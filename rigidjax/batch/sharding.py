@@ -1,5 +1,6 @@
-"""Map a function of one body over many bodies, in shares for devices and in chunks for the
-cache.
+"""Map a function of one body over many bodies, divided among devices and into chunks.
+
+A chunk is the bodies that a device computes at a time; on CPU its arrays fit into the cache.
 """
 
 import functools
@@ -56,6 +57,7 @@ class CompiledFunction:
 
     @functools.cached_property
     def _with_options(self) -> Callable[..., Any]:
+        """Return the function under `jit` with `compiler_options`, if the backend has any."""
         # This is made at the first call and not at import: `compiler_options` starts JAX's backend.
         options, jit = compiler_options(), cast(Any, eqx.filter_jit)
         return jit(self.function, compiler_options=options) if options else self._without_options
@@ -66,8 +68,10 @@ class CompiledFunction:
 
 
 def mesh_of(devices: Devices) -> Mesh | None:
-    """Return a mesh of one axis over `devices` (as in `rollout`), or `None` for the default
-    device.
+    """Return a mesh of one axis over some devices, or `None` for the default device.
+
+    `devices` is `None` for the default device, `"all"` for all devices of this process, or a
+    sequence of devices. Raise `ValueError` for anything else, and for a device of another process.
     """
     if devices is None:
         return None
@@ -91,9 +95,11 @@ def mesh_of(devices: Devices) -> Mesh | None:
 class Division(NamedTuple):
     """Describe how the bodies of a batch are divided into chunks.
 
-    **Fields:** `chunk` the number of bodies that each device computes at a time; `mesh` the
-    devices, which exchange nothing, or `None` for the default device; `progress_meter` a meter that
-    is moved after each chunk.
+    **Fields:**
+
+    - `chunk`: the number of bodies that each device computes at a time.
+    - `mesh`: the devices, which exchange nothing, or `None` for the default device.
+    - `progress_meter`: a progress meter of diffrax, which is moved after each chunk.
     """
 
     chunk: int
@@ -129,9 +135,10 @@ def division_of(
 
 
 def chunk_of(chunk: int | None, dtype: np.dtype, count: int) -> int:
-    """Return the number of bodies that are computed at a time, out of `count`.
+    """Return the number of bodies that a device computes at a time, out of `count` bodies.
 
-    It is `chunk` if given; else as many as fill the cache on CPU, and all on other backends.
+    It is `chunk`, but `count` at most. If `chunk` is `None`, it is on CPU the number of bodies that
+    fill the cache with numbers of the given `dtype`, and all bodies on other backends.
     """
     if chunk is None:
         small = _ROW // np.dtype(dtype).itemsize
@@ -149,9 +156,14 @@ def map_bodies(
 ) -> PyTree:
     """Return `function(shared, row)` of every body, stacked along a new first axis.
 
-    **Arguments:** `shared` the arrays that all bodies share; `per_body` arrays with a leading axis
-    of bodies, of which `row` is one row; `division` the size of a chunk, the devices and the
-    progress meter.
+    **Arguments:**
+
+    - `function`: a function of one body, called with `shared` and with the row of the body.
+    - `shared`: the arrays that all bodies share.
+    - `per_body`: arrays with a leading axis of bodies, of which `row` is one row.
+    - `division`: three things: the number of bodies that a device computes at a time; the mesh of
+      devices, which exchange nothing, or `None` for the default device;
+      and the progress meter, which is moved after each chunk.
     """
     chunk, mesh, meter = division
     count = jax.tree.leaves(per_body)[0].shape[0]

@@ -31,9 +31,13 @@ State = TypeVar("State", Spin, Attitude, Rigid)
 class Steps(NamedTuple):
     """Describe fixed steps, which `simulate` takes instead of times.
 
-    **Fields:** `size` of a step, s; `number` of steps; `save_every` a number k to save the states
-    after k, 2k, … steps, or `None` to save the last states only; `t0` the time of the initial
-    states, s.
+    **Fields:**
+
+    - `size`: the length of a step, s.
+    - `number`: the number of steps.
+    - `save_every`: a number k to save the states after k, 2k, … steps, or `None` to save the last
+      states only.
+    - `t0`: the time of the initial states, s.
 
     >>> Steps(0.01, 1000).number
     1000
@@ -129,7 +133,13 @@ def simulate(
         ts = _checks.checked_time(t0, "t0").astype(h.dtype) + ts
         num_steps = jnp.full(batch.num_bodies, count, jnp.int32)
         own = ys.own if isinstance(ys, Coupled) else None
-        return Batch(ts, motion_of(ys), _statuses(batch._replace(checks=()), ys), num_steps, own)
+        return Batch(
+            ts,
+            motion_of(ys),
+            _results_after_fixed_steps(batch._replace(checks=()), ys),
+            num_steps,
+            own,
+        )
     if inputs is not None:
         raise ValueError(
             "simulate: inputs are for Steps(size, number); with times give the torque "
@@ -157,12 +167,19 @@ def _simulate_bodies(
     constants: PyTree,
     numbers: tuple[PyTree, PyTree, Array],
 ) -> tuple[Any, ...]:
-    """Return four things for all bodies: `ys`, `result`, `num_steps` and `own` of a `Batch`.
+    """Simulate many bodies, each by `rigidjax.simulate`, and return the fields of a `Batch`.
 
-    **Arguments:** `options` keyword arguments of `rigidjax.simulate`, which runs for each body;
-    `division` the size of a chunk, the devices and the progress meter; `constants` the leaves of
-    the batch that are no arrays; `numbers` the arrays that all bodies share, the arrays with a row
-    for each body, and the times, s.
+    **Arguments:**
+
+    - `options`: keyword arguments of `rigidjax.simulate`, for every body.
+    - `division`: three things: the number of bodies that a device computes at a time; the mesh of
+      devices, or `None` for the default device; and the progress meter.
+    - `constants`: the leaves of bodies, states and torque that are no arrays.
+    - `numbers`: three things: the arrays that all bodies share; the arrays with a row for each
+      body; and the times (T,), s.
+
+    **Returns** four things, each with a leading axis of bodies: the states `ys`; the `result` of
+    diffrax; the numbers of steps; and the states `own` of the torques, or `None`.
     """
     shared, per_body, ts = numbers
 
@@ -195,9 +212,12 @@ _compiled = CompiledFunction(_simulate_bodies)
 
 
 @eqx.filter_jit
-def _statuses(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
-    """Return the `result` (N,) of each body after fixed steps: `successful`, or why its `ys` are
-    not finite.
+def _results_after_fixed_steps(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
+    """Return how the run of each of N bodies under fixed steps ended, a `diffrax.RESULTS` (N,).
+
+    It is `successful`, or `nonfinite` if a state of the body is not finite, or `nonfinite_input` if
+    no real body has its inertia. `batch` holds the bodies and their initial states; `ys` are the
+    saved states, with a leading axis N.
     """
 
     def status(row: PyTree, ys: PyTree) -> dfx.RESULTS:
@@ -213,13 +233,21 @@ _UNROLLED = 32
 
 
 def order_by_key(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:
-    """Return two permutations (N,): an order of bodies, in which a chunk has similar keys; and its
-    inverse.
+    """Sort bodies so that those that are computed together need similar numbers of steps.
 
-    **Arguments:** `key` (N,) a number of each body, NaN is the largest; `chunk` the number of
-    bodies of a chunk; `parts` the number of devices, to which consecutive chunks go one after
-    another. The place of a body within its chunk does not depend on the keys of other bodies, since
-    the rounding of its results depends on this place.
+    A chunk is the bodies that a device computes together; all of them wait for the slowest. The
+    place of a body within its chunk does not depend on the keys of other bodies, since the rounding
+    of its results depends on this place.
+
+    **Arguments:**
+
+    - `key`: (N,) a number of each body by which it is sorted, such as its speed; NaN is the
+      largest.
+    - `chunk`: the number of bodies of a chunk.
+    - `parts`: the number of devices, to which consecutive chunks go one after another.
+
+    **Returns** two permutations (N,): the order, which has the old index of each body at its new
+    place; and its inverse.
     """
     count = key.shape[0]
     chunk = min(chunk, -(-count // parts))

@@ -30,19 +30,18 @@ Check = tuple[Any, Callable[[int], None]]
 
 
 class BodyBatch(NamedTuple):
-    """Hold a batch, the tree `(bodies, states0, torque)`, split into three trees.
+    """Hold the bodies, initial states and torque of many runs, split into three trees.
 
-    `shared`, `per_body` and `constants` have `None` for each leaf that is in another of the three
-    trees. `num_bodies` is N, `dtype` the precision of the states, `checks` the checks of known
-    numbers, which `require` completes.
+    Each of the three trees has the structure of the tree `(bodies, states0, torque)`, and `None`
+    for each leaf that is in another one of them.
     """
 
     shared: PyTree  # the arrays that all bodies share
     per_body: PyTree  # the arrays with a row for each body
     constants: PyTree  # the leaves that are no arrays
-    num_bodies: int
-    dtype: np.dtype
-    checks: tuple[Check, ...] = ()
+    num_bodies: int  # the number N of bodies
+    dtype: np.dtype  # the precision of the states
+    checks: tuple[Check, ...] = ()  # the checks of known numbers, which `require` completes
 
     def require(self) -> None:
         """Raise an error for the first body with a known number that is wrong.
@@ -56,11 +55,16 @@ class BodyBatch(NamedTuple):
 
 
 def one_body(shared: PyTree, row: PyTree, constants: PyTree) -> tuple[Any, Any, Any]:
-    """Return three things for one body: its inertia or mass properties; its initial state; and its
-    torque.
+    """Return the inertia, the initial state and the torque of one body of a batch.
 
-    **Arguments:** `shared` and `constants` of a `BodyBatch`; `row` the row of this body in
-    `per_body`. An invalid state becomes NaN.
+    **Arguments:**
+
+    - `shared`, `constants`: the trees with these names of a `BodyBatch`: the arrays that all bodies
+      share, and the leaves that are no arrays.
+    - `row`: the row of this body in the tree `per_body` of the `BodyBatch`.
+
+    **Returns** three things: the `Inertia` or `MassProperties`; the state, which is NaN if it is
+    invalid; and the torque.
     """
     body, state0, torque = eqx.combine(shared, row, constants)
     return body, project_to_group(validation.checked_start(state0, False)), torque
@@ -72,10 +76,11 @@ def check_batch(
     torque: Torque | None,
     torque_axes: TorqueAxes,
 ) -> BodyBatch:
-    """Return the `BodyBatch` of these arguments of `rollout`; raise an error for wrong types and
-    shapes.
+    """Check the bodies, initial states and torque of `rollout`, and return them as a `BodyBatch`.
 
-    Where the numbers are checked on the device, `BodyBatch.require` raises the error, later.
+    The arguments are those of `rollout` with the same names. Raise `TypeError` and `ValueError` for
+    wrong types and shapes. Where the numbers are checked on the device, `BodyBatch.require` raises
+    the error, later.
     """
     if not isinstance(states0, Spin | Attitude | Rigid):
         raise TypeError(
@@ -111,7 +116,7 @@ def check_batch(
     # precision the rounded inertia of a flat body looks like an inertia that no mass has.
     bodies, checks = _check_inertia(bodies)
     if isinstance(states0, HasAttitude):
-        checks += _check_unit(states0.q)
+        checks += _check_unit_quaternions(states0.q)
     bodies = jax.tree.map(lambda a: a if a.dtype == dtype else a.astype(dtype), bodies)
     own = tensor.ndim == 3
     if own and tensor.shape[0] == 1 and count > 1:
@@ -143,10 +148,17 @@ def inputs_of_bodies(
     count: int,
     h: Array,
 ) -> dict[str, Array] | None:
-    """Return the `inputs` as arrays (N, count, *k) by name, in the precision of the states.
+    """Return the inputs of a torque as arrays (N, count, *k) by name, after a check.
 
-    Raise `ValueError` for inputs that do not fit the torque, the bodies or the `count` steps of `h`
-    seconds. The result is `None` for a torque without inputs.
+    **Arguments:**
+
+    - `inputs`: arrays by the names of the torque's inputs, or `None`.
+    - `torque`: the torque, or `None`.
+    - `states0`: the initial states of the N bodies, whose precision the arrays get.
+    - `count`, `h`: the number of steps, and the length of a step, s.
+
+    Raise `ValueError` for inputs that do not fit the torque, the bodies or the steps. The result is
+    `None` for a torque without inputs.
     """
     for name, delay in delays_of(torque):
         if _checks.is_known((delay, h)):
@@ -171,11 +183,13 @@ def inputs_of_bodies(
 
 
 def _has_row_for_each_body(torque: Torque | None, axes: TorqueAxes, count: int) -> PyTree:
-    """Return a tree of booleans like `torque`: true for an array with a row for each of `count`
-    bodies.
+    """Return which arrays of a torque have a row for each of `count` bodies, as a tree of booleans.
+
+    The tree has the structure of `torque`, or of its upper part. `axes` is the argument
+    `torque_axes` of `rollout`. Raise `ValueError` if a selected array has another number of rows.
     """
     if callable(axes) and not isinstance(axes, eqx.Module):
-        prefix = _is_picked(torque, axes)
+        prefix = _is_selected(torque, axes)
     else:
         for axis in jax.tree.leaves(axes):
             if not isinstance(axis, int) or axis != 0:
@@ -195,11 +209,11 @@ def _has_row_for_each_body(torque: Torque | None, axes: TorqueAxes, count: int) 
     return prefix
 
 
-def _is_picked(torque: Torque | None, pick: Callable[[Any], Any]) -> PyTree:
-    """Return a tree of booleans like `torque`: true for an array that `pick(torque)` contains.
+def _is_selected(torque: Torque | None, pick: Callable[[Any], Any]) -> PyTree:
+    """Return which arrays of a torque a function selects, as a tree of booleans like the torque.
 
-    `pick` may return one array, a tuple of arrays, or a part of the torque, which means all arrays
-    of this part.
+    `pick(torque)` returns one array, a tuple of arrays, or a part of the torque, which means all
+    arrays of this part.
     """
     leaves, structure = jax.tree.flatten(torque)
     numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
@@ -216,9 +230,11 @@ def _is_picked(torque: Torque | None, pick: Callable[[Any], Any]) -> PyTree:
 
 
 def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
-    """Return two things: the bodies; and a list with the check for an inertia that no mass has.
+    """Return the bodies, and the check that a real body can have the inertia of each of them.
 
-    For traced bodies the list is empty, and a body with such an inertia becomes NaN.
+    **Returns** two things: the bodies; and a list with one check, a pair of the index of the first
+    wrong body (−1 for none) and of the function that raises the error for this body. For traced
+    bodies the list is empty, and a body with an impossible inertia becomes NaN.
     """
     tensor = tensor_of(bodies)
     if not _checks.is_known(tensor):
@@ -236,9 +252,11 @@ def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
     return bodies, [(first_impossible_row(tensors), refuse)]
 
 
-def _check_unit(q: Array) -> list[Check]:
-    """Return a list with the check for a quaternion (N, 4) that is not unit; it is empty if `q` is
-    traced.
+def _check_unit_quaternions(q: Array) -> list[Check]:
+    """Return the check that each of N quaternions `q` (N, 4) is a unit quaternion.
+
+    It is a list with one pair: the index of the first wrong body (−1 for none), and the function
+    that raises the error for this body. If `q` is traced, the list is empty.
     """
     if not _checks.is_known(q):
         return []
@@ -254,12 +272,19 @@ def _check_unit(q: Array) -> list[Check]:
 
 
 def _is_not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
+    """Return for each quaternion of `q` (…, 4) whether its length differs from 1, (…).
+
+    `xp` is the module that computes: NumPy or `jax.numpy`.
+    """
     return xp.abs(xp.sqrt(xp.sum(xp.square(q), axis=-1)) - 1) > tolerance(q.dtype)
 
 
 def step_of(step_size: ScalarLike, num_steps: int, dtype: np.dtype) -> tuple[Array, int]:
-    """Return the step, s, in the precision `dtype`, and the number of steps, after a check of
-    each.
+    """Return the length of a step, s, and the number of steps, after a check of each.
+
+    `step_size` and `num_steps` are the arguments of `rollout`; `dtype` is the precision that the
+    length gets. Raise `ValueError` for a length that is known not to be positive, and an error for
+    a number of steps below 1.
     """
     h = _checks.array_of_shape(step_size, (), "step_size").astype(dtype)
     if _checks.is_known(h) and not 0 < float(h) < np.inf:

@@ -21,8 +21,10 @@ from rigidjax.rotation import euler, linalg3
 class Coordinates(eqx.Module):
     """Hold the state of a Lagrangian system: the coordinates and their time derivatives.
 
-    **Arguments:** `q` (n,) generalised coordinates, in the Lagrangian's units; `rate` (n,) dq/dt,
-    the same units per second.
+    **Arguments:**
+
+    - `q`: (n,) generalised coordinates, in the units of the Lagrangian.
+    - `rate`: (n,) their time derivatives dq/dt, in these units per second.
 
     >>> Coordinates([0.1, 0.2], [0.0, 1.0]).rate.shape
     (2,)
@@ -45,7 +47,10 @@ class Coordinates(eqx.Module):
 class LagrangeEquations(eqx.Module):
     """Evaluate Lagrange's equations of a Lagrangian and of forces as a vector field.
 
-    `equations_of_motion` makes this Module and describes its fields `lagrangian` and `force`.
+    The vector field is called as `f(t, y, args)`. `lagrangian` is a function `(q, q̇) → L`, J, of
+    the coordinates and their time derivatives; `force` is a function `(t, q, q̇) → Q` of the
+    generalised forces, or `None`. The state y is a `Coordinates`. `equations_of_motion` makes this
+    Module.
 
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
     >>> round(float(pendulum.energy(Coordinates([0.0], [2.0]))), 6)  # ½ v² − 9.81 cos q
@@ -75,6 +80,10 @@ class LagrangeEquations(eqx.Module):
         return jnp.sum(y.rate * momentum) - self._value(y.q, y.rate)
 
     def _value(self, q: Array, rate: Array) -> Scalar:
+        """Return the value of the Lagrangian, J, for the coordinates `q` (n,) and their rates (n,).
+
+        Raise an error unless the value is one number.
+        """
         return _checks.array_of_shape(
             self.lagrangian(q, rate), (), "lagrangian", hint="one number, J"
         )
@@ -88,14 +97,17 @@ def equations_of_motion(
     Lagrange's equations `d/dt ∂L/∂q̇ = ∂L/∂q + Q`, with generalised forces Q, are solved for q̈:
     `(∂²L/∂q̇∂q̇) q̈ = ∂L/∂q − (∂²L/∂q̇∂q) q̇ + Q`.
 
-    **Arguments:** `lagrangian` a callable `(q, q̇) → L`, J, with `q`, `q̇` (n,), best a Module:
-    motions
-    can be differentiated with respect to the numbers of a Module, and other numbers need no new
-    compilation; `force` a callable `(t, q, q̇) → Q` (n,), the generalised forces without a
-    potential, or `None`. **Returns** a Module, for
-    `diffrax.ODETerm`. The linear system is solved by cofactors for up to three coordinates, by LU
-    (`lineax`) for more. Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after
-    eq 57.
+    **Arguments:**
+
+    - `lagrangian`: a callable `(q, q̇) → L`, J, with `q`, `q̇` (n,), best a Module: motions can be
+      differentiated with respect to the numbers of a Module, and other numbers need no new
+      compilation.
+    - `force`: a callable `(t, q, q̇) → Q` (n,), the generalised forces without a potential, or
+      `None`.
+
+    **Returns** a Module, for `diffrax.ODETerm`. The linear system is solved by cofactors for up to
+    three coordinates, by LU (`lineax`) for more. Source: Landau and Lifshitz, Mechanics, eq 2.6;
+    the notes mention it after eq 57.
 
     If the matrix ∂²L/∂q̇∂q̇ is singular (at a singularity of the coordinates, or for a coordinate
     without inertia), the result has infinities or NaN.
@@ -113,12 +125,18 @@ def equations_of_motion(
 class EulerAngleTop(eqx.Module):
     """Compute the Lagrangian L = ½ Ω·IΩ − U of a body about a fixed point, in 3-1-3 Euler angles.
 
-    **Arguments:** `inertia` I about the fixed point (about the centre of mass for a free body);
-    `torque` a torque with a potential U that does not depend on time, such as `HeavyTop`, or
-    `None`. The object is called with the angles (φ, θ, ψ), sequence 3-1-3, rad, and the time
-    derivatives of these angles, and returns L, J; Ω is the body rate. Lagrange's equations of L are
-    singular at sin θ = 0. Source: notes, eqs 33, 75, 81–83. **Raises:** `TypeError` for a torque
-    without a potential.
+    **Arguments:**
+
+    - `inertia`: the inertia I about the fixed point (about the centre of mass for a free body),
+      kg m².
+    - `torque`: a torque with a potential U that does not depend on time, such as `HeavyTop`, or
+      `None`.
+
+    The object is called with the angles (φ, θ, ψ), sequence 3-1-3, rad, and the time derivatives of
+    these angles, rad/s, and returns L, J; Ω is the body rate. Lagrange's equations of L are
+    singular at sin θ = 0. Source: notes, eqs 33, 75, 81–83.
+
+    **Raises:** `TypeError` for a torque without a potential.
 
     >>> free = EulerAngleTop(rj.Inertia.from_principal(1.0, 1.0, 2.0))
     >>> free(jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))
@@ -184,6 +202,11 @@ def from_attitude(state: HasAttitude) -> Coordinates:
 def _solve_for_acceleration(
     matrix: Float[Array, "n n"], push: Float[Array, " n"]
 ) -> Float[Array, " n"]:
+    """Return the second time derivatives q̈ (n,) of coordinates: the solution of M q̈ = F.
+
+    `matrix` is M = ∂²L/∂q̇∂q̇ of the Lagrangian L, and `push` is F, the generalised forces with all
+    other terms of Lagrange's equations.
+    """
     n = push.shape[0]
     if n == 1:
         return push / matrix[0]

@@ -33,13 +33,17 @@ class Momentum(eqx.Module):
 
 
 class MomentumAndDirection(eqx.Module):
-    """Hold the state of a heavy top reduced by its symmetry: angular momentum, and a direction
-    fixed in the world.
+    """Hold the state of a heavy top: the angular momentum, and a vector fixed in the world.
 
-    **Arguments:** `pi` (3,) the angular momentum Π, N m s, body frame; `gamma` (3,) the vector γ =
-    Rᵀ
-    d, body frame, where d is a vector fixed in the world and R the attitude, body → world. d has
-    any length and unit; for `HeavyTopHamiltonian` it is the acceleration of gravity g, m/s².
+    The attitude itself is not needed, because the motion does not depend on a turn about this
+    vector.
+
+    **Arguments:**
+
+    - `pi`: (3,) the angular momentum Π, N m s, body frame.
+    - `gamma`: (3,) the vector γ = Rᵀ d, body frame, where d is a vector fixed in the world and R
+      the attitude, body → world. d has any length and unit; for `HeavyTopHamiltonian` it is the
+      acceleration of gravity g, m/s².
 
     >>> MomentumAndDirection([1.0, 0.0, 0.0], [0.0, 0.0, -9.81]).gamma.shape
     (3,)
@@ -55,9 +59,10 @@ class MomentumAndDirection(eqx.Module):
 
 
 class LiePoisson(eqx.Module):
-    """Evaluate `dΠ/dt = Π × ∇H(Π)` as a vector field; H is the `hamiltonian`.
+    """Evaluate `dΠ/dt = Π × ∇H(Π)` as a vector field `f(t, y, args)`, whose state is a `Momentum`.
 
-    `lie_poisson` makes this Module.
+    Π (3,) is the angular momentum in body axes, N m s, and H is the `hamiltonian`, a function
+    `Π → H`, J. `lie_poisson` makes this Module.
     """
 
     hamiltonian: Callable[[Any], Any]
@@ -67,9 +72,11 @@ class LiePoisson(eqx.Module):
 
 
 class LiePoissonWithDirection(eqx.Module):
-    """Evaluate the vector field of a `hamiltonian` H(Π, γ).
+    """Evaluate the Lie–Poisson equations of a Hamiltonian H(Π, γ) as a vector field.
 
-    `lie_poisson_with_direction` makes this Module and has the equations.
+    Π (3,) is the angular momentum, N m s, and γ (3,) a vector fixed in the world, both in body
+    axes; the state is a `MomentumAndDirection`. The equations are dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ and
+    dγ/dt = γ × ∂H/∂Π. `lie_poisson_with_direction` makes this Module.
     """
 
     hamiltonian: Callable[[Any, Any], Any]
@@ -83,14 +90,16 @@ class LiePoissonWithDirection(eqx.Module):
 
 
 def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
-    """Return the vector field `dΠ/dt = Π × ∇H(Π)` of any Hamiltonian H(Π); its state is a
-    `Momentum`.
+    """Return the vector field `dΠ/dt = Π × ∇H(Π)` of any Hamiltonian H(Π) of the momentum Π.
 
-    **Arguments:** `hamiltonian` a callable, best a Module, `Π → H`, J, with Π (3,), N m s, body
-    frame; ∇H is then the body rate Ω. For H = ½ Π·I⁻¹Π, which is `RotationalHamiltonian(inertia)`,
-    the equations are Euler's. H and the Casimir |Π|² are conserved. Source: Marsden and Ratiu,
-    Introduction
-    to Mechanics and Symmetry, §§1.2, 1.3.
+    **Arguments:**
+
+    - `hamiltonian`: a callable, best a Module, `Π → H`, J, with the angular momentum Π (3,), N m s,
+      body frame; ∇H is then the body rate Ω.
+
+    **Returns** a function `f(t, y, args)`, whose state y is a `Momentum`. For H = ½ Π·I⁻¹Π, which
+    is `RotationalHamiltonian(inertia)`, the equations are Euler's. H and the Casimir |Π|² are
+    conserved. Source: Marsden and Ratiu, Introduction to Mechanics and Symmetry, §§1.2, 1.3.
 
     >>> H = RotationalHamiltonian(rj.Inertia.from_principal(1.0, 2.0, 2.0))
     >>> lie_poisson(H)(0.0, Momentum([1.0, 1.0, 1.0])).pi
@@ -119,6 +128,11 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
 
 
 def _require_invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
+    """Return the inertia of one body after a check that it has an inverse.
+
+    Raise an error if a moment of the inertia is known to be zero; a traced inertia that no body can
+    have becomes NaN.
+    """
     _checks.require_single(inertia, _inertia.Inertia, "inertia")
     return validation.check_body(inertia, inertia.tensor, None, throw=False)
 
@@ -126,9 +140,9 @@ def _require_invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
 class RotationalHamiltonian(eqx.Module):
     """Compute the energy of rotation H = ½ Π·I⁻¹Π, J, of the angular momentum Π (3,), body frame.
 
-    **Arguments:** `inertia` I about the centre of mass or a fixed point. **Raises:** `ValueError`
-    for
-    a moment known to be zero.
+    **Arguments:** `inertia` is the inertia I about the centre of mass or a fixed point, kg m².
+
+    **Raises:** `ValueError` for a moment known to be zero.
 
     >>> RotationalHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0))([0.0, 0.0, 2.0])
     Array(1., dtype=float64)
@@ -147,10 +161,14 @@ class RotationalHamiltonian(eqx.Module):
 class HeavyTopHamiltonian(eqx.Module):
     """Compute the energy of a heavy top, H = ½ Π·I⁻¹Π − m c·γ, J.
 
-    **Arguments:** `inertia` I about the fixed point; `top` a `HeavyTop`, which gives the mass m and
-    the
-    centre of mass c. The object is a function of the angular momentum Π (3,), N m s, and of gravity
-    γ = Rᵀ g (3,), m/s², both in the body frame. `start` makes the state of the vector field.
+    **Arguments:**
+
+    - `inertia`: the inertia I about the fixed point, kg m².
+    - `top`: a `HeavyTop`, which gives the mass m, kg, and the centre of mass c, m.
+
+    The object is a function of the angular momentum Π (3,), N m s, and of gravity γ = Rᵀ g (3,),
+    m/s², both in the body frame. `start` makes the state of the vector field.
+
     **Raises:** `ValueError` for a moment known to be zero.
 
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0, 0.5], [0.0, 0, -9.81])
@@ -179,10 +197,14 @@ class HeavyTopHamiltonian(eqx.Module):
         return 0.5 * dot(pi, apply(self.inverse, pi)) - self.top.mass * dot(self.top.com, gamma)
 
     def start(self, state: HasAttitude) -> MomentumAndDirection:
-        """Return Π = IΩ and γ = Rᵀ g of a `state` with the attitude R and the body rate Ω."""
+        """Return the state of the vector field: Π = IΩ and γ = Rᵀ g, in body axes.
+
+        `state` has the attitude R (a quaternion `q`, body → world) and the body rate Ω, rad/s.
+        """
         pi: Vec3 = apply(self.inertia.tensor, state.omega)
         return MomentumAndDirection(pi, quaternion.rotate_inverse(state.q, self.top.gravity))
 
 
 def _checked_scalar(value):
+    """Return the value of a Hamiltonian, J; raise an error unless it is one number."""
     return _checks.array_of_shape(value, (), "hamiltonian", hint="one number, J")

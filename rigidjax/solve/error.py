@@ -154,24 +154,28 @@ class Error(eqx.Module):
 
     @property
     def _relative(self) -> Array:
-        """Return the largest of the errors of all parts of a state, each divided by its scale.
+        """Return the largest error of a state at each time (T,), without a unit.
 
-        Errors that are `lost`, which means too large to add up, are returned as they are.
+        The largest is taken over the arrays of the state (`q`, `omega`, …), after the error of each
+        array is divided by its scale in `sizes`. In contrast to `relative`, errors above one half
+        are returned as they are, and not as infinity.
         """
-        return _largest(jax.tree.map(jnp.hypot, self.steps, self.round_off), self.sizes)
+        return _largest_relative_distance(
+            jax.tree.map(jnp.hypot, self.steps, self.round_off), self.sizes
+        )
 
 
 class TriedRun(NamedTuple):
-    """Hold one run of the search for a tolerance: the tolerance, and the results of `solve`."""
+    """Hold one run of the search for a tolerance: the tolerance, and what `solve` returned."""
 
-    rtol: Array
-    ys: Any
-    stats: dict[str, Array]
-    result: dfx.RESULTS
+    rtol: Array  # (), the relative tolerance of the run
+    ys: Any  # the states at the T saved times, with a leading time axis
+    stats: dict[str, Array]  # the numbers of steps, as in `Solution.stats`
+    result: dfx.RESULTS  # whether the run reached the end, or why not
 
     @property
     def steps(self) -> Array:
-        """Return the number of accepted steps."""
+        """Return the number of accepted steps of the run, a whole number."""
         return self.stats["num_accepted_steps"]
 
 
@@ -183,33 +187,46 @@ def estimate_error_of_run(
     count: Array,
     search: tuple[TriedRun, TriedRun] | None = None,
 ) -> Error:
-    """Return the error of the states `ys`, which the run `setup` gave at `ts` in `count` steps.
+    """Return an estimate of the error of a run that is already known, at each of its saved times.
 
     The error of the steps is the distance to a second, more accurate run; a run in closed form has
-    no error of steps. `search`, if given, holds two runs at larger tolerances: the first run of a
-    search for a tolerance, and the run before `ys`. The run before then serves instead of a second
-    run, and the error is too large by a factor of about four.
+    no error of steps. The error of round-off is measured by runs with inputs changed in the last
+    digit.
+
+    **Arguments:**
+
+    - `setup`: the body, the torque, the solver and the tolerances of the run, a `ClosedFormRun` or
+      a `DiffraxRun`.
+    - `ts`: (T,) s, the times of the states.
+    - `ys`: the states at `ts` that the run gave, with a leading time axis.
+    - `count`: the number of steps of the run.
+    - `search`: `None`, or two runs of a search for a tolerance, both at larger tolerances: the
+      first run of the search, and the run before `ys`. The run before then serves instead of a
+      second run, and the error of the steps is too large by a factor of about four.
     """
     setup, ts, ys, count, search = _without_derivatives((setup, ts, ys, count, search))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
     if search is not None:
         before = search[1]
         rtol, others = setup.rtol, before.ys
-        far = _largest(_distances(others, ys), _sizes(ys)) > _FORESEEN
+        far = (
+            _largest_relative_distance(_distances_of_states(others, ys), _scales_by_name(ys))
+            > _FORESEEN
+        )
         factor = jnp.where(far, jnp.inf, _ALLOWED * rtol / before.rtol)
     elif not isinstance(setup, ClosedFormRun):
-        second, rtol, factor = _closer_run(setup, ts, _sudden_times(setup, ts, ys))
+        second, rtol, factor = _more_accurate_run(setup, ts, _sudden_times(setup, ts, ys))
         others, *_ = solve(second, jax.tree.map(lambda leaf: leaf[0], ys), ts)
-    steps = jax.tree.map(lambda part: factor * part, _distances(others, ys))
-    return _with_round_off(setup, ts, ys, count, steps, rtol, search)
+    steps = jax.tree.map(lambda part: factor * part, _distances_of_states(others, ys))
+    return _error_with_round_off(setup, ts, ys, count, steps, rtol, search)
 
 
 def _without_derivatives(tree: Any) -> Any:
-    """Return the tree with its arrays held constant in derivatives."""
+    """Return a tree with the same numbers, whose arrays are held constant in derivatives."""
     return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_array(a) else a, tree)
 
 
-def _with_round_off(
+def _error_with_round_off(
     setup: Any,
     ts: Array,
     ys: Any,
@@ -218,13 +235,23 @@ def _with_round_off(
     rtol: Array,
     search: tuple[TriedRun, TriedRun] | None,
 ) -> Error:
-    """Measure the error of round-off of a run by neighbouring runs, and return the whole error.
+    """Return the whole error of a run: the given error of its steps, and its round-off.
 
-    `steps` is the known error of the steps, by name. `rtol` is the tolerance of the run, `count`
-    its number of steps, and `search` holds two runs at larger tolerances, or is `None`.
+    The error of round-off is measured by neighbouring runs, whose body, torque and start differ
+    from those of the run by about a unit in the last digit.
+
+    **Arguments:**
+
+    - `setup`: the body, the torque, the solver and the tolerances of the run.
+    - `ts`, `ys`: the saved times (T,), s, and the states of the run at these times.
+    - `count`: the number of steps of the run.
+    - `steps`: the known error of the steps, one array (T,) for each array of a state, by its name
+      (`q`, `omega`, …).
+    - `rtol`: the relative tolerance of the run.
+    - `search`: `None`, or two runs of a search for a tolerance, at larger tolerances.
     """
-    sizes, start = _sizes(ys), jax.tree.map(lambda leaf: leaf[0], ys)
-    reached = jnp.isfinite(_largest(_distances(ys, ys), sizes))
+    sizes, start = _scales_by_name(ys), jax.tree.map(lambda leaf: leaf[0], ys)
+    reached = jnp.isfinite(_largest_relative_distance(_distances_of_states(ys, ys), sizes))
     # This is `_ABOVE` times the sum of the rounding errors of n = `count` steps, about n^1.5
     # roundings, in a motion without growth of errors: n^0.5 for the body rate, and once more n for
     # the angle.
@@ -232,7 +259,7 @@ def _with_round_off(
     plain = {name: _ABOVE * eps * count.astype(ts.dtype) ** 1.5 * sizes[name] for name in sizes}
     coarse = rtol > _COARSE * eps
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
-    setup, ys, more = _cheaper_run(setup, start, ts, ys, count, search)
+    setup, ys, more = _run_at_larger_tolerance(setup, start, ts, ys, count, search)
     free = isinstance(setup, ClosedFormRun)
 
     def changes_of_neighbour(numbers: Any, times: Array) -> Array:
@@ -245,21 +272,23 @@ def _with_round_off(
         # If round-off is known to be small, all times of a neighbour are the start, so that it
         # takes no step.
         changes = changes_of_neighbour(near, jnp.where(clear, ts[0], ts * later))
-        shown = _lengths(start, _DEVIATIONS * _ABOVE_ONE * changes)
+        shown = _lengths_by_name(start, _DEVIATIONS * _ABOVE_ONE * changes)
         bounds = {name: jnp.maximum(plain[name], shown[name]) for name in sizes}
         above = jnp.stack([(steps[name] > _CLEAR * bounds[name])[1:] for name in sizes])
         small = coarse & jnp.all(above | ~reached[None, 1:])
         return jnp.where(number == 0, small, clear), (changes, bounds)
 
     rng = np.random.default_rng(0)
-    near = jax.tree.map(lambda leaf: _nudged(leaf, rng, jnp.abs(leaf)), numbers)
+    near = jax.tree.map(
+        lambda leaf: _copies_changed_in_last_digit(leaf, rng, jnp.abs(leaf)), numbers
+    )
     # The closed form rounds its angle only once, and neighbours may get the same rounded angle. The
     # times of its neighbours are therefore changed, too.
     later = jnp.asarray(1.0 + eps * free * np.array([1.0, -1.0, 1.0]), ts.dtype)
     inputs = jnp.arange(_NEIGHBOURS), near, later
     # The neighbours are run one after another: in lanes they would take as long.
     clear, (changes, bounds) = lax.scan(neighbour, jnp.asarray(False), inputs)
-    off = _lengths(start, _DEVIATIONS * jnp.sqrt(_spread(changes)))
+    off = _lengths_by_name(start, _DEVIATIONS * jnp.sqrt(_variance_over_neighbours(changes)))
     off = {name: jnp.where(clear, bounds[name][0], off[name]) for name in off}
 
     def known(part: Array) -> Array:
@@ -269,37 +298,49 @@ def _with_round_off(
     return Error(ts, steps, off, sizes)
 
 
-def _cheaper_run(
+def _run_at_larger_tolerance(
     setup: Any, start: Any, ts: Array, ys: Any, count: Array, search: Any
 ) -> tuple[Any, Any, Any]:
-    """Return three things: a set-up that takes fewer steps, its states, and a factor for round-off.
+    """Return a run at a larger tolerance, by which the round-off of a given run can be measured.
 
-    The round-off of the given set-up, which took `count` steps, is the round-off of the new set-up
-    times the factor. The factor is the fourth root of `count` over the number of new steps: the
+    **Returns** three things: the set-up of the run at the larger tolerance, which takes fewer
+    steps; its states; and a factor. The round-off of the given run is the round-off of the new run
+    times the factor, which is the fourth root of the quotient of the two numbers of steps: the
     round-off of n steps adds up to about √n times that of one step, while the effect of the last
     digits of the inputs does not depend on n. Both grow along the motion in the same way at any
-    tolerance at which the states stay near `ys`. `search` holds two runs at larger tolerances, one
-    of which serves; without it a run is made. A run in float32 takes few steps anyway; its set-up
-    and states `ys` are returned unchanged, with the factor 1.
+    tolerance at which the states stay near `ys`. A run in float32
+    takes few steps anyway: its set-up and states are returned unchanged, with the factor 1, and so
+    are those of a run in closed form or without `ReplayAdjoint`.
+
+    **Arguments:**
+
+    - `setup`: the body, the torque, the solver and the tolerances of the given run.
+    - `start`: the state at the start of the run.
+    - `ts`, `ys`: the saved times (T,), s, and the states of the given run at these times.
+    - `count`: the number of steps of the given run.
+    - `search`: two runs at larger tolerances, one of which serves; with `None` a run is made.
     """
     replayed = isinstance(setup, DiffraxRun) and setup.is_replayed
     if not replayed or ts.dtype == jnp.float32:
         return setup, ys, 1.0
-    sizes = _sizes(ys)
-    unreached = jnp.isnan(_largest(_distances(ys, ys), sizes))
+    sizes = _scales_by_name(ys)
+    unreached = jnp.isnan(_largest_relative_distance(_distances_of_states(ys, ys), sizes))
 
     def is_near(run: TriedRun) -> Array:
-        return jnp.all((_largest(_distances(run.ys, ys), sizes) <= _NEAR) | unreached)
+        return jnp.all(
+            (_largest_relative_distance(_distances_of_states(run.ys, ys), sizes) <= _NEAR)
+            | unreached
+        )
 
     def closer(run: TriedRun) -> TriedRun:
-        return _tried(setup, start, ts, jnp.maximum(_FARTHEST * run.rtol, setup.rtol))
+        return _run_at_tolerance(setup, start, ts, jnp.maximum(_FARTHEST * run.rtol, setup.rtol))
 
     if search is None:
         loosest = jnp.maximum(setup.rtol, jnp.minimum(jnp.sqrt(setup.rtol), _LOOSE)) / _FARTHEST
         run = lax.while_loop(
             lambda run: ~(is_near(run) | (run.rtol <= setup.rtol)),
             closer,
-            _nothing_tried(setup, start, ts, loosest),
+            _run_without_steps(setup, start, ts, loosest),
         )
     else:
         near = is_near(search[0])
@@ -309,15 +350,24 @@ def _cheaper_run(
     return setup, run.ys, (jnp.maximum(count / fewer, 1.0) ** 0.25).astype(ts.dtype)
 
 
-def _tried(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) -> TriedRun:
-    """Return the run of a set-up at the tolerance `rtol`."""
+def _run_at_tolerance(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) -> TriedRun:
+    """Run a set-up at the relative tolerance `rtol`, and return the run with this tolerance.
+
+    `setup` holds the body, the torque and the solver, `state0` is the state at the time `ts[0]`,
+    and `ts` (T,), s, are the times at which states are saved.
+    """
     rtol = jnp.asarray(rtol, ts.dtype)
     return TriedRun(rtol, *solve(_with_tolerance(setup, rtol), state0, ts))
 
 
-def _nothing_tried(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) -> TriedRun:
-    """Return a run in the shapes of `_tried` that took no step: its states are NaN."""
-    run = eqx.filter_eval_shape(_tried, setup, state0, ts, rtol)
+def _run_without_steps(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) -> TriedRun:
+    """Return a `TriedRun` that stands for no run: no step was taken, and its states are NaN.
+
+    Its arrays have the shapes and dtypes of a run of the set-up `setup` from the state `state0`,
+    saved at the times `ts` (T,), s. A loop over runs can therefore begin with it. `rtol` is stored
+    as its tolerance.
+    """
+    run = eqx.filter_eval_shape(_run_at_tolerance, setup, state0, ts, rtol)
 
     def empty(leaf: Any) -> Array:
         inexact = jnp.issubdtype(leaf.dtype, jnp.inexact)
@@ -326,24 +376,43 @@ def _nothing_tried(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) -> Tr
     return jax.tree.map(empty, run)._replace(rtol=jnp.asarray(rtol, ts.dtype))
 
 
-def _distances(others: Any, ys: Any) -> dict[str, Array]:
-    """Return the distances of the states `ys` from the states `others`, one array (T,) by name."""
-    return _lengths(jax.tree.map(lambda leaf: leaf[0], ys), jax.vmap(minus)(others, ys))
+def _distances_of_states(others: Any, ys: Any) -> dict[str, Array]:
+    """Return how far the states of two runs are apart, at each of the T saved times.
+
+    `others` and `ys` are the states of the two runs, with a leading time axis. **Returns** a dict
+    with one array (T,) for each array of a state, by its name (`q`, `omega`, …): for a quaternion
+    the angle of the turn from one state to the other, rad, else the length of the difference.
+    """
+    return _lengths_by_name(jax.tree.map(lambda leaf: leaf[0], ys), jax.vmap(minus)(others, ys))
 
 
-def _lengths(state: Any, changes: Array) -> dict[str, Array]:
-    """Return the length of each array (`q`, `omega`, …) in the `changes` of a `state`, by name."""
+def _lengths_by_name(state: Any, changes: Array) -> dict[str, Array]:
+    """Return the length of the change of each array of a state, by the name of the array.
+
+    `changes` (…, n) are the n numbers of changes of the `state` on its tangent space, in which a
+    quaternion changes by a rotation vector, rad. **Returns** a dict with an array (…,) for each
+    name, such as `q` or `omega`.
+    """
     named = parts_by_name(state, changes).items()
     return {name.removeprefix("motion."): jnp.linalg.norm(part, axis=-1) for name, part in named}
 
 
 def largest_in_run(leaf: Array) -> Array:
-    """Return the largest length of an array (T, …) of states, over the times that a run reached."""
+    """Return the largest length that one array of the states of a run has at its T saved times.
+
+    `leaf` (T, …) is the array with a leading time axis. Times that the run did not reach, where the
+    array is NaN, are left out.
+    """
     return jnp.nanmax(jnp.linalg.norm(leaf.reshape(leaf.shape[0], -1), axis=-1))
 
 
-def _sizes(ys: Any) -> dict[str, Array]:
-    """Return the scale of each name: 1 rad for a quaternion, else the largest length in the run."""
+def _scales_by_name(ys: Any) -> dict[str, Array]:
+    """Return the scale by which an error of each array of a state is divided.
+
+    `ys` are the states of a run, with a leading time axis. **Returns** a dict by the names of the
+    arrays (`q`, `omega`, …): 1 rad for a quaternion, else the largest length of the array in the
+    run.
+    """
     sizes = {}
     for name, leaf in zip(names(ys), jax.tree.leaves(ys), strict=True):
         name = name.removeprefix("motion.")
@@ -352,9 +421,14 @@ def _sizes(ys: Any) -> dict[str, Array]:
     return sizes
 
 
-def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
-    """Return the largest of the distances `apart` over all names, each divided by its scale."""
-    return jnp.max(jnp.stack([apart[name] / sizes[name] for name in apart]), 0)
+def _largest_relative_distance(distances: dict[str, Array], sizes: dict[str, Array]) -> Array:
+    """Return the largest relative distance of two states, at each of T times.
+
+    `distances` has one array (T,) for each array of a state, by its name (`q`, `omega`, …); `sizes`
+    has the scale by which the distances of this name are divided. **Returns** an array (T,): the
+    largest quotient over all names.
+    """
+    return jnp.max(jnp.stack([distances[name] / sizes[name] for name in distances]), 0)
 
 
 @eqx.filter_jit
@@ -364,9 +438,18 @@ def solve_to(
     """Find a tolerance at which the global error of a run is below `accuracy`, if there is one.
 
     Runs are tried at smaller and smaller tolerances. The error of each run is estimated by its
-    distance from the run before, and scaled in proportion to the tolerance. **Returns** three
-    things: the set-up at the tolerance found; the results of `solve` for this set-up; and two of
-    the runs that were tried, the first one and the one before the last.
+    distance from the run before, and scaled in proportion to the tolerance.
+
+    **Arguments:**
+
+    - `setup`: the body, the torque and the solver of the run; its tolerances are not used.
+    - `state0`: the state at the time `ts[0]`.
+    - `ts`: (T,) s, the times at which states are saved.
+    - `accuracy`: the wanted error, rad for rotations, else relative to the largest value in the
+      run.
+
+    **Returns** three things: the set-up at the tolerance found; the results of `solve` for this
+    set-up; and two of the runs that were tried, the first one and the one before the last.
     """
     still = _without_derivatives((setup, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
@@ -378,10 +461,14 @@ def solve_to(
         number, first, _, before, rtol, ended = carry
         # In a batch, a body whose search has ended is run with all times equal to the start, and
         # takes no step.
-        new = _tried(cut, still[1], jnp.where(ended, ts[0], ts), rtol)
+        new = _run_at_tolerance(cut, still[1], jnp.where(ended, ts[0], ts), rtol)
         is_first = number == 0
         count, counted = new.steps.astype(ts.dtype), before.steps.astype(ts.dtype)
-        off = jnp.nanmax(_largest(_distances(before.ys, new.ys), _sizes(new.ys))[1:])
+        off = jnp.nanmax(
+            _largest_relative_distance(
+                _distances_of_states(before.ys, new.ys), _scales_by_name(new.ys)
+            )[1:]
+        )
         foreseen = off < _FORESEEN
         off = _ALLOWED * off * rtol / before.rtol
         # In two cases the error of a run does not predict the error of the next run: if the error
@@ -396,27 +483,35 @@ def solve_to(
         following = jnp.maximum(jnp.where(is_first, second, wanted), floor)
         # A run that reached none of the times will reach none at a smaller tolerance either.
         none_reached = ~jnp.any(
-            jnp.isfinite(_largest(_distances(new.ys, new.ys), _sizes(new.ys)))[1:]
+            jnp.isfinite(
+                _largest_relative_distance(
+                    _distances_of_states(new.ys, new.ys), _scales_by_name(new.ys)
+                )
+            )[1:]
         )
         found = ~is_first & ((sound & (off <= still[3])) | (rtol <= floor))
         first = jax.tree.map(lambda a, b: jnp.where(is_first, a, b), new, first)
         return number + 1, first, before, new, following, found | none_reached
 
-    begun = _nothing_tried(cut, still[1], ts, first_rtol)
+    begun = _run_without_steps(cut, still[1], ts, first_rtol)
     carry = (0, begun, begun, begun, first_rtol, jnp.asarray(False))
     _, first, before, new, *_ = lax.while_loop(lambda carry: ~carry[-1], closer, carry)
     setup = dataclasses.replace(_with_tolerance(setup, lax.stop_gradient(new.rtol)), cuts=sudden)
-    run = _as_solved(setup, state0, ts, new.ys), new.stats, new.result
+    run = _with_derivatives_of_solve(setup, state0, ts, new.ys), new.stats, new.result
     return setup, run, (first, before)
 
 
 @eqx.filter_custom_jvp
-def _as_solved(setup: DiffraxRun, state0: Any, ts: Array, ys: Any) -> Any:
-    """Return the states `ys`, known from `solve`; only their derivatives call `solve` once more."""
+def _with_derivatives_of_solve(setup: DiffraxRun, state0: Any, ts: Array, ys: Any) -> Any:
+    """Return the known states `ys` of a run, with the derivatives that `solve` would give them.
+
+    `setup`, `state0` and `ts` are the arguments with which `solve` computed `ys`. Only a derivative
+    runs `solve` once more.
+    """
     return ys
 
 
-@_as_solved.def_jvp
+@_with_derivatives_of_solve.def_jvp
 def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     states = lambda *args: solve(*args)[0]  # noqa: E731
     ys, along = eqx.filter_jvp(states, primals[:3], tangents[:3])
@@ -424,18 +519,32 @@ def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
 
 
 def _with_tolerance(setup: DiffraxRun, rtol: Any) -> DiffraxRun:
-    """Return the set-up with the given `rtol`, and with an `atol` of 1e-3 times `rtol`."""
+    """Return the set-up of a run with another relative tolerance `rtol`.
+
+    The absolute tolerance becomes 1e-3 times `rtol`, and a run of the new set-up raises no error
+    if it fails.
+    """
     return dataclasses.replace(setup, rtol=rtol, atol=_SMALL * rtol, throw=False)
 
 
 def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
-    """Return one time for each part of a run: that of a sudden change of the law, or the start.
+    """Return times at which the torque changes suddenly, so that a run may miss a short pulse.
 
-    A run does not notice a pulse that is shorter than a step and that no stage hits. The law is
-    therefore sampled in time, at one saved state for each part of the run. A sample is sudden if
-    its distance from the chord between its two neighbours is far greater than such distances
-    elsewhere in the part. The start of the run is returned for a part without a sudden sample. If
-    the law does not depend on the time except by tables, no times are returned.
+    A run does not notice a pulse that is shorter than a step and that no stage of a step hits. The
+    time of the run is therefore divided into 32 equal parts, and in each part the torque is
+    sampled at 512 times, with the state held fixed at a saved state of the part. A sample is sudden
+    if its distance from the chord between its two neighbours is far greater than such distances
+    elsewhere in the part.
+
+    **Arguments:**
+
+    - `setup`: the body, the torque and the solver of the run.
+    - `ts`, `ys`: the saved times, s, and the states at these times, with a leading time axis. The
+      states may be fewer: then the last of them stands for all later times.
+
+    **Returns** (32,) s: for each part the time of its most sudden sample, or the start of the run
+    if no sample is sudden. If the torque does not depend on the time except by tables, the array
+    has no times.
     """
     state0 = jax.tree.map(lambda leaf: leaf[0], ys)
     # Steps end at each row of a table, between which the table is a straight line.
@@ -472,11 +581,19 @@ def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
     return lax.stop_gradient(lax.map(sudden, (times, saved)))
 
 
-def _closer_run(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
-    """Return three things: the set-up of a more accurate run, the given tolerance, and a factor.
+def _more_accurate_run(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
+    """Return the set-up of a more accurate run, by which the error of a given run is measured.
 
-    The error of the given run is its distance to the more accurate run times the factor. Steps of
-    the more accurate run also end at the `sudden` times.
+    **Arguments:**
+
+    - `setup`: the body, the torque, the solver and the tolerances (or the fixed step) of the given
+      run.
+    - `ts`: (T,) s, the times of its saved states.
+    - `sudden`: (m,) s, times at which steps of the more accurate run end, besides others.
+
+    **Returns** three things: the set-up of the more accurate run; the relative tolerance of the
+    given run, 0 under fixed steps; and a factor. The error of the given run is its distance to the
+    more accurate run times the factor.
     """
     eps = float(jnp.finfo(ts.dtype).eps)
     most = None if setup.max_steps is None else 4 * setup.max_steps
@@ -620,10 +737,14 @@ def error_of(
 
         def neighbours() -> Any:
             rng = np.random.default_rng(0)
-            near = jax.tree.map(lambda leaf: _nudged(leaf, rng, difference.size_of(leaf)), x)
+            near = jax.tree.map(
+                lambda leaf: _copies_changed_in_last_digit(leaf, rng, difference.size_of(leaf)), x
+            )
             others = jax.vmap(both, (0, None))(near, first)
             changes = jax.tree.map(lambda a, b: a - b[None], others, answer)
-            return jax.tree.map(lambda a: _DEVIATIONS * jnp.sqrt(_spread(a)), changes)
+            return jax.tree.map(
+                lambda a: _DEVIATIONS * jnp.sqrt(_variance_over_neighbours(a)), changes
+            )
 
         off = lax.cond(clear, lambda: jax.tree.map(jnp.zeros_like, answer), neighbours)
         (value, derivative), whole = answer, jax.tree.map(jnp.hypot, steps, off)
@@ -639,17 +760,31 @@ def error_of(
     return dataclasses.replace(error, derivative_error=derivative_error)
 
 
-def _spread(changes: Array) -> Array:
-    """Return the variance over a run and its neighbours, which differ from the run by `changes`."""
+def _variance_over_neighbours(changes: Array) -> Array:
+    """Return the variance of each number over a run and its neighbouring runs.
+
+    The neighbours are runs with slightly changed inputs. `changes` (m, …) are the differences of
+    their results from the result of the run, one row for each of the m neighbours; the run itself
+    counts as one more, with the difference 0. **Returns** an array (…) without the first axis.
+    """
     mean = jnp.sum(changes, 0, keepdims=True) / (_NEIGHBOURS + 1)
     return (jnp.sum((changes - mean) ** 2, 0) + mean[0] ** 2) / _NEIGHBOURS
 
 
-def _nudged(leaf: Array, rng: np.random.Generator, size: Array) -> Array:
-    """Return copies of the array `leaf`, one for each neighbouring run, changed in the last digit.
+def _copies_changed_in_last_digit(leaf: Array, rng: np.random.Generator, size: Array) -> Array:
+    """Return three copies of an array, each changed at random by about a unit in the last digit.
 
-    Each number is changed by half to one unit in the last digit of its `size`, up or down. The
-    change of a square matrix is symmetric, so that a symmetric matrix stays symmetric.
+    A run from each copy shows how far rounding errors grow. Each number is changed, up or down, by
+    half to one unit in the last digit of its size. The change of a square matrix is symmetric, so
+    that a symmetric matrix stays symmetric.
+
+    **Arguments:**
+
+    - `leaf`: (…) the array.
+    - `rng`: the generator of the random changes.
+    - `size`: (…) the positive number whose last digit is meant, for each number of `leaf`.
+
+    **Returns** an array (3, …): the copies along a new first axis.
     """
     shape = (_NEIGHBOURS + 1) // 2, *leaf.shape
     # The change is at least half a unit, because a smaller change would often be rounded away.

@@ -44,11 +44,13 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
 def direction_and_length(
     terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike
 ) -> tuple[Array, Array]:
-    """Return the direction of a step, 1 or −1, and its length.
+    """Return the direction of a step of diffrax, 1 or −1, and its length, s.
 
-    In a run backwards in time diffrax uses −t as the time, so that `t1` > `t0` in both directions;
-    only the control `contr(t0, t1)` of the term is negative. A step backwards is therefore computed
-    as a step forwards from `t0` to `t1` with slopes of the opposite sign.
+    `terms` is the `diffrax.ODETerm` of the vector field, and `t0` and `t1` are the times of diffrax
+    at which the step begins and ends. In a run backwards in time diffrax uses −t as the time, so
+    that `t1` > `t0` in both directions; only the control `contr(t0, t1)` of the term is negative. A
+    step backwards is therefore computed as a step forwards from `t0` to `t1` with slopes of the
+    opposite sign.
     """
     h = jnp.asarray(terms.contr(t0, t1))
     way = jnp.where(h < 0, -jnp.ones_like(h), jnp.ones_like(h))
@@ -56,10 +58,11 @@ def direction_and_length(
 
 
 def cubic_rows(rise: Any, h: Any, left: Any, right: Any) -> tuple[Any, Any, Any]:
-    """Return the rows F0, F1 and F2 of `runge_kutta.nested` for a cubic.
+    """Return the three coefficients of a cubic polynomial that interpolates within a step.
 
-    The cubic changes by `rise` over a step of the length `h`; its slopes at the start and the end
-    of the step are `left` and `right`.
+    They are the rows F0, F1 and F2 of `runge_kutta.nested`. The cubic changes by `rise` over the
+    step, whose length is `h`, s; its slopes at the start and the end of the step are `left` and
+    `right`. All but `h` are arrays of the shape of a state, or of one array of it.
     """
     return rise, h * left - rise, 2 * rise - h * (left + right)
 

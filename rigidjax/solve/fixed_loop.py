@@ -75,27 +75,40 @@ def fixed(
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y0, later)
 
 
-def first_rows(many: Any, one: Callable[..., Any], y: Any, rows: Any) -> Any:
-    """Return `rows` with the first `many` rows replaced by those that `one` returns.
+def first_rows(count: Any, row_of: Callable[..., Any], y: Any, rows: Any) -> Any:
+    """Compute the first rows of a table in a loop, and return the table.
 
-    `one(y, i) → (y, row)` takes the state `y` before row number `i`. `many` may be traced.
+    **Arguments:**
+
+    - `count`: the number of rows to compute; it may be traced.
+    - `row_of`: a function `(y, i) → (y, row)`, which takes the carried value `y` before row number
+      `i` and returns the next carried value and this row.
+    - `y`: the carried value at the start.
+    - `rows`: the table, a tree of arrays whose first axis is the rows; later rows stay as they are.
     """
 
     def put(i: Array, now: tuple[Any, Any]) -> tuple[Any, Any]:
-        y, row = one(now[0], i)
+        y, row = row_of(now[0], i)
         return y, jax.tree.map(lambda all_, mine: all_.at[i].set(mine), now[1], row)
 
     zero = jnp.zeros((), jnp.int32)
-    return lax.fori_loop(zero, jnp.asarray(many, jnp.int32), put, (y, rows))[1]
+    return lax.fori_loop(zero, jnp.asarray(count, jnp.int32), put, (y, rows))[1]
 
 
 def step(
     stepper: AnyStepper, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None, before: int = 0
 ) -> Any:
-    """Return the state after step number `i` since the time `t0`; `y` is the state before the step.
+    """Take one of a sequence of equal steps, and return the numbers of the state after it.
 
-    `h` is the length of each step, s. `inputs` has one array for each named input of the torque;
-    the step uses row `before + i` of each array.
+    **Arguments:**
+
+    - `stepper`: what takes a step of one body.
+    - `h`: the length of each step, s.
+    - `t0`: the time at which step number 0 begins, s.
+    - `i`: the number of the step.
+    - `y`: the numbers that stand for the state before the step, as the stepper carries them.
+    - `inputs`: `None`, or an array for each named input of the torque, with one row for each step.
+    - `before`: the step uses row `before + i` of each array of `inputs`.
     """
 
     def at(i: Array) -> Array:
@@ -103,7 +116,7 @@ def step(
         # steps to 1e-3 in float32).
         return t0 + i.astype(h.dtype) * h
 
-    now = jax.tree.map(lambda a: _row(a, before + i), inputs)
+    now = jax.tree.map(lambda a: _row_at(a, before + i), inputs)
     if not stepper.delays:
         return stepper.step(at(i), at(i + 1), h, y, now)
     # A delayed input changes inside the step. The step is therefore taken in parts: one up to the
@@ -127,12 +140,20 @@ def step(
 def delayed_rows(
     delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: Any, before: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Return where in step `i` each delayed input changes, and its values before and after.
+    """Return where within a step each delayed input changes, and its values before and after.
+
+    An input of a torque is constant during each step; if it is delayed, it changes within a step.
+
+    **Arguments:**
+
+    - `delays`: the name and the delay, s, of each of the m delayed inputs.
+    - `h`: the length of each step, s.
+    - `i`: the number of the step.
+    - `inputs`: an array for each named input, with one row for each step.
+    - `before`: row `before + i` of an array belongs to step `i`.
 
     **Returns** three things: the places (m,) of the changes, from 0 at the start of the step to 1
     at its end; a list of the m values before the changes; and a list of the m values after them.
-    `delays` has the name and the delay, s, of each of the m delayed inputs; `h`, `inputs` and
-    `before` are as for `step`.
     """
     parts, early, late = [], [], []
     for name, delay in delays:
@@ -140,13 +161,18 @@ def delayed_rows(
         whole = lax.stop_gradient(jnp.floor(steps))
         parts.append(steps - whole)
         last = before + i - whole.astype(jnp.int32)
-        early.append(_row(inputs[name], last - 1))
-        late.append(_row(inputs[name], last))
+        early.append(_row_at(inputs[name], last - 1))
+        late.append(_row_at(inputs[name], last))
     return jnp.stack(parts), early, late
 
 
 def inputs_at_start(law: Any, h: Array, inputs: Any) -> Any:
-    """Return the inputs of the torque `law` at the start of a run, in the form for `bind`."""
+    """Return the values of the inputs of a torque at the start of a run.
+
+    `law` is the torque; `h` is the length of a step, s; `inputs` has an array for each named input,
+    with one row for each step. A delayed input has its value at the start. The result is in the
+    form that `bind` takes, which sets the inputs of a torque.
+    """
     delays = delays_of(law)
     now = jax.tree.map(lambda a: a[0], inputs)
     if not delays:
@@ -156,19 +182,30 @@ def inputs_at_start(law: Any, h: Array, inputs: Any) -> Any:
     return InputRow(now, tuple(values))
 
 
-def _row(a: Array, i: Any) -> Array:
-    """Return row `i` of `a`; for an `i` before the first or after the last row return that row."""
+def _row_at(a: Array, i: Any) -> Array:
+    """Return row `i` of an array `a`, the first axis of which is the rows.
+
+    If `i` lies before the first or after the last row, the first or the last row is returned.
+    """
     return lax.dynamic_index_in_dim(a, jnp.clip(i, 0, a.shape[0] - 1), 0, keepdims=False)
 
 
 def march_steps(
     stepper: AnyStepper, h: Array, t0: Array, first: Array, count: int, y: Any, inputs: Any = None
 ) -> Any:
-    """Return the state after `count` steps, beginning with step number `first` and the state `y`.
+    """Take many equal steps one after another, and return the numbers of the state after them.
 
-    `h`, `t0` and `inputs` are as for `step`. In reverse mode the run is divided into about √count
-    pieces. The states at the starts of all pieces are stored; the states within a piece are stored
-    for one piece at a time.
+    **Arguments:**
+
+    - `stepper`: what takes a step of one body.
+    - `h`: the length of each step, s.
+    - `t0`: the time at which step number 0 begins, s.
+    - `first`, `count`: the number of the first step that is taken, and how many steps are taken.
+    - `y`: the numbers that stand for the state at the start, as the stepper carries them.
+    - `inputs`: `None`, or an array for each named input of the torque, with one row for each step.
+
+    In reverse mode the run is divided into about √count pieces. The states at the starts of all
+    pieces are stored; the states within a piece are stored for one piece at a time.
     """
     if platform() != "cpu":
         return in_pieces(lambda y, i: step(stepper, h, t0, i, y, inputs), first, count, y)

@@ -26,11 +26,20 @@ _ZERO: Any = ad.Zero
 
 
 def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) -> Arrays:
-    """Return `function(*given, *tangents)`, a map linear in `tangents` that has its own transpose.
+    """Call a function that is linear in some of its arguments, with a given transpose.
 
-    `transposed(*given, *bars)` returns the cotangents of `tangents` from `bars`, the cotangents of
-    the results. Neither function may close over tracers. Derivatives with respect to `given` exist
-    in forward mode only.
+    Reverse mode then calls the given transpose and does not transpose the function itself.
+
+    **Arguments:**
+
+    - `function`: a function of the arrays in `given` and those in `tangents`, linear in the latter,
+      which returns a list of arrays.
+    - `transposed`: a function `(*given, *bars)` that returns the list of the cotangents of
+      `tangents`; `bars` are the cotangents of the results.
+    - `given`, `tangents`: lists of arrays.
+
+    **Returns** the list `function(*given, *tangents)`. Neither function may close over tracers.
+    Derivatives with respect to `given` exist in forward mode only.
     """
     outs = jax.eval_shape(lambda g, t: function(*g, *t), given, tangents)
     inputs, results = (
@@ -47,17 +56,18 @@ def as_known(known: Any, moved: Any) -> Any:
     `moved` are the same numbers, computed once more for their derivatives. The values of `moved`
     may be NaN, and so may the derivatives.
     """
-    return jax.tree.map(_known, known, moved)
+    return jax.tree.map(_with_derivatives_of, known, moved)
 
 
 @jax.custom_jvp
-def _known(known: Array, moved: Array) -> Array:
+def _with_derivatives_of(known: Array, moved: Array) -> Array:
+    """Return the array `known` with the derivatives of `moved`, another array of its shape."""
     return batch_as(known, (known, moved))
 
 
-@_known.defjvp
-def _known_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-    return _known(*primals), tangents[1]
+@_with_derivatives_of.defjvp
+def _with_derivatives_of_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
+    return _with_derivatives_of(*primals), tangents[1]
 
 
 def nan_derivatives(tree: Any, inputs: Any) -> Any:
@@ -70,17 +80,21 @@ def nan_derivatives(tree: Any, inputs: Any) -> Any:
     smooth, rest = eqx.partition(tree, eqx.is_inexact_array)
     outs, structure = jax.tree.flatten(smooth)
     anchors = jax.tree.leaves(eqx.filter(inputs, eqx.is_inexact_array))
-    return eqx.combine(structure.unflatten(_with_nan(len(outs), *outs, *anchors)), rest)
+    return eqx.combine(structure.unflatten(_with_nan_derivatives(len(outs), *outs, *anchors)), rest)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _with_nan(count: int, *numbers: Array) -> Arrays:
+def _with_nan_derivatives(count: int, *numbers: Array) -> Arrays:
+    """Return the first `count` of the arrays, with NaN derivatives where they are not finite.
+
+    The other arrays in `numbers` are the inputs with respect to which the derivatives are NaN.
+    """
     return batch_as(list(numbers[:count]), numbers)
 
 
-@_with_nan.defjvp
+@_with_nan_derivatives.defjvp
 def _(count: int, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-    outs = _with_nan(count, *primals)
+    outs = _with_nan_derivatives(count, *primals)
 
     def along(*args: Array) -> Arrays:
         moved = args[count : 2 * count]
@@ -101,19 +115,32 @@ _linear_map.multiple_results = True
 
 
 @_linear_map.def_impl
-def _evaluated(*args: Any, function: Map, **_: Any) -> Arrays:
+def _linear_map_impl(*args: Any, function: Map, **_: Any) -> Arrays:
+    """Return the results of a linear map, a list of arrays: its `function`, called with `args`.
+
+    This is the rule of the JAX primitive `_linear_map` for known arrays.
+    """
     return function(*args)
 
 
 @_linear_map.def_abstract_eval
-def _abstract(*_: Any, results: Any, **__: Any) -> Any:
+def _linear_map_abstract_eval(*_: Any, results: Any, **__: Any) -> Any:
+    """Return the shapes and dtypes of the results of a linear map, as JAX wants them for a trace.
+
+    `results` is a tuple of pairs (shape, dtype), one for each result.
+    """
     return [ShapedArray(*result) for result in results]
 
 
-def _differentiated(
+def _linear_map_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...], **params: Any
 ) -> Any:
-    """Return the results of the primitive and their tangents: its rule for forward mode."""
+    """Return the results of a linear map and the tangents of the results, in forward mode.
+
+    This is the rule of the JAX primitive `_linear_map`. `primals` are the arguments of the map, the
+    arrays that it is linear in after the others; `tangents` are their tangents (`ad.Zero` where
+    there is none). `params` holds the map, its transpose, and the shapes and dtypes of the arrays.
+    """
     number, function = params["number"], params["function"]
     out, parts = _linear_map.bind(*primals, **params), []
     moving = [not isinstance(t, ad.Zero) for t in tangents]
@@ -148,8 +175,14 @@ def refuse(*_: Any) -> Arrays:
     )
 
 
-def _transposed(cotangents: Any, *args: Any, **params: Any) -> Any:
-    """Return the cotangents of the primitive's arguments: its rule for reverse mode."""
+def _linear_map_transpose(cotangents: Any, *args: Any, **params: Any) -> Any:
+    """Return the cotangents of the arguments of a linear map, in reverse mode.
+
+    This is the rule of the JAX primitive `_linear_map`. `cotangents` are those of the results;
+    `args` are the arguments, of which those that the map is linear in are undefined; `params` holds
+    the map, its transpose, and the shapes and dtypes of the arrays. The arguments that the map is
+    not linear in get `None`.
+    """
     number = params["number"]
     given = args[:number]
     if any(ad.is_undefined_primal(g) for g in given):
@@ -163,8 +196,13 @@ def _transposed(cotangents: Any, *args: Any, **params: Any) -> Any:
     return [None] * number + _linear_map.bind(*given, *whole, number=number, **turned)
 
 
-def _batched(args: Any, dims: Any, **params: Any) -> Any:
-    """Return the results of the primitive for a batch, and the batch axes of the results."""
+def _linear_map_batching(args: Any, dims: Any, **params: Any) -> Any:
+    """Return the results of a linear map for a batch, and the batch axes of the results (all 0).
+
+    This is the rule of the JAX primitive `_linear_map` for `jax.vmap`. `args` are the arguments;
+    `dims` has the batch axis of each argument, or `None` for an argument without one; `params`
+    holds the map, its transpose, and the shapes and dtypes of the arrays.
+    """
     number = params["number"]
     size = next(a.shape[d] for a, d in zip(args, dims, strict=True) if d is not None)
     given, own = args[:number], dims[:number]
@@ -185,9 +223,9 @@ def _batched(args: Any, dims: Any, **params: Any) -> Any:
     return _linear_map.bind(*given, *along, number=number, **both), [0] * len(results)
 
 
-ad.primitive_jvps[_linear_map] = _differentiated
-ad.primitive_transposes[_linear_map] = _transposed
-batching.primitive_batchers[_linear_map] = _batched
+ad.primitive_jvps[_linear_map] = _linear_map_jvp
+ad.primitive_transposes[_linear_map] = _linear_map_transpose
+batching.primitive_batchers[_linear_map] = _linear_map_batching
 mlir.register_lowering(
     _linear_map, mlir.lower_fun(lambda *args, function, **_: function(*args), multiple_results=True)
 )

@@ -144,10 +144,10 @@ class Magnus4(dfx.AbstractSolver):
 
 
 def require_attitude(name: str, field: Any, y0: PyTree, instead: str) -> AttitudeEquations:
-    """Return `field` if it is `AttitudeEquations` and the state `y0` an `Attitude`.
+    """Return a vector field after a check that it is that of an attitude (quaternion and rate).
 
-    Else raise `TypeError`. The message says that the solver `name` does not fit, and names the
-    solver `instead` to use.
+    Raise `TypeError` unless `field` is `AttitudeEquations` and the state `y0` is an `Attitude`. The
+    message says that the solver `name` does not fit, and names the solver `instead` to use.
     """
     if isinstance(field, AttitudeEquations) and isinstance(y0, Attitude):
         return field
@@ -158,7 +158,10 @@ def require_attitude(name: str, field: Any, y0: PyTree, instead: str) -> Attitud
 
 
 def require_blind(law: Any) -> None:
-    """Raise `TypeError` unless the law says by `feels` that it does not read the attitude."""
+    """Raise `TypeError` unless a torque says that it does not read the attitude of the body.
+
+    `law` is the torque; it says so by its member `feels`. `None` stands for no torque.
+    """
     if sees_attitude(law):
         raise TypeError(
             f"Magnus4: the torque {type(law).__name__} depends on the attitude, or does not say "

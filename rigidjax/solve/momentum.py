@@ -7,6 +7,7 @@ state of the run has Ω̃ = I₀⁻¹ p in the place of Ω, where I₀ is the in
 suit Ω̃.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -26,15 +27,16 @@ from rigidjax.motion.torques.states import freeze
 from rigidjax.rotation.linalg3 import apply, solve
 
 
-class _Changing(eqx.Module):
-    """Compute the time derivative of a state of the run, in which Ω̃ replaces the body rate Ω.
+class _EquationsUnderChangingInertia(eqx.Module):
+    """Compute the time derivative of the state of a body whose inertia changes with the time.
 
-    It is called with the time and the state in which the body rate is Ω. `body` has the inertia I₀,
-    and `law` gives the inertia I at any time. See the module for Ω̃.
+    It is called with the time t, s, and a state with the body rate Ω. In the derivative the rate is
+    that of Ω̃ = I₀⁻¹ p, rad/s, where p = I(t) Ω is the momentum: unlike Ω it does not jump where the
+    inertia jumps.
     """
 
-    body: Any
-    law: ChangingInertia
+    body: Any  # the body with the inertia I₀, an `Inertia` or `MassProperties`
+    law: ChangingInertia  # gives the inertia I(t) at any time, and the torque
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None) -> Any:
         dtype = y.omega.dtype
@@ -48,59 +50,80 @@ class _Changing(eqx.Module):
 
 
 class ByMomentum(eqx.Module):
-    """Compute the time derivative of a state of the run, and convert between Ω and Ω̃.
+    """Compute the time derivative of a state whose inertia changes, and convert between two rates.
 
-    A state of the run has Ω̃ = I₀⁻¹ p in the place of the body rate Ω (see the module). The method
-    `enter` replaces Ω by Ω̃, and `leave` replaces Ω̃ by Ω.
+    A state of the run has the rate Ω̃ = I₀⁻¹ p in the place of the body rate Ω: p = I(t) Ω is the
+    momentum, I(t) the inertia at the time t, and I₀ the inertia of the body that `simulate` was
+    given. The method `enter` replaces Ω by Ω̃, and `leave` replaces Ω̃ by Ω.
     """
 
-    field: Any  # a `_Changing`, or the `CoupledEquations` of one
+    field: Any  # a `_EquationsUnderChangingInertia`, or the `CoupledEquations` of one
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None) -> Any:
         return self.field(t, self.leave(t, y))
 
     def enter(self, t: Any, y: Any) -> Any:
-        """Return the state `y` at the time `t`, s, with the body rate Ω replaced by Ω̃."""
+        """Return the state `y` with its body rate Ω replaced by I₀⁻¹ I(t) Ω, a form of momentum.
+
+        I(t) is the inertia at the time `t`, s, and I₀ that of the body that `simulate` was given.
+        """
         return self._with_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
 
     def leave(self, t: Any, y: Any) -> Any:
-        """Return the state `y` of the run at the time `t`, s, with Ω̃ replaced by Ω."""
+        """Return the state `y` of the run with body rates: the inverse of `enter`.
+
+        Its rate w becomes Ω = I(t)⁻¹ I₀ w, where I(t) is the inertia at the time `t`, s, and I₀
+        that of the body that `simulate` was given.
+        """
         return self._with_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
 
-    def _with_rate(self, y: Any, rate: Any, t: Any) -> Any:
-        """Return the state `y` with its rate w, rad/s, replaced by `rate(I(t), I₀, w)`."""
+    def _with_rate(self, y: Any, new_rate: Callable[..., Array], t: Any) -> Any:
+        """Return the state `y` with its body rate, rad/s, replaced by another one.
+
+        `new_rate(I, I₀, w)` computes the new rate from three arrays: the inertia (3, 3) at the time
+        `t`, s; the inertia (3, 3) of the body that `simulate` was given; and the rate w (3,) of
+        `y`.
+        """
         motion, own = motion_of(y), y.own if isinstance(y, Coupled) else ()
         dtype = motion.omega.dtype
         inner: Any = self.field.field if isinstance(self.field, CoupledEquations) else self.field
         now = freeze(inner.law, own).tensor(jnp.asarray(t, dtype)) if own else inner.law.tensor(t)
         fixed = tensor_of(inner.body).astype(dtype)
-        omega = rate(now.astype(dtype), fixed, motion.omega)
+        omega = new_rate(now.astype(dtype), fixed, motion.omega)
         return eqx.tree_at(lambda s: motion_of(s).omega, y, omega)
 
 
 def by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
-    """Return the equations by momentum if the inertia is a function of time, else `None`.
+    """Return the equations of motion by momentum if the inertia is a function of time, else `None`.
 
-    `state0` is the state at the start, with the body rate; `torque` is that of `simulate`.
+    `body` and `torque` are those of `simulate`; `state0` is the state at the start, with the body
+    rate. In these equations a multiple of the momentum stands in the place of the body rate, so
+    that nothing jumps where the inertia jumps.
     """
     if not isinstance(law := momentum_changes(torque), ChangingInertia) or hasattr(
         law.inertia, "feels"
     ):
         return None
-    field: Any = _Changing(body, law)
+    field: Any = _EquationsUnderChangingInertia(body, law)
     return ByMomentum(CoupledEquations(field, body) if isinstance(state0, Coupled) else field)
 
 
 def momentum_changes(torque: Any) -> ChangingInertia | None:
-    """Return the `ChangingInertia` that is the whole of a torque, or `None` if there is none."""
+    """Return the law by which the inertia of a body changes with the time, or `None` if none does.
+
+    It is the `ChangingInertia` of which the `torque` of `simulate` consists; a `Sum` of this law
+    alone counts, too.
+    """
     # The argument may also be a scene of particles or `None`, which are no torques.
     parts = parts_of(torque) if isinstance(torque, ChangingInertia | Sum) else ()
     return parts[0] if len(parts) == 1 and isinstance(parts[0], ChangingInertia) else None
 
 
 def with_body_rates(form: ByMomentum | None, ts: Array, ys: Any) -> Any:
-    """Return the states `ys` of a run, saved at the times `ts` (T,), s, with their body rates.
+    """Return the states of a run with body rates, where the run may have used the momentum.
 
-    `form` holds the equations of the run; it is `None` if the states already have the body rate.
+    `ts` (T,), s, are the saved times, and `ys` the states at these times, with a leading time axis.
+    `form` holds the equations by momentum of the run; if it is `None`, the states already have the
+    body rate.
     """
     return ys if form is None else jax.vmap(form.leave)(ts, ys)

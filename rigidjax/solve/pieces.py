@@ -42,63 +42,73 @@ def piece_length(count: int) -> int:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Program:
-    """Run `count` steps of a program forward and backward.
+class _StepsInPieces:
+    """Run many equal steps of a function in forward direction, and in reverse mode.
 
-    `call(constants, y, i)` returns the state after step number `i`, which begins with the state
-    `y`. Constants and states are lists of arrays. In forward direction `turn` steps are in one
-    iteration of the loop.
+    The steps are divided into pieces of about √count steps. Constants and states are lists of
+    arrays.
     """
 
+    # call(constants, y, i) → the state after step number i, which begins with the state y.
     call: Callable[[Arrays, Arrays, Array], Arrays]
-    count: int
-    turn: int
+    count: int  # the number of steps
+    turn: int  # the number of steps in one iteration of the loop in forward direction
 
-    def some(
-        self, constants: Arrays, y: Arrays, first: Array, many: int, keep: bool = False
+    def take_steps(
+        self, constants: Arrays, y: Arrays, first: Array, number: int, keep: bool = False
     ) -> tuple[Arrays, Any]:
-        """Return the state after `many` steps, which begin with step number `first` and the state
-        `y`.
+        """Take `number` steps, which begin with step number `first` and the state `y`.
 
-        A second result is returned with it: the states at the starts of these steps if `keep` is
-        true, else `None`.
+        `constants` are the arrays that the function of a step holds. **Returns** two things: the
+        state after the steps; and the states at the starts of these steps, along a new first axis,
+        if `keep` is true, else `None`.
         """
 
         def one(y: Arrays, i: Array) -> tuple[Arrays, Any]:
             return self.call(constants, y, i), y if keep else None
 
-        return lax.scan(one, y, first + jnp.arange(many, dtype=jnp.int32), unroll=self.turn)
+        return lax.scan(one, y, first + jnp.arange(number, dtype=jnp.int32), unroll=self.turn)
 
     def forward(self, constants: Arrays, first: Array, y: Arrays) -> tuple[Arrays, Any]:
-        """Return the state after all steps from `y`, and the states that `back` needs.
+        """Take all steps from the state `y`, beginning with step number `first`.
 
-        The states for `back` are a pair: the states at the starts of the pieces, in rows; and the
-        state at the start of the remaining steps after the last piece.
+        `constants` are the arrays that the function of a step holds. **Returns** two things: the
+        state at the end; and the states that `back` needs, a pair of the states at the starts of
+        the pieces (along a new first axis) and of the state at the start of the remaining steps
+        after the last piece.
         """
         firsts, length, left = self.pieces(first)
 
         def piece(y: Arrays, begin: Array) -> tuple[Arrays, Arrays]:
-            return self.some(constants, y, begin, length)[0], y
+            return self.take_steps(constants, y, begin, length)[0], y
 
         end, starts = lax.scan(piece, y, firsts)
         last = end
         if left:
-            end, _ = self.some(constants, end, first + self.count - left, left)
+            end, _ = self.take_steps(constants, end, first + self.count - left, left)
         return end, (starts, last)
 
     def back(
         self, constants: Arrays, moving: Sequence[bool], first: Array, starts: Any, bar: Arrays
     ) -> tuple[Arrays, Arrays]:
-        """Return the cotangents of the constants with derivatives, and of the state at the start.
+        """Run all steps in reverse mode, and return the cotangents of constants and start.
 
-        `moving` has one truth value for each constant: whether it has a derivative. `starts` are
-        the states that `forward` returned, and `bar` is the cotangent of the state at the end.
+        **Arguments:**
+
+        - `constants`: the arrays that the function of a step holds.
+        - `moving`: for each constant, whether it has a derivative.
+        - `first`: the number of the first step.
+        - `starts`: the states that `forward` returned for this function.
+        - `bar`: the cotangent of the state at the end.
+
+        **Returns** two lists: the cotangents of the constants with a derivative, and the cotangent
+        of the state at the start.
         """
         firsts, length, left = self.pieces(first)
         chosen = [c for c, m in zip(constants, moving, strict=True) if m]
 
         def step_of(i: Array) -> Callable[[Arrays, Arrays], Arrays]:
-            return lambda some, y: self.call(_with(constants, moving, some), y, i)
+            return lambda some, y: self.call(_replace_selected(constants, moving, some), y, i)
 
         def one(sums: tuple[Arrays, Arrays], at: tuple[Arrays, Array]) -> tuple[Any, None]:
             (total, bar), (y, i) = sums, at
@@ -106,7 +116,7 @@ class _Program:
             return ([a + b for a, b in zip(total, more, strict=True)], bar), None
 
         def piece(sums: tuple[Arrays, Arrays], y: Arrays, begin: Array, many: int) -> Any:
-            _, states = self.some(constants, y, begin, many, keep=True)
+            _, states = self.take_steps(constants, y, begin, many, keep=True)
             steps = begin + jnp.arange(many, dtype=jnp.int32)
             return lax.scan(one, sums, (states, steps), reverse=True)[0]
 
@@ -122,10 +132,10 @@ class _Program:
         return lax.scan(whole, sums, (rows, firsts), reverse=True)[0]
 
     def pieces(self, first: Array) -> tuple[Array, int, int]:
-        """Return how the steps are divided into pieces.
+        """Return how the steps, the first of which has the number `first`, are divided into pieces.
 
-        **Returns** three things: the index of the first step of each piece; the number of steps in
-        a piece; and the number of steps that remain after the last piece.
+        **Returns** three things: the number of the first step of each piece, an array; how many
+        steps are in a piece; and how many steps remain after the last piece.
         """
         length = piece_length(self.count)
         many, left = divmod(self.count, length)
@@ -133,7 +143,10 @@ class _Program:
 
 
 def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: Any) -> Any:
-    """Return the state after `count` steps `y = step(y, i)`, beginning with i = `first`.
+    """Take many equal steps on a GPU, several in one kernel, and return the state after them.
+
+    `step(y, i)` returns the state after step number i, which begins with the state `y`. The first
+    of the `count` steps has the number `first`; `y` is the state before it.
 
     In reverse mode the run is divided into about √count pieces. The states at the starts of all
     pieces are stored; the states within a piece are stored for one piece at a time. Second
@@ -145,7 +158,7 @@ def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: An
     # The number of steps in an iteration is a power of two, because the length of a piece is often
     # a multiple of a power of two.
     turn = 1 << (turn.bit_length() - 1)
-    program, constants = _Program(one.call, count, turn), one.constants
+    program, constants = _StepsInPieces(one.call, count, turn), one.constants
     number = len(constants)
     smooth = [*[eqx.is_inexact_array(c) for c in constants], False, *[True for _ in start]]
 
@@ -167,7 +180,7 @@ def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: An
 
         def push(*args: Array) -> Arrays:
             given = list(args[:size])
-            of = lambda *some: end(_with(given, moving, some))  # noqa: E731
+            of = lambda *some: end(_replace_selected(given, moving, some))  # noqa: E731
             at = [g for g, m in zip(given, moving, strict=True) if m]
             return jax.jvp(of, at, list(args[size + len(rows) :]))[1]
 
@@ -185,7 +198,13 @@ def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: An
     return tree.unflatten(run(*constants, first, *start))
 
 
-def _with(all_: Sequence[Any], which: Sequence[bool], some: Sequence[Any]) -> list[Any]:
-    """Return the list `all_` with the arrays that `which` selects replaced by `some`, in order."""
-    rest = iter(some)
-    return [next(rest) if w else a for a, w in zip(all_, which, strict=True)]
+def _replace_selected(
+    arrays: Sequence[Any], selected: Sequence[bool], replacements: Sequence[Any]
+) -> list[Any]:
+    """Return a copy of a list in which some arrays are replaced.
+
+    `selected` has a truth value for each array of the list `arrays`: whether it is replaced.
+    `replacements` are the new arrays, in order, one for each true value.
+    """
+    rest = iter(replacements)
+    return [next(rest) if new else a for a, new in zip(arrays, selected, strict=True)]

@@ -27,19 +27,21 @@ class GroupInterpolation(dfx.AbstractLocalInterpolation):
         return jtu.tree_map(lambda a, b: a - b, end, start)
 
 
-class _Build(eqx.Module):
-    """Make a `GroupInterpolation` from the dense information of a solver's step.
+class _MakeGroupInterpolation(eqx.Module):
+    """Make the object that interpolates within a step, and keeps the quaternion a unit quaternion.
 
-    `inner_cls` is the class of the solver's own interpolation.
+    Diffrax calls it with the times `t0` and `t1` at which the step begins and ends, and with what
+    the solver has stored for dense output; it returns a `GroupInterpolation`.
     """
 
-    inner_cls: Any = eqx.field(static=True)
+    inner_cls: Any = eqx.field(static=True)  # the class of the solver's own interpolation
 
     def __call__(self, *, t0: RealLike, t1: RealLike, **dense_info: Any) -> GroupInterpolation:
         return GroupInterpolation(t0, t1, self.inner_cls(t0=t0, t1=t1, **dense_info))
 
 
-def _of(part: str, name: str) -> Any:
+def _attribute_of_member(part: str, name: str) -> Any:
+    """Define a property that reads the attribute `name` of the member `part` of an object."""
     return property(lambda self: getattr(getattr(self, part), name))
 
 
@@ -63,17 +65,17 @@ class Projected(dfx.AbstractWrappedSolver):
     def __check_init__(self) -> None:
         _checks.require_instance(self.solver, dfx.AbstractSolver, "solver")
 
-    term_structure = _of("solver", "term_structure")
-    term_compatible_contr_kwargs = _of("solver", "term_compatible_contr_kwargs")
+    term_structure = _attribute_of_member("solver", "term_structure")
+    term_compatible_contr_kwargs = _attribute_of_member("solver", "term_compatible_contr_kwargs")
     # Adjoints of diffrax set `scan_kind` on a Runge–Kutta method, and controllers set the members
     # of the root finder on an implicit method; they look for these members on this wrapper.
-    scan_kind = _of("solver", "scan_kind")
-    root_finder = _of("solver", "root_finder")
-    root_find_max_steps = _of("solver", "root_find_max_steps")
+    scan_kind = _attribute_of_member("solver", "scan_kind")
+    root_finder = _attribute_of_member("solver", "root_finder")
+    root_find_max_steps = _attribute_of_member("solver", "root_find_max_steps")
 
     @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _Build(self.solver.interpolation_cls)
+        return _MakeGroupInterpolation(self.solver.interpolation_cls)
 
     def order(self, terms: PyTree[dfx.AbstractTerm]) -> int | None:
         return self.solver.order(terms)

@@ -24,12 +24,13 @@ SMOOTH = len(Smooth._fields)
 def states_of_run(
     method: Method, smooth: list[bool], constants: Arrays, state: Any, run: Run
 ) -> tuple[Array, LoopState]:
-    """Return the states at the saved times (K, n), and the state of the loop at the end of the run.
+    """Run one body, with derivatives that repeat the recorded steps of the run.
 
-    The saved times are the K times `run.between`. A state has n numbers; at a time that the run did
-    not reach they are NaN. The states have derivatives with respect to two kinds of inputs: the
-    constants that `smooth` selects, and the fields of the run that `adjoint.Smooth` lists. The
-    derivatives hold the lengths of the steps constant.
+    **Returns** two things: the states (K, n) at the K saved times `run.between`, each of n numbers,
+    NaN at times that the run did not reach; and the state of the loop at the end of the run. The
+    states have derivatives with respect to two kinds of inputs: the constants that `smooth`
+    selects, and the fields of the run that `adjoint.Smooth` lists. The derivatives hold the lengths
+    of the steps constant.
 
     **Arguments:**
 
@@ -55,13 +56,15 @@ def states_of_run(
         call = partial(program, method, trees)
         return in_lanes(call, list(args[:number]), list(args[number:]), linear)
 
-    answer: Any = jax.custom_jvp(partial(mapped, partial(_forward, False), 0))
-    recorded: Any = jax.custom_jvp(partial(mapped, partial(_forward, True), 0))
+    answer: Any = jax.custom_jvp(partial(mapped, partial(_run_bodies, False), 0))
+    recorded: Any = jax.custom_jvp(partial(mapped, partial(_run_bodies, True), 0))
 
     def tangents_of(primals: Any, tangents: Any, pull: Any = None) -> tuple[Arrays, Arrays]:
-        """Return the arrays of `recorded`, and the tangents of the arrays that hold states.
+        """Return the arrays of a run with its record, and the tangents of those that hold states.
 
-        `pull` is the transpose of the tangents; if it is `None`, reverse mode raises an error.
+        `primals` are the arrays of the run, and `tangents` their tangents (symbolic zeros where
+        there is none). `pull` is the function that computes the cotangents in reverse mode; if it
+        is `None`, reverse mode raises an error.
         """
         # A number without a tangent needs no derivative.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
@@ -69,7 +72,7 @@ def states_of_run(
         moving = [s and t for s, t in zip(smooth, there[:number], strict=True)], of_run
         along = [t for t, m in zip(tangents, [*moving[0], *moving[1]], strict=True) if m]
         found = recorded(*primals)
-        push = partial(mapped, partial(_push_forward, moving), len(along))
+        push = partial(mapped, partial(_tangents_of_states, moving), len(along))
         given = [*primals, *found[head:]]
         if pull is None:
             return found, linear_map(push, refuse, given, along)
@@ -85,7 +88,7 @@ def states_of_run(
         return found, along
 
     def of_answer(primals: Any, tangents: Any) -> Any:
-        found, moved = tangents_of(primals, tangents, _pull_back)
+        found, moved = tangents_of(primals, tangents, _cotangents_of_inputs)
         return with_zeros(found[:head], moved)
 
     def of_record(primals: Any, tangents: Any) -> Any:
@@ -97,15 +100,24 @@ def states_of_run(
     return between, adaptive_loop.unpack(end, like)
 
 
-def _over_bodies(
+def _method_over_bodies(
     method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> tuple[Method, Run, Layout, Arrays]:
-    """Return the method, the run, the layout and the constants for arrays (n, *bodies).
+    """Convert a method for one body to a method for arrays whose last axis is the bodies.
 
-    The last arrays in the given `constants` are the states of controller and progress meter at the
-    start; they become a part of the run. The given `method` is for one body; its functions
-    `halt(constants, t, y)` and `control(again, constants, …)` take the constants as an argument. In
-    the returned method these two functions already hold the constants.
+    **Arguments:**
+
+    - `method`: the method of one body. Its functions `halt(constants, t, y)` and `control(again,
+      constants, …)` take the constants as an argument.
+    - `trees`: the structure of a `Run`, and that of the states of controller and progress meter.
+    - `layout`: which arrays have a last axis of bodies.
+    - `constants`: the arrays that the functions of the method hold, then the states of controller
+      and progress meter at the start.
+    - `each`: the arrays of the run, with values of each body.
+
+    **Returns** four things: the method for bodies, whose `halt` and `control` already hold the
+    constants; the run, to which the states of controller and progress meter belong; the layout of
+    the constants; and the constants without these states.
     """
     run_tree, state_tree = trees
     run, count = run_tree.unflatten(each), len(constants) - state_tree.num_leaves
@@ -126,11 +138,25 @@ def _over_bodies(
     return method, run, layout, constants
 
 
-def _forward(
+def _run_bodies(
     record: bool, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    """Return a list of the saved states, the end of a run and, if `record` is true, its record."""
-    method, run, _, constants = _over_bodies(method, trees, layout, constants, each)
+    """Run all bodies, and return the arrays of the result as one list.
+
+    **Arguments:**
+
+    - `record`: whether the record of the steps is returned, too.
+    - `method`: the method of one body.
+    - `trees`: the structure of a `Run`, and that of the states of controller and progress meter.
+    - `layout`: which arrays have a last axis of bodies.
+    - `constants`: the arrays that the functions of the method hold, then the states of controller
+      and progress meter at the start.
+    - `each`: the arrays of the run, with values of each body.
+
+    **Returns** a list of arrays: the states at the saved times; the state of the loop at the end;
+    and, if `record` is true, the record of the steps.
+    """
+    method, run, _, constants = _method_over_bodies(method, trees, layout, constants, each)
     kept = None
     if record or (run.between.shape[0] and layout.bodies):
         between, end, kept = adaptive_loop.record_run(method, constants, run)
@@ -146,19 +172,31 @@ def _forward(
 Moving = tuple[list[bool], list[bool]]
 
 
-def _moving_run(
+def _parts_of_recorded_run(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> tuple[Method, Arrays, Run, Record, Arrays]:
-    """Return what is needed to differentiate a recorded run.
+    """Return what is needed to differentiate a recorded run of all bodies.
 
-    **Returns** five things: the method; the constants; the run; its record; and the tangents or
-    cotangents. The returned constants are only the constants that `moving` selects, with one copy
-    for each body; the field of the returned method takes these constants alone. `each` is a list of
-    the arrays of the run, then those of its record, then the tangents or cotangents.
+    **Arguments:**
+
+    - `moving`: which constants, and which arrays of the run, have a tangent.
+    - `method`: the method of one body.
+    - `trees`: the structure of a `Run`, and that of the states of controller and progress meter.
+    - `layout`: which arrays have a last axis of bodies.
+    - `constants`: the arrays that the functions of the method hold, then the states of controller
+      and progress meter at the start.
+    - `each`: a list of the arrays of the run, then those of its record, then the tangents or
+      cotangents.
+
+    **Returns** five things: the method for bodies; the constants; the run; its record; and the
+    tangents or cotangents. The returned constants are only the constants that have a tangent, with
+    one copy for each body; the field of the returned method takes these constants alone.
     """
     whole = trees[0].num_leaves
     one = method.field
-    method, run, layout, constants = _over_bodies(method, trees, layout, constants, each[:whole])
+    method, run, layout, constants = _method_over_bodies(
+        method, trees, layout, constants, each[:whole]
+    )
     starts = len(jax.eval_shape(adaptive_loop.pack, adaptive_loop.initial_loop_state(run)))
     *kept, rows, counts = each[whole : whole + starts + 2]
     there = moving[0][: len(constants)]
@@ -175,15 +213,21 @@ def _moving_run(
     return method._replace(field=of_moving), chosen, run, record, bars
 
 
-def _push_forward(
+def _tangents_of_states(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    """Return the tangents of the states of a recorded run.
+    """Return the tangents of the states of a recorded run, in forward mode.
 
-    The last arrays in `each` are the tangents of the constants and of the arrays of the run that
-    `moving` selects.
+    The states are those at the saved times and the one at the end of the run. `moving` says which
+    constants, and which arrays of the run, have a tangent. `each` is a list of the arrays of the
+    run, then those of its record, then the tangents of the constants and arrays that `moving`
+    selects. `method`, `trees`, `layout` and `constants` are the method of one body, the structures
+    of a `Run` and of the states of its controller, the axes of bodies, and the arrays that the
+    functions of the method hold.
     """
-    method, chosen, run, record, along = _moving_run(moving, method, trees, layout, constants, each)
+    method, chosen, run, record, along = _parts_of_recorded_run(
+        moving, method, trees, layout, constants, each
+    )
     rest = iter(along[len(chosen) :])
     smooth = adjoint.smooth_numbers(run)
     still = zip(smooth, moving[1], strict=False)
@@ -196,14 +240,20 @@ def _push_forward(
     return list(jax.jvp(again, (chosen, smooth), (along[: len(chosen)], of_run))[1])
 
 
-def _pull_back(
+def _cotangents_of_inputs(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    """Return the cotangents of the constants and of the arrays of the run that `moving` selects.
+    """Return the cotangents of the inputs of a recorded run, in reverse mode.
 
-    The last two arrays in `each` are the cotangents of the states at the saved times, and of the
-    state at the end of the run.
+    The inputs are the constants and the arrays of the run; `moving` says which of them have a
+    cotangent. `each` is a list of the arrays of the run, then those of its record, then two
+    cotangents: that of the states at the saved times, and that of the state at the end of the run.
+    `method`, `trees`, `layout` and `constants` are the method of one body, the structures of a
+    `Run` and of the states of its controller, the axes of bodies, and the arrays that the functions
+    of the method hold.
     """
-    method, chosen, run, record, bars = _moving_run(moving, method, trees, layout, constants, each)
+    method, chosen, run, record, bars = _parts_of_recorded_run(
+        moving, method, trees, layout, constants, each
+    )
     total, of_run = adjoint.cotangents(method, chosen, run, record, bars, any(moving[1][:3]))
     return [*total, *(a for a, moves in zip(of_run, moving[1], strict=False) if moves)]

@@ -78,7 +78,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
     ) -> Any:  # fmt: skip
         how = dict(terms=terms, solver=solver, stepsize_controller=stepsize_controller)
         how |= dict(saveat=saveat, t0=t0, t1=t1, dt0=dt0, max_steps=max_steps)
-        if not _is_replayed(solver, saveat, event, max_steps, init_state):
+        if not _can_be_replayed(solver, saveat, event, max_steps, init_state):
             more = dict(args=args, event=event, init_state=init_state)
             return self.otherwise.loop(progress_meter=progress_meter, **how, **more, **rest)
         y0, tree = ravel_pytree(init_state.y)
@@ -122,20 +122,24 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         state = lax.stop_gradient(jax.tree.map(jnp.asarray, state))
         between, first = asked if order is None else asked[order], init_state.tnext
         run = Run(
-            t0, _stops(controlled_by, t0, t1), between, y0, lax.stop_gradient(first),
-            None if event is None else init_state.result,
+            t0, _times_where_steps_end(controlled_by, t0, t1), between, y0,
+            lax.stop_gradient(first), None if event is None else init_state.result,
         )  # fmt: skip
         # The condition and the controller, which can end a run, have no derivative.
         smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
         ys, end = states_of_run(method, smooth, constants, state, run)
         if order is not None:
             ys = jnp.zeros_like(ys).at[order].set(ys)
-        final = _final(init_state, saveat, event, args, tree, run, asked, ys, end)
+        final = _final_state(init_state, saveat, event, args, tree, run, asked, ys, end)
         return final, {"next_step": end.end - end.t}
 
 
 class _Control(NamedTuple):
-    """Hold a step controller and a progress meter, and call both after a step of one body."""
+    """Choose whether an attempted step is accepted, and at which time the next step ends.
+
+    It is called for one body. It holds a step controller of diffrax, which decides, and a progress
+    meter, which shows how far the run is.
+    """
 
     static: Any  # controller, progress meter and `args`, without their arrays
     arrays: Callable[[Arrays], Any]  # selects these arrays from the constants of the run
@@ -177,8 +181,13 @@ class _Control(NamedTuple):
         return jax.tree.map(jnp.asarray, (keep, t, following, (control, progress), result))
 
 
-def _is_replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: Any) -> bool:
-    """Return whether `ReplayAdjoint` itself does a run; if not, its `otherwise` does."""
+def _can_be_replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: Any) -> bool:
+    """Return whether `ReplayAdjoint` itself can do a run; if not, its `otherwise` does the run.
+
+    The arguments are those of `diffrax.diffeqsolve`: the `solver`, what is saved (`saveat`), the
+    `event` or `None`, and the largest number of steps. `state` is the state of `diffeqsolve` at the
+    start.
+    """
     kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(state.y)}
     plain = isinstance(solver, AbstractExplicit) and max_steps is not None and not saveat.dense
     plain = plain and len(kinds) == 1 and jnp.issubdtype(min(kinds, key=str), jnp.floating)
@@ -190,13 +199,16 @@ def _is_replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: An
 
 
 def _sub_save_ats(saveat: Any) -> list[Any]:
-    """Return each `diffrax.SubSaveAt` of a `diffrax.SaveAt`."""
+    """Return a list of the `diffrax.SubSaveAt`s of a `diffrax.SaveAt`.
+
+    Each of them says at which times, and which function of the state, is saved.
+    """
     is_sub = lambda s: isinstance(s, dfx.SubSaveAt)  # noqa: E731
     return [s for s in jax.tree.leaves(saveat.subs, is_leaf=is_sub) if is_sub(s)]
 
 
 def _nested_controllers(controller: Any) -> list[Any]:
-    """Return a list of a controller and all the controllers inside it, the outermost first."""
+    """Return a list of a step controller and all the controllers inside it, the outermost first."""
     found = []
     while isinstance(controller, dfx.AbstractStepSizeController):
         found.append(controller)
@@ -204,8 +216,13 @@ def _nested_controllers(controller: Any) -> list[Any]:
     return found
 
 
-def _stops(controllers: list[Any], t0: Array, t1: Array) -> Array:
-    """Return in increasing order the times at which the field jumps, followed by t1."""
+def _times_where_steps_end(controllers: list[Any], t0: Array, t1: Array) -> Array:
+    """Return in increasing order the times at which steps end, s: those of jumps, and the last t1.
+
+    The times at which the field jumps are held by the step `controllers`. `t0` and `t1` are the
+    times at which the run begins and ends. A jump at a time that the run does not reach is replaced
+    by t0, so that the array keeps its length.
+    """
     jumps = [c.stops for c in controllers if type(c) is Stopping]
     for c in controllers:
         if type(c) is dfx.ClipStepSizeController and c.jump_ts is not None:
@@ -218,14 +235,21 @@ def _stops(controllers: list[Any], t0: Array, t1: Array) -> Array:
     return jnp.concatenate([*jumps, t1[None]])
 
 
-def _final(
+def _final_state(
     state: Any, saveat: Any, event: Any, args: Any, tree: Any, run: Run, asked: Array, ys: Array,
     end: LoopState,
 ) -> Any:  # fmt: skip
     """Return the state of `diffrax.diffeqsolve` at the end of a run, with all that it saves.
 
-    `state` is the state of `diffeqsolve` at the start; `tree` makes a state of the run from its
-    numbers; `asked` are the saved times, and `ys` the states at them; `end` is the end of the loop.
+    **Arguments:**
+
+    - `state`: the state of `diffeqsolve` at the start.
+    - `saveat`, `event`, `args`: the arguments of `diffeqsolve` with these names.
+    - `tree`: a function that makes a state of the motion from its n numbers.
+    - `run`: the start, the stops and the saved times of the run.
+    - `asked`: (K,) the saved times, those of all `diffrax.SubSaveAt`s joined.
+    - `ys`: (K, n) the states at the saved times, NaN where the run did not come.
+    - `end`: the state of the loop at the end of the run.
     """
     t1 = run.stops[-1]
     # Before its first accepted step a run saves nothing, unless the run has no step because t1 is

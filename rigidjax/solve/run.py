@@ -48,18 +48,21 @@ _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 class ClosedFormRun(eqx.Module):
-    """Hold the set-up of a run of a free body in closed form.
+    """Hold the set-up of a run of a free body in closed form: all but the start and the times.
 
     The cost of a state is the same at any time of the run.
     """
 
     body: Inertia | MassProperties
-    throw: bool = eqx.field(static=True)
+    throw: bool = eqx.field(static=True)  # whether a run that fails raises an error
     torque: ClassVar[None] = None
 
 
 class DiffraxRun(eqx.Module):
-    """Hold the set-up of a run by diffrax: everything but the start and the times."""
+    """Hold the set-up of a run by diffrax: everything but the start and the times.
+
+    The fields without a comment are the arguments of `simulate` with the same names.
+    """
 
     body: Inertia | MassProperties | None
     torque: Any
@@ -78,7 +81,11 @@ class DiffraxRun(eqx.Module):
 
     @property
     def seeks_stops(self) -> bool:
-        """Return whether steps end where the law switches; if so, the run uses the time s = σt."""
+        """Return whether steps end at the times at which the torque jumps or switches.
+
+        If so, the run uses the time s = σt, which increases along the run: σ is 1, or −1 in a run
+        backwards in the time t.
+        """
         # These solvers read attributes of the vector field, which therefore cannot be replaced by a
         # traced program.
         solver = self.solver.solver if isinstance(self.solver, Projected) else self.solver
@@ -87,7 +94,11 @@ class DiffraxRun(eqx.Module):
 
     @property
     def is_replayed(self) -> bool:
-        """Return whether an `AbstractExplicit` runs under tolerances and `ReplayAdjoint`."""
+        """Return whether the run keeps a record of its steps, which derivatives repeat.
+
+        This is so for an explicit Runge–Kutta method of this package (an `AbstractExplicit`) under
+        tolerances and a `ReplayAdjoint`, with a limit to the number of steps.
+        """
         explicit = isinstance(self.solver, AbstractExplicit) and self.max_steps is not None
         return explicit and self.controller is None and isinstance(self.adjoint, ReplayAdjoint)
 
@@ -104,9 +115,10 @@ class DiffraxRun(eqx.Module):
 
 
 class Ends(eqx.Module):
-    """Evaluate the condition that ends the run of a scene, such as a collision.
+    """Evaluate the condition that ends the run of a particle in its scene, such as a collision.
 
-    `diffrax.Event` calls it.
+    `diffrax.Event` calls it with the time `t`, s, and the state `y`, a `Point`. It returns whether
+    the scene ends the run there.
     """
 
     scene: Any  # has ends(t, state) → bool and end_words(t, state) → str
@@ -161,13 +173,21 @@ def direction(times: Array) -> Int[Array, ""] | None:
 def in_forward_time(
     sign: Array | None, field: Callable[..., Any], condition: Any, ts: Array
 ) -> tuple[Callable[..., Any], Any, Array, list[Array]]:
-    """Convert a field, a condition, saved times and jump times from the time t to the time s = σt.
+    """Convert a run backwards in time to a run forwards in time, which uses the time s = σt.
 
-    `sign` is σ, 1 or −1 such that s increases along the run; `None` stands for 1. `condition` may
-    be `None`. The returned field takes a third argument: a list of stops, as times s, with one
-    array for each part of the field that jumps (see `adaptive`).
+    **Arguments:**
+
+    - `sign`: σ, 1 or −1 such that s increases along the run; `None` stands for 1.
+    - `field`: the vector field `f(t, y, args)`.
+    - `condition`: a function `(t, y)` that says whether the run ends, or `None`.
+    - `ts`: (T,) the saved times t, s.
+
+    **Returns** four things: the field as a function `(s, y, sides)`; the condition as a function
+    `(s, y)`, or `None`; the saved times s; and a list with the jump times s of each part of the
+    field that jumps in time. `sides` is a list with one array for each of these parts: the times s
+    at which steps end for its jumps. `None` says that they are the jump times.
     """
-    time = partial(_signed, sign)
+    time = partial(_multiply_by_direction, sign)
 
     def directed(s: Array, y: Any, sides: Any = None) -> Any:
         sided = on_sides(field, sign, None if sides is None else [time(side) for side in sides])
@@ -181,18 +201,24 @@ def in_forward_time(
 def solve(
     setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    """Return three things: the states at `ts` (T,), s; the `Solution.stats`; and the result."""
+    """Compute the motion of one body from the state `state0`, at the times `ts` (T,), s.
+
+    `setup` holds the body, the torque and how the motion is solved. **Returns** three things: the
+    states at `ts`, with a leading time axis, NaN at times that the run did not reach; the dict
+    `Solution.stats` with the numbers of steps; and the result of diffrax, which says whether the
+    run reached the end, or why not.
+    """
     # One `jit` encloses everything, because a single operation outside of `jit` takes as long as a
     # hundred steps.
     state0 = given = project_to_group(state0)
     if isinstance(setup, ClosedFormRun):
-        ys, stats, result = _free(setup, state0, ts)
+        ys, stats, result = _solve_in_closed_form(setup, state0, ts)
     else:
         # If the torque has states of its own, they are integrated together with the body's.
         state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
         scene: Any = scene_of_force(setup.torque) if isinstance(state0, Point) else None
         watch = Ends(scene) if hasattr(scene, "ends") else None
-        ys, stats, result, end = _integrated(setup, watch, state0, ts)
+        ys, stats, result, end = _integrate(setup, watch, state0, ts)
         if setup.throw:
             ys = raise_unless_complete(ys, result, setup.torque)
         if watch is not None:
@@ -204,13 +230,17 @@ def solve(
     return nan_derivatives(ys, inputs), stats, result_of_body(result, setup.body)
 
 
-def _integrated(
+def _integrate(
     setup: DiffraxRun, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
-    """Return the states at `ts`, the counts of steps, the result, and the end of the run.
+    """Integrate the motion step by step from the state `state0`, saved at the times `ts` (T,), s.
 
-    The end is a tuple of the time, the state, and the length of the step that would follow. `watch`
-    is the condition that ends the run, or `None`.
+    `setup` holds the body, the torque, the solver and its tolerances; `watch` is the condition that
+    ends the run, or `None`.
+
+    **Returns** four things: the states at `ts`, with a leading time axis; a dict with the numbers
+    of steps; the result of diffrax, which says why the run ended; and the end of the run, a tuple
+    of its time, s, its state, and the length of the step that would follow, s.
     """
     form = by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
@@ -220,7 +250,7 @@ def _integrated(
         sign = setup.sign
         field, halt, along, jumps = in_forward_time(sign, field, watch, ts)
         if setup.cuts is not None:
-            jumps = [*jumps, _signed(sign, setup.cuts)]
+            jumps = [*jumps, _multiply_by_direction(sign, setup.cuts)]
     elif dt0 is not None:
         dt0 = dt0 * jnp.sign(ts[-1] - ts[0])
     out = integrate(
@@ -232,13 +262,17 @@ def _integrated(
     stats: dict[str, Any] = dict(zip(_COUNTS, taken, strict=True))
     if out.missed is not None:
         stats["switches_missed"] = out.missed
-    last_time = _signed(sign, out.last_time)
+    last_time = _multiply_by_direction(sign, out.last_time)
     last = out.last if form is None else form.leave(last_time, out.last)
     return with_body_rates(form, ts, out.ys), stats, out.result, (last_time, last, out.next_step)
 
 
-def _signed(sign: Array | None, t: Array) -> Array:
-    """Return σ times the time `t`, which converts t to s = σt and back; `sign` is σ (`None`: 1)."""
+def _multiply_by_direction(sign: Array | None, t: Array) -> Array:
+    """Convert times `t` to times s = σt, which increase along a run, or convert s back to t.
+
+    `t` is an array of any shape; `sign` is σ: 1, or −1 in a run backwards in time. `None` stands
+    for 1.
+    """
     return t if sign is None else sign.astype(t.dtype) * t
 
 
@@ -261,7 +295,10 @@ _NONFINITE_WORDS = (
 
 
 def _shortest_step_words(dtype: Any) -> str:
-    """Return the message for a run in which no step is short enough."""
+    """Return the message of the error for a run in which no step was short enough.
+
+    `dtype` is the dtype of the times, whose resolution the message names.
+    """
     gap = np.spacing(np.asarray(1e9, dtype))
     return (
         "simulate: no step is short enough: the minimum step size, some units of round-off of the "
@@ -271,7 +308,11 @@ def _shortest_step_words(dtype: Any) -> str:
 
 
 def raise_unless_complete(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
-    """Return the states `ys`; raise an error with a readable message if the run ended early."""
+    """Return the states `ys` of a run; raise an error with a readable message if it ended early.
+
+    `result` is the result of diffrax, which says why the run ended; `torque` is the torque, which
+    decides on the advice in the message. The end by an event is no error.
+    """
     if momentum_changes(torque) is not None:
         ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
@@ -287,7 +328,11 @@ def raise_unless_complete(ys: Any, result: dfx.RESULTS, torque: Any = None) -> A
 
 
 def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) -> None:
-    """Warn if a law switches in time more often than there are stored stops for steps to end at."""
+    """Warn if a torque switches in time so often that steps do not end at all of its switches.
+
+    `setup` holds the body and the torque of the run, `state0` is its state at the start, and `ts`
+    (T,), s, are its saved times. `stats["switches_missed"]` says whether switches are missed.
+    """
     missed = stats.get("switches_missed", False)
     if not _checks.is_known((missed, state0, ts)) or not np.any(np.asarray(missed)):
         return
@@ -306,12 +351,15 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
 
 
 @eqx.filter_jit
-def _end_of(setup: DiffraxRun, state0: Any, ts: Array) -> Any:
-    """Return the time and state at the end of a run, the length of the next step, and the step
-    count.
+def _end_of_run(setup: DiffraxRun, state0: Any, ts: Array) -> Any:
+    """Run once more and return where the run ended.
+
+    `setup` holds the body, the torque and the solver; the run begins with the state `state0` and
+    has the saved times `ts` (T,), s. **Returns** four things: the time at the end, s; the state at
+    the end; the length of the step that would follow, s; and the number of steps.
     """
     state0 = with_own_states(setup.body, project_to_group(state0), setup.torque, ts[0])
-    *_, stats, _, end = _integrated(setup, None, state0, ts)
+    *_, stats, _, end = _integrate(setup, None, state0, ts)
     return *end, stats["num_steps"]
 
 
@@ -320,12 +368,17 @@ _STUCK = 1e-2
 
 
 def words_of_steps(setup: Any, state0: Any, ts: Array, error: RuntimeError) -> RuntimeError:
-    """Return the `error`; if the run used up all steps, its message says at which time and why."""
+    """Return the error of a failed run, with a better message if the run used up all its steps.
+
+    The message then says which time was reached, and why. `setup` holds the body, the torque and
+    the solver of the run, `state0` is its state at the start, `ts` (T,), s, are its saved times,
+    and `error` is the error that the run raised.
+    """
     if _MANY_STEPS not in str(error) or not isinstance(setup, DiffraxRun):
         return error
     if not setup.is_replayed or not _checks.is_known((setup, state0, ts)):
         return error
-    t, state, step, count = _end_of(dataclasses.replace(setup, throw=False), state0, ts)
+    t, state, step, count = _end_of_run(dataclasses.replace(setup, throw=False), state0, ts)
     begun, end, t = float(ts[0]), float(ts[-1]), float(t)
     gone, step = abs(t - begun), float(step)
     words = f"simulate: the maximum number of solver steps, {int(count)}, "
@@ -347,8 +400,15 @@ def words_of_steps(setup: Any, state0: Any, ts: Array, error: RuntimeError) -> R
     return type(error)(f"{words}; give max_steps={int(float(f'{needed:.1g}')):_} or more")
 
 
-def _free(setup: ClosedFormRun, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    """Return the states at `ts` in closed form, the counts of steps (all 0), and the result."""
+def _solve_in_closed_form(
+    setup: ClosedFormRun, state0: Any, ts: Array
+) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+    """Compute the motion of a free body in closed form, at the times `ts` (T,), s.
+
+    `setup` holds the body, and `state0` is the state at `ts[0]`. **Returns** three things: the
+    states, with a leading time axis; a dict with the numbers of steps, which are all 0; and the
+    result of diffrax, which says whether all states are finite.
+    """
     ys = FreeMotion(setup.body, state0)(ts - ts[0])
     stats: Any = dict.fromkeys(_COUNTS, jnp.zeros((), int))
     if setup.throw:
@@ -363,9 +423,16 @@ def _free(setup: ClosedFormRun, state0: Any, ts: Array) -> tuple[Any, dict[str, 
 
 
 def raise_if_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
-    """Return the states `ys` saved at `ts`; raise an error if the scene ended the run.
+    """Return the states of a particle's run; raise an error if its scene ended the run early.
 
-    The message contains the sentence that `scene.end_words` returns.
+    **Arguments:**
+
+    - `scene`: the scene of the particle; its method `end_words(t, state)` gives the sentence of the
+      message that says why the run ended.
+    - `ys`: the states at the saved times, which are returned.
+    - `stats`: a dict with `ended` (whether the scene ended the run), `end_time`, s, and
+      `end_state`.
+    - `ts`: (T,) s, the saved times.
     """
     ended, advice = stats["ended"], "; give throw=False to keep what came before it"
     if _checks.is_known(ended) and not np.any(np.asarray(ended)):

@@ -25,38 +25,42 @@ Field = Callable[[Arrays, Array, Array], Array]
 class Step(NamedTuple):
     """Hold a step: the times of its start and end, its length, and the state at its start."""
 
-    t: Array  # (*bodies), s
-    h: Array  # (*bodies), s
+    t: Array  # (*bodies), s: the time at the start
+    h: Array  # (*bodies), s: the length
     # (*bodies), s: the end, equal to t + h but for rounding. If the step ends at a jump of the
     # field, this is the last floating-point number before the time of the jump.
     end: Array
-    y: Array  # (n, *bodies)
+    y: Array  # (n, *bodies) the state at the start
 
 
 class Stages(NamedTuple):
     """Hold the s stages of a step and the state at its end; a slope is a value of the field."""
 
-    times: Array  # (s, *bodies)
+    times: Array  # (s, *bodies) s
     places: Array  # (n, s, *bodies) the states at which the field is evaluated
     slopes: Array  # (n, s, *bodies)
-    end: Array  # (n, *bodies)
+    end: Array  # (n, *bodies) the state at the end of the step
     number: Any  # the number of stages that were computed
 
 
 class Weights(NamedTuple):
-    """Hold a tableau as arrays over s stages: the stages of a step, then those for dense output."""
+    """Hold the numbers of a Runge–Kutta method as arrays over its s stages.
 
-    a: Array  # (s, s)
-    b: Array  # (s,)
-    c: Array  # (s,)
+    First come the stages of a step, then those that only dense output needs, which is the state at
+    any time within the step.
+    """
+
+    a: Array  # (s, s) the weights of the slopes in the state of each stage
+    b: Array  # (s,) the weights of the slopes in the state at the end of the step
+    c: Array  # (s,) the times of the stages, from 0 at the start of the step to 1 at its end
     last: Array  # (s,) whether c is 1
     dense: Array  # (r, s) the rows of dense output
-    errors: Array  # (1 or 2, s)
+    errors: Array  # (1 or 2, s) the weights of the slopes in the estimates of the error
     plain: int  # the number of stages of a step without dense output
 
 
 def weights(tableau: Tableau, dtype: Any) -> Weights:
-    """Return the weights of a tableau as arrays of the dtype."""
+    """Return the numbers of a Runge–Kutta method, its `tableau`, as arrays of the `dtype`."""
     c = np.array([0.0, *tableau.c, 1.0, *tableau.extra_c])
     rows = [{}, *tableau.a, tableau.b, *tableau.extra_a, *tableau.dense, *tableau.errors]
     table, whole = np.zeros((len(rows), c.size)), c.size
@@ -72,10 +76,11 @@ def weights(tableau: Tableau, dtype: Any) -> Weights:
     return Weights(a, b, nodes, jnp.asarray(c == 1.0), dense, errors, plain)
 
 
-def _sum(row: Array, slopes: Array) -> Array:
-    """Return Σ row_i k_i, summed over the stages i, the axis 1 of the `slopes` k (n, s, …).
+def _weighted_sum(row: Array, slopes: Array) -> Array:
+    """Return the weighted sum of the slopes of a step over its stages, Σ row_i k_i, (n, …).
 
-    If there are fewer slopes than weights in `row`, the last weights are left out.
+    `slopes` (n, s, …) are the slopes k_i, the values of the field at the s stages i of the step;
+    `row` holds the weights. If there are fewer slopes than weights, the last weights are left out.
     """
     row = row[: slopes.shape[1]]
     return jnp.sum(row.reshape(1, -1, *[1] * (slopes.ndim - 2)) * slopes, 1)
@@ -84,11 +89,18 @@ def _sum(row: Array, slopes: Array) -> Array:
 def stages(
     tableau: Tableau, field: Field, constants: Arrays, step: Step, dense: Any = False
 ) -> Stages:
-    """Compute all stages of a step, and, if `dense` is true, also the stages for dense output.
+    """Compute all stages of a step of a Runge–Kutta method, and the state at its end.
 
-    The quaternion of the state at the end is not scaled to length 1. If `dense` is traced and
-    false, the arrays have places for the stages of dense output: the time and state in these places
-    are those at the start of the step, and the slopes are 0.
+    **Arguments:**
+
+    - `tableau`: the numbers of the method.
+    - `field`: the vector field `(constants, t, y)`, and `constants` the list of its arrays.
+    - `step`: the times, the length and the state (n, *bodies) at the start of the step.
+    - `dense`: whether the stages for dense output (the state within the step) are computed, too. If
+      it is traced and false, the arrays have places for these stages: the time and state in these
+      places are those at the start of the step, and the slopes are 0.
+
+    The quaternion of the state at the end is not scaled to length 1.
     """
     w = weights(tableau, step.y.dtype)
     count = w.plain if dense is False else w.c.size
@@ -109,24 +121,32 @@ def stages(
     begun = (times, places, empty)
     times, places, slopes = lax.fori_loop(np.int32(0), number, stage, begun)
     h = lift(step.h.astype(step.y.dtype), step.y)
-    return Stages(times, places, slopes, step.y + h * _sum(w.b, slopes), number)
+    return Stages(times, places, slopes, step.y + h * _weighted_sum(w.b, slopes), number)
 
 
 def _stage(
     w: Weights, field: Field, constants: Arrays, step: Step, i: Array, slopes: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the time, the state and the slope of stage i, from the `slopes` before it."""
+    """Return the time, the state (n, *bodies) and the slope (n, *bodies) of one stage of a step.
+
+    `w` are the weights of the method; `field` is the vector field `(constants, t, y)`; `step` holds
+    the times, the length and the state at the start of the step; `i` is the index of the stage; and
+    `slopes` (n, s, *bodies) are the slopes of all stages, of which those before `i` are used.
+    """
     # The dtype of the time may differ from that of the state.
-    y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _sum(w.a[i], slopes)
+    y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _weighted_sum(w.a[i], slopes)
     t = jnp.where(w.last[i], step.end, step.t + w.c[i].astype(step.t.dtype) * step.h)
     return t, y, field(constants, t, y)
 
 
 def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
-    """Return the rows F0, F1, … (r, n) that `nested` takes, for dense output of a step of one body.
+    """Return the coefficients by which `nested` interpolates within a step of one body, (r, n).
 
-    `slopes` (n, s) are the slopes at the stages of the step. The length of the step is already
-    multiplied into the rows.
+    These r rows F0, F1, … are for dense output, that is for the state of n numbers at any time
+    within the step. `tableau` holds the numbers of the method, `field` is the vector field
+    `(constants, t, y)`, which is called with no constants, and `step` holds the times, the length
+    and the state at the start. `slopes` (n, s) are the slopes at the stages of the step. The length
+    of the step is already multiplied into the rows.
     """
     w = weights(tableau, slopes.dtype)
     slopes = jnp.pad(slopes, ((0, 0), (0, w.c.size - w.plain)))
@@ -140,10 +160,11 @@ def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Arr
 
 
 def nested(theta: Array, rows: Array) -> Array:
-    """Return θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))), of which F0, F1, … are the `rows`.
+    """Return the change of the state since the start of a step, at a time within the step.
 
-    `theta` is θ, the part of the step that has passed, from 0 to 1. The sum of this value and the
-    state at the start of the step is dense output: Hairer, Nørsett and Wanner (1993), II.6.
+    It is θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))), where `theta` is θ, the part of the step
+    that has passed, from 0 to 1, and `rows` are F0, F1, …. The sum of this value and the state at
+    the start of the step is dense output: Hairer, Nørsett and Wanner (1993), II.6.
     """
     total = jnp.zeros((), rows.dtype)
     for i in reversed(range(rows.shape[0])):
@@ -152,12 +173,13 @@ def nested(theta: Array, rows: Array) -> Array:
 
 
 def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) -> Array:
-    """Return an estimate of the error of a step (n, *bodies).
+    """Return an estimate of the error of each number of the state after a step, (n, *bodies).
 
-    If the tableau has two estimates, e5 of order 5 and e3 of order 3, they are combined to
-    e5 |e5|/√(|e5|² + 0.01 |e3|²), which falls as h⁸ with the length h of the step (Hairer, Nørsett
-    and Wanner 1993, II.10). The norms |e5| and |e3| are taken over each array of the state alone;
-    `sizes` are the sizes of these arrays.
+    `tableau` holds the numbers of the method; `h` (*bodies) is the length of the step, s; `slopes`
+    (n, s, *bodies) are the slopes at its s stages. If the tableau has two estimates, e5 of order 5
+    and e3 of order 3, they are combined to e5 |e5|/√(|e5|² + 0.01 |e3|²), which falls as h⁸ with
+    the length h of the step (Hairer, Nørsett and Wanner 1993, II.10). The norms |e5| and |e3| are
+    taken over each array of the state alone; `sizes` are the sizes of these arrays.
     """
     dtype, ones = slopes.dtype, [1] * (slopes.ndim - 2)
     # All sums over stages are computed in one operation, because for one body each separate sum
@@ -180,11 +202,19 @@ def pull_back(
     tableau: Tableau, field: Field, constants: Arrays, step: Step, there: Stages,
     cotangent: Array, of_slopes: Array | None = None,
 ) -> tuple[Arrays, Array, Array, Array]:  # fmt: skip
-    """Return the cotangents of the constants, and of the time, length and state of a step.
+    """Compute a step of a Runge–Kutta method in reverse mode: the cotangents of its inputs.
 
-    This is the transpose of a step. `there` holds the stages of the step. `cotangent` (n, *bodies)
-    is the cotangent of the state at the end of the step, and `of_slopes` (n, s, *bodies) are the
-    cotangents of all slopes, or `None` if these are 0.
+    **Arguments:**
+
+    - `tableau`: the numbers of the method.
+    - `field`: the vector field `(constants, t, y)`, and `constants` the list of its arrays.
+    - `step`: the times, the length and the state (n, *bodies) at the start of the step.
+    - `there`: the s stages of the step.
+    - `cotangent`: (n, *bodies) the cotangent of the state at the end of the step.
+    - `of_slopes`: (n, s, *bodies) the cotangents of all slopes, or `None` if these are 0.
+
+    **Returns** four cotangents: those of the constants, a list; of the time at the start of the
+    step; of the length of the step; and of the state at the start.
     """
     w, count = weights(tableau, step.y.dtype), there.slopes.shape[1]
     h, put = step.h.astype(step.y.dtype), lax.dynamic_update_index_in_dim
@@ -192,7 +222,7 @@ def pull_back(
     def stage(i: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
         m = there.number - 1 - i
         below, seeds = both
-        seed = w.b[m] * cotangent + _sum(w.a[:, m], below)
+        seed = w.b[m] * cotangent + _weighted_sum(w.a[:, m], below)
         bar = lift(h, seed) * seed
         if of_slopes is not None:
             bar = bar + of_slopes[:, m]

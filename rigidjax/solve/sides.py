@@ -27,11 +27,14 @@ _OWN = (*_TABLES, Delayed, Lagged)
 
 
 class Sided(eqx.Module):
-    """Evaluate a law on the correct side of its jumps in time.
+    """Evaluate a torque law on the correct side of its jumps in time.
 
-    `jumps` (n,), s, are the times at which the law jumps. `stops` (n,), s, are the times at which
-    steps end for these jumps, at most some units of round-off later or earlier; `None` says that
-    the stops are equal to the jumps. `sign` is the direction of time as for `in_forward_time`.
+    A step that ends at a jump needs the value before the jump; a step that begins there needs the
+    value after it. `law` is the law, which is called with the time and, for a torque, with the
+    state and the body. `jumps` (n,), s, are the times at which the law jumps. `stops` (n,), s, are
+    the times at which steps end for these jumps, at most some units of round-off later or earlier;
+    `None` says that the stops are equal to the jumps. `sign` is the direction of time: 1, −1 in a
+    run backwards, or `None` for 1.
     """
 
     law: Any
@@ -56,7 +59,10 @@ class Sided(eqx.Module):
             return self.law(self.seen(t), *args)
 
     def seen(self, t: Any) -> Any:
-        """Return the time for calling the law: `t`, or the nearest time on the correct side."""
+        """Return the time, s, with which the law is called at the time `t` of the run, s.
+
+        It is `t`, or the nearest time on the correct side of a jump.
+        """
         if self.sign is None and self.stops is None:
             return t
         still = lax.stop_gradient(jnp.asarray(t))
@@ -79,7 +85,7 @@ class Sided(eqx.Module):
 
 
 class Constant(eqx.Module):
-    """Evaluate a law or function of time as it is at one time, `time`, s."""
+    """Evaluate a law, or a function of time, at one fixed `time`, s, whenever it is called."""
 
     law: Any
     time: Array
@@ -106,11 +112,11 @@ def with_constant_tables(field: Any, time: Array) -> Any:
     return jax.tree.map(constant, field, is_leaf=is_table)
 
 
-def _declares(node: Any) -> bool:
-    """Return whether a law declares jumps of its own.
+def _declares_jumps(node: Any) -> bool:
+    """Return whether a part of a vector field is a law that jumps in time, by its own declaration.
 
-    A law of this package does if it has jumps; a law of a user does if it has the member
-    `jump_times`, even if that is empty.
+    `node` is any part of the tree of the field. A law of this package declares jumps if it has
+    some; a law of a user does if it has the member `jump_times`, even if that is empty.
     """
     if isinstance(node, type) or not hasattr(node, "jump_times"):
         return False
@@ -120,21 +126,26 @@ def _declares(node: Any) -> bool:
 
 
 def declared_jumps(field: Any) -> list[Array]:
-    """Return the `jump_times`, s, of each part of a vector field that has jumps."""
-    parts = filter(_declares, jax.tree.leaves(field, is_leaf=_declares))
+    """Return a list with the jump times, s, of each part of a vector field that jumps in time.
+
+    `field` is the vector field, a tree of which these parts are torque laws or functions of time.
+    """
+    parts = filter(_declares_jumps, jax.tree.leaves(field, is_leaf=_declares_jumps))
     return [jumps for part in parts if (jumps := jnp.asarray(jumps_of(part))).shape[0]]
 
 
 def on_sides(field: Any, sign: Any, sides: Any) -> Any:
-    """Return the field with each part that declares jumps wrapped in a `Sided` law.
+    """Return a vector field in which each part is evaluated on the correct side of its jumps.
 
-    `sides` is a list with the stops, s, of each part that has jumps, in the order of
-    `declared_jumps`; `None` says that the stops are equal to the jumps. `sign` is as for `Sided`.
+    Each part of `field` that declares jumps in time is wrapped in a `Sided` law. `sign` is the
+    direction of time: 1, −1 in a run backwards, or `None` for 1. `sides` is a list with one array
+    for each part that has jumps, in the order of `declared_jumps`: the times, s, at which steps end
+    for these jumps. `None` says that these times are equal to the jumps.
     """
     stops = iter(sides or ())
 
     def on_side(part: Any) -> Any:
-        if not _declares(part):
+        if not _declares_jumps(part):
             return part
         jumps = jnp.asarray(jumps_of(part))
         own = next(stops, None) if jumps.shape[0] else None
@@ -146,4 +157,4 @@ def on_sides(field: Any, sign: Any, sides: Any) -> Any:
             else Sided(part, jumps, own, sign if jumps.shape[0] else None)
         )
 
-    return jax.tree.map(on_side, field, is_leaf=_declares)
+    return jax.tree.map(on_side, field, is_leaf=_declares_jumps)

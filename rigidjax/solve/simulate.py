@@ -165,17 +165,17 @@ def simulate(
     if stepsize_controller is None:
         rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
-        found = _solution(ClosedFormRun(body, throw), event, state0, times)
+        found = _solve_run(ClosedFormRun(body, throw), event, state0, times)
         return found if accuracy is None else with_error(found, found.error, accuracy)
     # The tolerances are arrays, so that another tolerance does not compile again.
     if stepsize_controller is None:
         rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
     setup = DiffraxRun(
-        body, torque, _solver(solver, adjoint, event, max_steps), rtol, atol, stepsize_controller,
-        None if dt0 is None else validation.checked_first_step(dt0, times), max_step, adjoint,
-        progress_meter or NO_METER, direction(times), max_steps, throw,
+        body, torque, _solver_of_run(solver, adjoint, event, max_steps), rtol, atol,
+        stepsize_controller, None if dt0 is None else validation.checked_first_step(dt0, times),
+        max_step, adjoint, progress_meter or NO_METER, direction(times), max_steps, throw,
     )  # fmt: skip
-    setup = dataclasses.replace(setup, adjoint=_adjoint(setup))
+    setup = dataclasses.replace(setup, adjoint=_adjoint_of_run(setup))
     sought = setup.is_replayed and progress_meter is None
     if accuracy is not None and not sought:
         raise ValueError(
@@ -191,15 +191,21 @@ def simulate(
             "diffrax.Event to diffrax.diffeqsolve"
         )
     if accuracy is not None:
-        return _accurate(setup, event, state0, times, accuracy)
-    return _solution(setup, event, state0, times)
+        return _solve_to_accuracy(setup, event, state0, times, accuracy)
+    return _solve_run(setup, event, state0, times)
 
 
-def _solver(solver: Any, adjoint: Any, event: Any, max_steps: int | None) -> Any:
-    """Return the solver of a run, which keeps attitudes on the group.
+def _solver_of_run(
+    solver: dfx.AbstractSolver | None,
+    adjoint: dfx.AbstractAdjoint | None,
+    event: Event | Callable[..., Any] | None,
+    max_steps: int | None,
+) -> dfx.AbstractSolver:
+    """Return the solver that a run uses, one that keeps attitudes unit quaternions.
 
-    If `solver` is `None`, the solver is the fastest for the given adjoint, event and largest number
-    of steps.
+    The arguments are those of `simulate` with the same names. If `solver` is `None`, the fastest
+    solver that allows the `adjoint`, the `event` and the largest number of steps `max_steps` is
+    returned. A solver of diffrax is wrapped, so that each step scales its quaternion to length 1.
     """
     if solver is None:
         # If the user asks for forward mode alone, diffrax computes the tangents together with the
@@ -212,10 +218,13 @@ def _solver(solver: Any, adjoint: Any, event: Any, max_steps: int | None) -> Any
     return solver if ours else Projected(solver)
 
 
-def _adjoint(setup: DiffraxRun) -> dfx.AbstractAdjoint:
-    """Return the adjoint of a run: `ReplayAdjoint` if it can replace the given adjoint.
+def _adjoint_of_run(setup: DiffraxRun) -> dfx.AbstractAdjoint:
+    """Return the adjoint that a run uses, that is how its derivatives are taken.
 
-    Otherwise return the given adjoint or, if none is given, an adjoint of diffrax for reverse mode.
+    It is `ReplayAdjoint` if the solver is an explicit method of this package and `ReplayAdjoint`
+    can do all that the adjoint in `setup` can. Otherwise it is the adjoint in `setup` or, if this
+    is `None`, an adjoint of diffrax for reverse mode. `setup` also holds the solver and the
+    tolerances of the run.
     """
     explicit = isinstance(setup.solver, AbstractExplicit) and setup.max_steps is not None
     if explicit and isinstance(setup.adjoint, _EITHER_MODE):
@@ -227,17 +236,42 @@ def _adjoint(setup: DiffraxRun) -> dfx.AbstractAdjoint:
     return _EVERY_STEP if tight else ADJOINT
 
 
-def _accurate(setup: DiffraxRun, event: Any, state0: Any, times: Array, accuracy: Any) -> Solution:
-    """Return the solution of a run, with its error, at a tolerance that gives the `accuracy`."""
+def _solve_to_accuracy(
+    setup: DiffraxRun,
+    event: Event | Callable[..., Any] | None,
+    state0: Any,
+    times: Array,
+    accuracy: ScalarLike,
+) -> Solution:
+    """Solve to a wanted accuracy: find a tolerance, and return the solution with its error.
+
+    **Arguments:**
+
+    - `setup`: the body, the torque and the solver of the run.
+    - `event`: an `Event` or a condition that ends the run, or `None`.
+    - `state0`: the state at the time `times[0]`.
+    - `times`: (T,) s, the times at which states are saved.
+    - `accuracy`: the wanted error, rad for rotations, else relative to the largest value in the
+      run.
+    """
     found, run, search = solve_to(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
-    sol = _solution(found, event, state0, times, None if event is not None else run)
+    sol = _solve_run(found, event, state0, times, None if event is not None else run)
     error = estimate_error_of_run(found, times, sol._states, sol.stats["num_steps"], search)
     return with_error(sol, error, accuracy)
 
 
-def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None) -> Solution:
-    """Return the solution of a run; `run` holds the results of `solve` if these are known."""
+def _solve_run(setup: Any, event: Any, state0: Any, times: Array, run: Any = None) -> Solution:
+    """Solve a run, and return it as a `Solution`.
+
+    **Arguments:**
+
+    - `setup`: the body, the torque and how the motion is solved, a `ClosedFormRun` or `DiffraxRun`.
+    - `event`: an `Event` or a condition that ends the run, or `None`.
+    - `state0`: the state at the time `times[0]`.
+    - `times`: (T,) s, the times at which states are saved.
+    - `run`: what `solve` returned for this run, if it is already known; else `None`.
+    """
     event_time = event_state = None
     try:
         if run is not None:

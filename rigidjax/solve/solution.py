@@ -148,7 +148,7 @@ class Solution(eqx.Module, Generic[State]):
         if self._error is not None:
             return self._error
         found = estimate_error_of_run(self._setup, self.ts, self._states, self.stats["num_steps"])
-        _say(found, 0.5, "error: nothing is known of the states")
+        _warn_of_error(found, 0.5, "error: nothing is known of the states")
         return found
 
     def transition_matrix(self) -> Float[Array, "times n n"]:
@@ -164,7 +164,7 @@ class Solution(eqx.Module, Generic[State]):
         [0.0, 0.0, 1.0]
         """
         require_stateless(self._setup.torque, "transition_matrix")
-        return _transition(self._setup, self.ts, self.ys)
+        return _transition_matrix(self._setup, self.ts, self.ys)
 
     def evaluate(self, t: ScalarLike) -> State:
         """Return the state at any time `t`, s, between the first and the last of `ts`.
@@ -186,21 +186,30 @@ class Solution(eqx.Module, Generic[State]):
 
     @property
     def _setup(self) -> Any:
+        """Return the set-up of the run: the body, the torque, the solver and its tolerances."""
         return eqx.combine(self._arrays, self._rest)
 
     @property
     def _states(self) -> Any:
+        """Return the states at `ts`, joined with the states of the torque if it has some."""
         return self.ys if self.own is None else Coupled(self.ys, self.own)
 
 
 def with_error(sol: Solution, error: Error, accuracy: Any) -> Solution:
-    """Return the solution with its error; warn if the error exceeds the accuracy asked for."""
-    _say(error, accuracy, "simulate: the accuracy cannot be had")
+    """Return a solution that stores its known error; warn if the error exceeds the accuracy.
+
+    `accuracy` is the error that the user allows, rad for rotations, else relative.
+    """
+    _warn_of_error(error, accuracy, "simulate: the accuracy cannot be had")
     return dataclasses.replace(sol, _error=error)
 
 
-def _say(error: Error, most: Any, words: str) -> None:
-    """Warn with `words` if the relative error exceeds `most`, and name the first such time."""
+def _warn_of_error(error: Error, most: Any, words: str) -> None:
+    """Warn if the error of a run exceeds a limit, and name the first time at which it does.
+
+    `most` is the limit of the relative error (rad for rotations), and `words` is the beginning of
+    the message.
+    """
     if not _checks.is_known((error, most)) or not np.any(np.asarray(error.relative) > most):
         return
     i = int(np.argmax(np.asarray(error.relative) > most))
@@ -218,11 +227,22 @@ def _say(error: Error, most: Any, words: str) -> None:
 
 @eqx.filter_jit
 def _drift(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> dict[str, Array]:
+    """Return the relative drift of each quantity that the motion conserves, by its name.
+
+    `setup` holds the body and the torque; `ys` are the states at the times `ts` (T,), s.
+    """
     return drift(ts, ys, setup.body, setup.torque)  # pyright: ignore[reportArgumentType]
 
 
 @eqx.filter_jit
-def _transition(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, "times n n"]:
+def _transition_matrix(
+    setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any
+) -> Float[Array, "times n n"]:
+    """Return the derivatives (T, n, n) of the states at all times with respect to the first state.
+
+    `setup` holds the body, the torque and the solver; `ys` are the states at the times `ts` (T,),
+    s. Rows and columns are the n numbers of a small change of a state on its tangent space.
+    """
     # The run must not raise an error, and it must be differentiable in forward mode.
     plain = isinstance(setup, DiffraxRun) and not setup.is_replayed
     more = dict(adjoint=dfx.ForwardMode()) if plain else {}
@@ -237,8 +257,11 @@ def _transition(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[
 
 @eqx.filter_jit
 def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, " times"]:
-    """Return the largest singular value of ∂y(t)/∂y(t₀), with each array divided by its largest
-    size.
+    """Return by which factor a small error at the start has grown at each saved time, (T,).
+
+    The factor is the largest singular value of ∂y(t)/∂y(t₀), after each array of the state y is
+    divided by its largest length in the run. `setup` holds the body, the torque and the solver;
+    `ys` are the states at the times `ts` (T,), s.
     """
     start = jax.tree.map(lambda leaf: leaf[0], ys)
     each = parts_by_name(start, jnp.ones(dimension(start), ts.dtype)).values()
@@ -248,5 +271,5 @@ def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Arra
     # A turn by δθ changes q by half of δθ.
     for turned in rotation_slices(start):
         sizes = sizes.at[turned].multiply(2)
-    change = _transition(setup, ts, ys) * (sizes[None] / sizes[:, None])[None]
+    change = _transition_matrix(setup, ts, ys) * (sizes[None] / sizes[:, None])[None]
     return jnp.linalg.norm(change, ord=2, axis=(1, 2))

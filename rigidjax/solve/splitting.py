@@ -39,9 +39,11 @@ from rigidjax.solve.tableaus import parse_numbers
 
 
 class Composition(NamedTuple):
-    """Hold a symmetric composition `B(b1) A(a1) … B(b1)` by its order and weights.
+    """Hold a splitting method B(b1) A(a1) B(b2) … A(a1) B(b1) by its order and its weights.
 
-    `flows` are the weights a1, a2, … of A, and `kicks` the weights b1, b2, … of B (see the module).
+    A(a) is the exact motion of the free body during the time a h, where h is the length of a step.
+    B(b) is a kick, which adds b h times the torque to the momentum. `flows` are the weights a1, a2,
+    …, and `kicks` the weights b1, b2, ….
     """
 
     order: int
@@ -49,11 +51,15 @@ class Composition(NamedTuple):
     kicks: tuple[float, ...]
 
 
-def _symmetric(order: int, flows: tuple[float, ...], kicks: tuple[float, ...]) -> Composition:
-    """Return the composition whose weights begin with `flows` and `kicks`.
+def _symmetric_composition(
+    order: int, flows: tuple[float, ...], kicks: tuple[float, ...]
+) -> Composition:
+    """Return a symmetric splitting method of the given `order`, from the first of its weights.
 
-    The middle weights follow because the `flows` sum up to 1 and the `kicks` sum up to 1. The last
-    weights follow from the symmetry.
+    A step of the method alternates between exact free motions, each during a part of the step, and
+    kicks, each of which adds a part of the torque's impulse to the momentum. `flows` are the first
+    of these parts for the free motions, and `kicks` for the kicks. The middle weights follow
+    because the weights of each kind sum up to 1; the last weights follow from the symmetry.
     """
     if len(flows) < len(kicks):
         middle = 1 - 2 * sum(kicks)
@@ -69,12 +75,12 @@ STRANG = Composition(2, (1.0,), (0.5, 0.5))
 # Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, methods SRKN6b and SRKN11b. These methods
 # are for kicks B that commute with [B, [B, A]], where [·, ·] is the commutator. This holds here,
 # because B and [B, [B, A]] both change only the momentum, by a function of the attitude.
-SRKN6 = _symmetric(
+SRKN6 = _symmetric_composition(
     4,
     parse_numbers("0.245298957184271 0.604872665711080"),
     parse_numbers("0.0829844064174052 0.396309801498368 -0.0390563049223486"),
 )
-SRKN11 = _symmetric(
+SRKN11 = _symmetric_composition(
     6,
     parse_numbers("""
     0.123229775946271 0.290553797799558 -0.127049212625417 -0.246331761062075 0.357208872795928
@@ -92,12 +98,15 @@ class Frame(NamedTuple):
     """
 
     moments: Six  # the inertia, kg m²
-    weights: Six  # its inverse
+    weights: Six  # the inverse of the inertia, 1/(kg m²)
     axes: Array  # (3, 3), the axes as columns
 
 
 def frame_of_tensor(tensor: Array) -> Frame:
-    """Return the principal frame of an inertia `tensor` (3, 3), kg m²."""
+    """Return the principal axes of a body, with its inertia and the inverse along these axes.
+
+    `tensor` (3, 3) is the inertia in body axes, kg m².
+    """
     six, axes = principal_frame(tensor)
     # The tensor is divided by its trace before it is inverted, because the determinant of an
     # inertia of 1e37 kg m² would overflow.
@@ -108,9 +117,14 @@ def frame_of_tensor(tensor: Array) -> Frame:
 
 
 @jax.custom_jvp
-def rate_of(weights: Six, p: Triple) -> Triple:
-    """Return the body rate Ω of the momentum `p`, both along the principal axes."""
-    return weights[0] * p[0], weights[1] * p[1], weights[2] * p[2]
+def rate_of(inverse: Six, momentum: Triple) -> Triple:
+    """Return the body rate Ω = I⁻¹Π along the principal axes, three numbers, rad/s.
+
+    `momentum` is Π along these axes, three numbers, N m s. `inverse` has the six entries (11, 22,
+    33, 12, 13, 23) of I⁻¹, the inverse of the inertia. The off-diagonal entries are zero, but they
+    have tangents.
+    """
+    return inverse[0] * momentum[0], inverse[1] * momentum[1], inverse[2] * momentum[2]
 
 
 @rate_of.defjvp
@@ -160,7 +174,7 @@ class AbstractSplitting(dfx.AbstractSolver):
         # the same in each step and would add up.
         omega = y0.omega + leave(solver_state, dp)
         y1 = Attitude(quaternion.normalise(y0.q + dq), omega)
-        dense = dict(y0=y0, coefficients=_dense_rows(terms, t0, t1, args, y0, y1))
+        dense = dict(y0=y0, coefficients=_quintic_coefficients(terms, t0, t1, args, y0, y1))
         return y1, None, dense, solver_state, dfx.RESULTS.successful
 
     def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree) -> Any:
@@ -218,9 +232,11 @@ class Splitting6(AbstractSplitting):
 
 
 def frame_of(field: Any, y0: Any) -> Frame:
-    """Return the principal frame of the body of a field on the `Attitude` state `y0`.
+    """Return the principal axes of the body of a vector field, with the inertia along them.
 
-    Raise `TypeError` for any other field or state, and for a torque that reads the body rate.
+    `field` are the equations of an attitude, and `y0` is the `Attitude` at the start, whose dtype
+    the result has. Raise `TypeError` for any other field or state, and for a torque that reads the
+    body rate.
     """
     # If the torque reads the body rate, a kick is no exact flow, and the order would fall to 1.
     torque = require_attitude("Splitting", field, y0, "DormandPrince8").euler.torque
@@ -234,23 +250,39 @@ def frame_of(field: Any, y0: Any) -> Frame:
 
 
 def enter(frame: Frame, omega: Array) -> Triple:
-    """Return the momentum Π along the principal axes for the body rate `omega` in body axes."""
+    """Return the momentum Π = IΩ along the principal axes, three numbers, N m s.
+
+    `frame` holds the principal axes and the inertia I along them; `omega` (3,) is the body rate Ω
+    in body axes, rad/s.
+    """
     return matvec(frame.moments, components_along(frame.axes, omega))
 
 
 def leave(frame: Frame, momentum: Triple) -> Array:
-    """Return the body rate Ω in body axes for the `momentum` along the principal axes."""
+    """Return the body rate Ω = I⁻¹Π in body axes (3,), rad/s.
+
+    `frame` holds the principal axes and the inverse inertia I⁻¹ along them; `momentum` is Π along
+    the principal axes, three numbers, N m s.
+    """
     return jnp.stack(combine_columns(frame.axes, rate_of(frame.weights, momentum)))
 
 
 def compose(
     composition: Composition, field: AttitudeEquations, frame: Frame, t: Any, h: Any, state: Any
 ) -> tuple[Array, Triple]:
-    """Return the changes of the attitude q and of the momentum Π in one step.
+    """Take one step of a splitting method: exact free motions and kicks by the torque in turn.
 
-    `t` is the time at the start of the step, and `h` the length of the step, s. `state` is the pair
-    of q and Π at the start; Π is along the principal axes of `frame`. The changed q is not scaled
-    to length 1.
+    **Arguments:**
+
+    - `composition`: the weights of the method.
+    - `field`: the equations of the attitude, which hold the torque and the inertia.
+    - `frame`: the principal axes of the body, and the inertia along them.
+    - `t`, `h`: the time at the start of the step, and its length, s.
+    - `state`: the pair of the quaternion q (4,) and the momentum Π at the start; Π is three numbers
+      along the principal axes, N m s.
+
+    **Returns** the change of q and the change of Π in the step. The changed q is not scaled to
+    length 1.
     """
     dtype = state[0].dtype
 
@@ -294,13 +326,22 @@ def compose(
     return dq, change
 
 
-def _dense_rows(
+def _quintic_coefficients(
     terms: PyTree[dfx.AbstractTerm], t0: Any, t1: Any, args: PyTree, y0: PyTree, y1: PyTree
 ) -> Any:
-    """Return the rows for `nested` of a quintic, which is dense output of order 6.
+    """Return the coefficients of a polynomial of degree 5 that interpolates within a step.
 
-    At both ends of the step the quintic has the state of the motion and its first and second time
-    derivatives.
+    At both ends of the step the polynomial has the state of the motion and its first and second
+    time derivatives, so that the dense output is of order 6.
+
+    **Arguments:**
+
+    - `terms`, `args`: the `diffrax.ODETerm` of the vector field, and the argument of its calls.
+    - `t0`, `t1`: the times of diffrax at which the step begins and ends, s.
+    - `y0`, `y1`: the states at the two ends of the step.
+
+    **Returns** a tree like the state, whose arrays (5, …) have the five coefficients in the form
+    that `runge_kutta.nested` evaluates.
     """
     way, length = direction_and_length(terms, t0, t1)
     h = way * length

@@ -26,7 +26,8 @@ from rigidjax.solve.adaptive_loop import (
 NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
 
 
-def _of(name: str) -> Any:
+def _attribute_of_controller(name: str) -> Any:
+    """Define a property that reads the attribute `name` of the wrapped `controller`."""
     return property(lambda self: getattr(self.controller, name))
 
 
@@ -69,10 +70,10 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
         error_order: RealLike | None,
     ) -> tuple[Any, Any]:
         assert dt0 is not None
-        return t0 + self._limited(dt0), ()
+        return t0 + self._limited_length(dt0), ()
 
-    def _limited(self, length: Any) -> Any:
-        """Return the length of a step, or `dtmax` if that is shorter."""
+    def _limited_length(self, length: Any) -> Any:
+        """Return the `length` of a step, s, or the longest allowed step if this is shorter."""
         return length if self.dtmax is None else jnp.minimum(length, self.dtmax)
 
     def adapt_step_size(
@@ -101,7 +102,7 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
             self.norm(jax.tree.map(over_tolerance, *still)), error_order, t1 - t0
         )
         left = jnp.where(keep, t1, t0)
-        right = left + self._limited(length)
+        right = left + self._limited_length(length)
         return keep, left, right, False, controller_state, dfx.RESULTS.successful
 
 
@@ -123,9 +124,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     def __init__(self, controller: dfx.AbstractStepSizeController):
         self.controller = controller
 
-    rtol = _of("rtol")
-    atol = _of("atol")
-    norm = _of("norm")
+    rtol = _attribute_of_controller("rtol")
+    atol = _attribute_of_controller("atol")
+    norm = _attribute_of_controller("norm")
 
     def wrap(self, direction: PyTree) -> "Watched":
         return Watched(self.controller.wrap(direction))
@@ -164,15 +165,15 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         # `least`, the round-off of the length of the run.
         least = jnp.finfo(begin.dtype).eps * jnp.abs(end - begin)
         # Steps of length 0 would be accepted without end, but a step of length NaN ends the run.
-        shortest = begin + self._unit(begin, least)
+        shortest = begin + self._shortest_step(begin, least)
         first = jnp.where(sound, jnp.maximum(first, shortest), jnp.nan)
         return first.astype(begin.dtype), (inner, least)
 
     def _first_step(self, y: PyTree, slope: PyTree, order: RealLike) -> Array:
-        """Return the first step from the state `y` and its derivative `slope`.
+        """Choose the length of the first step of a run, s, by the sizes of the state and its slope.
 
-        The result is 0 or NaN if the state or its derivative is not finite; `order` is the order of
-        the error of a step.
+        `y` is the state at the start, `slope` its time derivative, and `order` the order of the
+        error of a step. The length is 0 or NaN if the state or its derivative is not finite.
         """
         y, tree = ravel_pytree(y)
         scale = self.atol + self.rtol * jnp.abs(y)
@@ -183,9 +184,10 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         size, rate = (jnp.asarray(self.norm(of_state(a / scale))) for a in both)
         return starting_step(size, rate, order)
 
-    def _unit(self, t: ArrayLike, least: ArrayLike) -> Array:
-        """Return the shortest step at the time `t`: 8 units of round-off of the larger of |t| and
-        `least`.
+    def _shortest_step(self, t: ArrayLike, least: ArrayLike) -> Array:
+        """Return the length of the shortest step that the resolution of the time allows, s.
+
+        It is 8 units of round-off of the time `t`, s, or of `least` if |t| is smaller than `least`.
         """
         return 8 * jnp.finfo(jnp.result_type(t)).eps * jnp.maximum(jnp.abs(t), least)
 
@@ -204,7 +206,7 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
-        unit = self._unit(left, least)
+        unit = self._shortest_step(left, least)
         stuck = ~keep & ~(right - left > unit)
         # If even the shortest possible step has NaN, a still shorter step might have none. The
         # reason given is then that no step is short enough.
@@ -240,9 +242,9 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         still = lax.stop_gradient(stops)
         self.following = jnp.searchsorted(still, still, side="right").astype(jnp.int32)
 
-    rtol = _of("rtol")
-    atol = _of("atol")
-    norm = _of("norm")
+    rtol = _attribute_of_controller("rtol")
+    atol = _attribute_of_controller("atol")
+    norm = _attribute_of_controller("norm")
 
     def wrap(self, direction: PyTree) -> "Stopping":
         way = jnp.asarray(direction).astype(self.stops.dtype)
@@ -269,9 +271,11 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         )
 
     def _stop_and_moment_before(self, index: Any) -> tuple[Any, Any]:
-        """Return the stop with this `index`, and the last floating-point number before the stop.
+        """Return two times: that of the stop number `index`, and the last number before this time.
 
-        If `index` is beyond the last stop, the two results are infinite.
+        A stop is a time at which steps end because the field jumps. The last floating-point number
+        before a stop is the time at which the step before the stop ends. If `index` is beyond the
+        last stop, both times are infinite.
         """
         none = jnp.full_like(self.stops[:1], jnp.inf)
         stop = row_of_each_body(jnp.concatenate([self.stops, none]), index)

@@ -42,9 +42,11 @@ _MANY = 10_000
 
 
 class Stepper(NamedTuple):
-    """Hold functions that take fixed steps of one body, on numbers y that stand for its state.
+    """Hold what takes fixed steps of one body: numbers y for its state, and their change in a step.
 
-    A step goes from the time `t` to `end`, s, and has the length `h`, s.
+    A step goes from the time `t` to the time `end`, s, and has the length `h`, s. The numbers y
+    stand for the state, from which they may differ: they may be the momentum in the place of the
+    body rate. `inputs` are the values of the torque's inputs during the step, or `None`.
     """
 
     start: Any  # the numbers y at the start, which stand for the state there
@@ -57,7 +59,7 @@ class Stepper(NamedTuple):
 
 
 class Carrying(NamedTuple):
-    """Take the steps of the stepper `of` with compensated summation.
+    """Take the fixed steps of the stepper `of`, and carry the rounding errors of the sums along.
 
     Each step computes the rounding error of the addition of the change to y, and the next step adds
     this error to its change. The round-off of n steps then grows as √n, not as n. The rounding
@@ -69,6 +71,7 @@ class Carrying(NamedTuple):
 
     @property
     def start(self) -> Any:
+        """Return the numbers of the state at the start, and their rounding errors, which are 0."""
         return self.of.start, jax.tree.map(jnp.zeros_like, self.of.start)
 
     @property
@@ -83,6 +86,7 @@ class Carrying(NamedTuple):
         return after, lax.stop_gradient(lost)
 
     def state(self, y: Any) -> Any:
+        """Return the state for `y`, a pair of its numbers and of their rounding errors."""
         return self.of.state(y[0])
 
 
@@ -90,30 +94,49 @@ AnyStepper = Stepper | Carrying
 
 
 def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) -> AnyStepper:
-    """Return the stepper of a vector field under `solver`; `None` stands for the cheapest solver.
+    """Return the object that takes fixed steps of a vector field by a method, a `Stepper`.
 
-    `y0` is the state at the start, and `count` the number of steps. If `count` is at least 10 000
-    or is traced, the stepper is a `Carrying`.
+    **Arguments:**
+
+    - `solver`: a method of `rigidjax.solvers`; `None` stands for the cheapest one.
+    - `field`: the vector field `f(t, y, args)` of one body.
+    - `y0`: the state at the start.
+    - `count`: the number of steps. If it is at least 10 000 or is traced, the stepper is a
+      `Carrying`, which also carries the rounding errors of the sums along.
     """
     stepper = _stepper_of(solver, field, y0)._replace(delays=tuple(delays_of(field)))
     return Carrying(stepper) if not isinstance(count, int) or count >= _MANY else stepper
 
 
 def cheapest(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
-    """Return the method of order 4 that takes the least work for this field."""
+    """Return the method of order 4 that takes the least work for a vector field.
+
+    It is `Magnus4` for the attitude of a body whose torque does not read the attitude, else
+    `RungeKutta4`.
+    """
     attitude = isinstance(field, AttitudeEquations)
     blind = attitude and not sees_attitude(field.euler.torque)
     return Magnus4() if blind else RungeKutta4()
 
 
 def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
-    turning = _turning(field, y0)
+    """Return the stepper of a vector field under a method, without its delayed inputs.
+
+    `solver` is a method of `rigidjax.solvers` (`None`: the cheapest one), `field` the vector field
+    `f(t, y, args)`, and `y0` the state at the start. Raise `TypeError` if the method cannot take
+    fixed steps of this field.
+    """
+    turning = _inertia_and_torque(field, y0)
     solver = cheapest(field) if solver is None else solver
     if isinstance(solver, Magnus4) and isinstance(y0, Attitude) and turning is not None:
         require_blind(turning.torque)
-        return _free(turning.inertia, y0) if turning.torque is None else _magnus(turning, y0)
+        return (
+            _stepper_of_free_body(turning.inertia, y0)
+            if turning.torque is None
+            else _stepper_of_magnus(turning, y0)
+        )
     if isinstance(solver, AbstractSplitting):
-        return _split(solver, field, y0)
+        return _stepper_of_splitting(solver, field, y0)
     if not isinstance(solver, AbstractExplicit | StepWithLoopedStages):
         raise TypeError(
             f"no fixed steps of {type(solver).__name__} on {type(y0).__name__}; wanted "
@@ -122,36 +145,41 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
             "stepsize_controller=diffrax.ConstantStepSize() under jax.vmap"
         )
     if turning is not None:
-        return _explicit(solver, turning, y0)
+        return _stepper_of_explicit_method(solver, turning, y0)
     slope = lambda inputs: lambda t, y: split(bind(field, inputs)(t, join(y, y0), None))  # noqa: E731
-    return _of_slope(solver, slope, split(y0), lambda y: join(y, y0), y0)
+    return _stepper_of_slope(solver, slope, split(y0), lambda y: join(y, y0), y0)
 
 
-class _Turning(NamedTuple):
-    """Hold the inertia, the six entries of its inverse, and the torque; the dtype is that of the
-    state.
-    """
+class _InertiaAndTorque(NamedTuple):
+    """Hold the inertia and the torque of a body that only turns, in the precision of its state."""
 
     inertia: Inertia
-    weights: Six
-    torque: Any
+    weights: Six  # the six different entries of the inverse of the inertia, 1/(kg m²)
+    torque: Any  # the torque law, or `None` for a free body
 
 
-def _turning(field: Any, y0: Any) -> _Turning | None:
-    """Return inertia and torque from the field of a body that only turns; else `None`."""
+def _inertia_and_torque(field: Any, y0: Any) -> _InertiaAndTorque | None:
+    """Return the inertia and the torque of a body that only turns, or `None` for other motions.
+
+    `field` is the vector field of the body, and `y0` its state at the start.
+    """
     euler = field.euler if isinstance(field, AttitudeEquations) else field
     if not isinstance(euler, EulerEquations) or not isinstance(y0, Spin | Attitude):
         return None
     dtype = y0.omega.dtype
     inertia = jax.tree.map(lambda a: a.astype(dtype), euler.inertia)
-    return _Turning(inertia, _entries(euler.inverse.astype(dtype)), euler.torque)
+    return _InertiaAndTorque(
+        inertia, _entries_of_symmetric_matrix(euler.inverse.astype(dtype)), euler.torque
+    )
 
 
-def _free(body: Inertia, state0: Attitude) -> Stepper:
-    """Return the stepper of a free body, whose momentum is along the principal axes.
+def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
+    """Return the object that takes fixed steps of a free body by Magnus' method of order 4.
 
-    Derivatives hold the principal axes fixed. The off-diagonal entries of the inertia along these
-    axes are zero, but they have tangents that are not zero.
+    `body` is the inertia, and `state0` the state at the start. The numbers that it carries are the
+    quaternion of the turn since the start and the momentum Π, both along the principal axes of the
+    body. Derivatives hold the principal axes fixed. The off-diagonal entries of the inertia along
+    these axes are zero, but they have tangents that are not zero.
     """
     frame = splitting.frame_of_tensor(body.tensor)
     weights, axes = frame.weights, frame.axes
@@ -161,7 +189,7 @@ def _free(body: Inertia, state0: Attitude) -> Stepper:
     one, none = jnp.ones_like(a), jnp.zeros_like(a)
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
-        slope = lambda _, p: _free_slope(weights, gaps, p)  # noqa: E731
+        slope = lambda _, p: _free_momentum_derivative(weights, gaps, p)  # noqa: E731
         dp, turn = change_and_turn(slope, partial(splitting.rate_of, weights), t, end, h, y[4:])
         return (*product4(y[:4], turn), *dp)
 
@@ -176,31 +204,38 @@ def _free(body: Inertia, state0: Attitude) -> Stepper:
 
 
 @jax.custom_jvp
-def _free_slope(weights: Six, gaps: Triple, p: Triple) -> Triple:
-    """Return dΠ/dt = Π × Ω for the momentum `p`, along the principal axes.
+def _free_momentum_derivative(inverse: Six, differences: Triple, momentum: Triple) -> Triple:
+    """Return the time derivative of the momentum of a free body, dΠ/dt = Π × Ω, N m.
 
-    `weights` are the six entries of the inverse of the inertia. With its diagonal entries a, b and
-    c, `gaps` are the differences (c − b, a − c, b − a).
+    `momentum` is Π, three numbers along the principal axes, N m s; Ω is the body rate. `inverse`
+    has the six entries (11, 22, 33, 12, 13, 23) of the inverse of the inertia along these axes, and
+    `differences` are those of its diagonal entries a, b and c: (c − b, a − c, b − a).
     """
-    return gaps[0] * (p[1] * p[2]), gaps[1] * (p[2] * p[0]), gaps[2] * (p[0] * p[1])
+    d, p = differences, momentum
+    return d[0] * (p[1] * p[2]), d[1] * (p[2] * p[0]), d[2] * (p[0] * p[1])
 
 
-@_free_slope.defjvp
-def _free_slope_jvp(primals, tangents):
+@_free_momentum_derivative.defjvp
+def _free_momentum_derivative_jvp(primals, tangents):
     (weights, gaps, p), (dw, _, dp) = primals, tangents
     rate, turning = splitting.rate_of_jvp((weights, p), (dw, dp))
-    return _free_slope(weights, gaps, p), add(cross(dp, rate), cross(p, turning))
+    return _free_momentum_derivative(weights, gaps, p), add(cross(dp, rate), cross(p, turning))
 
 
-def _entries(a: Array) -> Six:
-    """Return the six different entries of a symmetric matrix (3, 3)."""
+def _entries_of_symmetric_matrix(a: Array) -> Six:
+    """Return the six entries (11, 22, 33, 12, 13, 23) of the symmetric matrix `a` (3, 3)."""
     # Both halves of the matrix are used, so that the derivative is symmetric as the matrix is.
     off = [0.5 * (a[i, j] + a[j, i]) for i, j in ((0, 1), (0, 2), (1, 2))]
     return a[0, 0], a[1, 1], a[2, 2], *off
 
 
-def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
-    """Return the stepper of `Magnus4` for a torque that does not read the attitude."""
+def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
+    """Return the object that takes fixed steps by Magnus' method, under a torque.
+
+    The torque may read the time and the body rate, not the attitude. `turning` holds the inertia
+    and the torque of the body, and `state0` is the state at the start. The numbers carried are the
+    quaternion and the momentum in body axes.
+    """
     body, weights, torque = turning
     start, rate = split(state0), partial(matvec, weights)
 
@@ -219,13 +254,20 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
     def state(y: Atoms) -> Attitude:
         return Attitude(quaternion.normalise(jnp.stack(y[:4])), jnp.stack(rate(y[4:])))
 
-    return Stepper((*start[:4], *matvec(_entries(body.tensor), start[4:])), change, state)
+    return Stepper(
+        (*start[:4], *matvec(_entries_of_symmetric_matrix(body.tensor), start[4:])), change, state
+    )
 
 
-def _explicit(
-    solver: AbstractExplicit | StepWithLoopedStages, turning: _Turning, state0: Any
+def _stepper_of_explicit_method(
+    solver: AbstractExplicit | StepWithLoopedStages, turning: _InertiaAndTorque, state0: Any
 ) -> Stepper:
-    """Return the stepper of an explicit method for a body that only turns."""
+    """Return the object that takes fixed steps of an explicit method for a body that only turns.
+
+    `solver` is the Runge–Kutta method, `turning` holds the inertia and the torque of the body, and
+    `state0` is the state at the start, a `Spin` or an `Attitude`. The numbers carried are the
+    quaternion, if there is one, and the momentum in body axes.
+    """
     body, weights, torque = turning
     start = split(state0)
     many = len(start) - 3
@@ -249,27 +291,41 @@ def _explicit(
     def state(y: Atoms) -> Any:
         return join((*y[:many], *matvec(weights, y[many:])), state0)
 
-    momentum = matvec(_entries(body.tensor), start[many:])
-    return _of_slope(solver, slope_under, (*start[:many], *momentum), state, state0)
+    momentum = matvec(_entries_of_symmetric_matrix(body.tensor), start[many:])
+    return _stepper_of_slope(solver, slope_under, (*start[:many], *momentum), state, state0)
 
 
-def _of_slope(solver: Any, slope_under: Any, start: Atoms, state: Any, like: Any) -> Stepper:
-    """Return the stepper of an explicit method for the slope `slope_under(inputs)(t, y)`.
+def _stepper_of_slope(
+    solver: AbstractExplicit | StepWithLoopedStages,
+    slope_under: Callable[[Any], Callable[[Any, Atoms], Atoms]],
+    start: Atoms,
+    state: Callable[[Atoms], Any],
+    like: Any,
+) -> Stepper:
+    """Return the object that takes fixed steps of an explicit method, for a slope dy/dt.
 
-    `like` is an example of y: a tree with the structure, the shapes and the dtypes of y.
+    **Arguments:**
+
+    - `solver`: the Runge–Kutta method.
+    - `slope_under`: `slope_under(inputs)` returns, for the values of the torque's inputs, the
+      function `(t, y)` that gives dy/dt.
+    - `start`: the numbers y at the start, a tuple of scalars that stand for the state.
+    - `state`: a function that returns the state for the numbers y.
+    - `like`: a state with the structure, the shapes and the dtypes into which y can be joined.
     """
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
-        return _to_unit_length(y, change_in(solver, slope_under(inputs), t, h, y, end), like)
+        return _change_to_unit_length(y, change_in(solver, slope_under(inputs), t, h, y, end), like)
 
     return Stepper(start, change, state)
 
 
-def _to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
-    """Return the `change` of the numbers `y`, corrected so that y + change has a unit quaternion.
+def _change_to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
+    """Return the change of a state in a step, corrected so that the quaternion after it is unit.
 
-    `like` is a state with the structure of `y`. If this state has no attitude, `change` is returned
-    unchanged.
+    `y` are the numbers of the state before the step, a tuple of scalars, and `change` the changes
+    of these numbers. `like` is a state with the structure that the numbers have. If this state has
+    no attitude, `change` is returned as it is.
     """
     if not isinstance(motion_of(like), HasAttitude):
         return change
@@ -291,8 +347,13 @@ def _to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
     return split(eqx.tree_at(lambda s: motion_of(s).q, join(change, like), q))
 
 
-def _split(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
-    """Return the stepper of a splitting."""
+def _stepper_of_splitting(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
+    """Return the object that takes fixed steps of a splitting: free motions and kicks in turn.
+
+    `solver` is the splitting, `field` the equations of an attitude under a torque of time and
+    attitude, and `state0` the state at the start. The numbers carried are the quaternion and the
+    momentum along the principal axes.
+    """
     # No step converts the momentum Π to Ω = I⁻¹Π and back, so that |Π| drifts only by the round-off
     # of the free motion.
     frame = splitting.frame_of(field, state0)

@@ -23,7 +23,10 @@ from rigidjax.solve.switching_times import field_with_stops, separate_times, tim
 
 
 def say_unseen(analysis: Analysis) -> None:
-    """Warn for each line of a law that may switch at times that cannot be found before the run."""
+    """Warn for each line of a torque that may jump at times that cannot be found before the run.
+
+    `analysis` is what was found in the traced vector field.
+    """
     for line in dict.fromkeys(analysis.unseen):
         warnings.warn(
             f"simulate: a law may jump at a time that is not found before the run ({line}): steps "
@@ -45,7 +48,10 @@ class TracedProgram(NamedTuple):
         return [c for c in self.closed.consts if eqx.is_array(c)]
 
     def consts(self, constants: Arrays) -> Arrays:
-        """Return all constants of the program, in which `constants` replace the JAX arrays."""
+        """Return all constants of the traced function, after a replacement of its JAX arrays.
+
+        `constants` are the arrays that replace the JAX arrays, in order; its NumPy arrays stay.
+        """
         arrays = iter(constants)
         return [next(arrays) if eqx.is_array(c) else c for c in self.closed.consts]
 
@@ -55,7 +61,11 @@ class TracedProgram(NamedTuple):
 
 
 def trace_program(function: Callable[..., Any], *like: Any) -> TracedProgram:
-    """Return the `TracedProgram` of a function for arguments of the shapes and dtypes of `like`."""
+    """Return a function after it was traced, with the arrays that it closes over as an argument.
+
+    `like` are examples of its arguments, of which only shapes and dtypes count. The result is
+    called as `call(constants, *args)`.
+    """
     closed, out = jax.make_jaxpr(function, return_shape=True)(*like)
     return TracedProgram(closed, jax.tree.structure(out))
 
@@ -63,7 +73,12 @@ def trace_program(function: Callable[..., Any], *like: Any) -> TracedProgram:
 def constants_of(
     functions: list[Callable[..., Any]], *like: Any
 ) -> tuple[list[Callable[..., Any]], Arrays]:
-    """Return each function as `f(constants, *args)`, and the constants of all functions."""
+    """Return several functions, with the arrays that they close over (constants) as an argument.
+
+    `like` are examples of the arguments, which all functions share. **Returns** two lists: the
+    functions, to be called as `f(constants, *args)`; and the constants of all functions, which each
+    of them takes.
+    """
     programs = [trace_program(function, *like) for function in functions]
     ends = np.cumsum([0, *(len(program.constants) for program in programs)])
 
@@ -87,11 +102,15 @@ class ProgramWithStops(NamedTuple):
 def program_with_stops(
     function: Callable[..., Array], declared: list[Array], a: Array, b: Array, y: Array
 ) -> ProgramWithStops:
-    """Return the field `function(t, y, *sides)` with all its stops between the times a and b, s.
+    """Return a vector field with all times at which steps must end, because the field jumps there.
 
-    `declared` is a list with the jump times, s, of each part of the field that declares jumps. If
-    there are several such parts, the function gets as `sides` one array for each part: the stops,
-    s, for the jumps of the part.
+    **Arguments:**
+
+    - `function`: the field `(t, y, *sides)`. If several parts of it declare jumps, it gets as
+      `sides` one array for each part: the times, s, at which steps end for the jumps of the part.
+    - `declared`: a list with the jump times, s, of each part of the field that declares jumps.
+    - `a`, `b`: the times between which the run lies, s.
+    - `y`: an example of the state.
     """
     declared = [times.astype(a.dtype) for times in declared if times.size]
     likes = declared if len(declared) > 1 else []
@@ -104,12 +123,12 @@ def program_with_stops(
             stops = jnp.clip(jnp.sort(declared[0]), a, b) if declared else jnp.zeros(0, a.dtype)
             return ProgramWithStops(program.call, program.constants, number, stops, None)
         stops, each = separate_times(jnp.concatenate(declared), a, b)
-        sides = _split(lax.stop_gradient(each), declared)
+        sides = _split_like(lax.stop_gradient(each), declared)
         call = lambda given, t, y: program.call(given[:number], t, y, *given[number:])  # noqa: E731
         return ProgramWithStops(call, [*program.constants, *sides], number, stops, None)
     found = times_of(analysis, program.closed.consts, a, b)
     stops, each = separate_times(jnp.concatenate([*declared, found.times]), a, b)
-    *sides, own = _split(lax.stop_gradient(each), [*declared, found.times])
+    *sides, own = _split_like(lax.stop_gradient(each), [*declared, found.times])
     over, most = found.over, MOST + sum(times.shape[0] for times in declared)
     if stops.shape[0] > most:
         stops, over = stops[:most], over | (stops[most] < b)
@@ -125,6 +144,9 @@ def program_with_stops(
     return ProgramWithStops(call, [*program.constants, *more], number, stops, over)
 
 
-def _split(whole: Array, like: list[Array]) -> list[Array]:
-    """Return an array split along its first axis into parts as long as the arrays in `like`."""
+def _split_like(whole: Array, like: list[Array]) -> list[Array]:
+    """Return the parts of an array along its first axis, as long as the arrays in `like`.
+
+    `whole` is the array; the lengths of the parts add up to its length.
+    """
     return list(jnp.split(whole, np.cumsum([a.shape[0] for a in like])[:-1]))

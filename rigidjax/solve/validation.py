@@ -25,9 +25,16 @@ from rigidjax.rotation.validation import tolerance
 def checked_scene(
     body: Any, state0: Any, ts: Any, torque: Any, throw: bool
 ) -> tuple[Any, Any, Array]:
-    """Check the body, start and times of a run, and return them with start and times in one dtype.
+    """Check the body, the start and the times of a run, and return the three in one precision.
 
-    With `throw=False` invalid traced numbers become NaN and raise no error.
+    **Arguments:**
+
+    - `body`, `state0`, `ts`, `torque`: the arguments of `simulate` with these names.
+    - `throw`: whether invalid numbers raise an error. With `False` invalid traced numbers become
+      NaN instead; known invalid numbers raise an error in any case.
+
+    **Returns** three things: the body; the state at the start; and the times (T,), s, in the same
+    dtype as the state.
     """
     ts = checked_times(ts, throw)
     state0 = checked_start(state0, throw)
@@ -46,7 +53,10 @@ def checked_scene(
 
 
 def require_fit(body: Any, state0: Any, torque: Any) -> None:
-    """Raise `TypeError` unless body, state and torque fit together."""
+    """Raise `TypeError` unless the body, the type of the state and the torque fit together.
+
+    The arguments are those of `simulate` with the same names.
+    """
     if isinstance(state0, Point) and body is not None:
         raise TypeError(f"Point is no body: wanted None in its place, got {type(body).__name__}")
     if isinstance(torque, AbstractScene | MovingFrame) and not isinstance(state0, Point):
@@ -78,9 +88,10 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
 
 
 def _require_one_frame(torque: Any) -> None:
-    """Raise `TypeError` if a law that needs the absolute body rate is used in a moving frame.
+    """Raise `TypeError` if a torque that needs the absolute body rate is used in a moving frame.
 
-    In a moving frame the body rate of a state is relative to the frame.
+    In a moving frame the body rate of a state is relative to the frame. `torque` is a torque law,
+    which may consist of several laws.
     """
 
     def within(law: Any) -> list[Any]:
@@ -98,9 +109,9 @@ def _require_one_frame(torque: Any) -> None:
 
 
 def one_dtype(tree: Any, name: str) -> Any:
-    """Return the dtype of all arrays of a tree; raise `TypeError` if there are several.
+    """Return the dtype that all arrays of a tree have; raise `TypeError` if they have several.
 
-    The message begins with `name`.
+    The message of the error begins with `name`.
     """
     kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(tree)}
     if len(kinds) != 1:
@@ -110,7 +121,11 @@ def one_dtype(tree: Any, name: str) -> Any:
 
 
 def warn_of_scale(body: Any, torque: Any) -> None:
-    """Warn of a torque on a body of arbitrary scale, unless the torque scales with the inertia."""
+    """Warn if a torque in N m acts on a body whose inertia is known only up to a factor.
+
+    A torque that grows in proportion to the inertia, such as the gravity gradient, needs no
+    warning. `torque` is the torque law, or `None` for a free body.
+    """
     relative = isinstance(body, Inertia) and body.scale is not None
     alike = isinstance(torque, GravityGradient) and not torque.harmonics
     if relative and torque is not None and not alike:
@@ -122,10 +137,10 @@ def warn_of_scale(body: Any, torque: Any) -> None:
 
 
 def _advice_for_bare_numbers(numbers: Any, moves: bool = False) -> str:
-    """Return advice, for a message, to a user who gave bare numbers in the place of a body.
+    """Return the end of an error message, for a user who gave bare numbers in the place of a body.
 
-    `moves` says whether the body moves as well as turns. If `numbers` is not an array or list, the
-    advice is empty.
+    It says how to make a body of the `numbers`. `moves` says whether the body moves as well as
+    turns. If `numbers` is not an array or list, the text is empty.
     """
     if not isinstance(numbers, (list, tuple, np.ndarray, jax.Array)):
         return ""
@@ -136,9 +151,10 @@ def _advice_for_bare_numbers(numbers: Any, moves: bool = False) -> str:
 
 
 def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
-    """Return the body; the numbers of a traced body that no real body can have become NaN.
+    """Return a body after a check of its mass and inertia: NaN if no real body can have them.
 
-    If `throw` is true, such a body raises an error instead.
+    If `throw` is true, an impossible body raises an error instead; an impossible body whose numbers
+    are known raises it in any case.
     """
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
@@ -146,9 +162,11 @@ def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
 
 
 def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
-    """Return `rtol` and `atol`, by default suited to `dtype`.
+    """Return the relative and the absolute tolerance of a run, after a check.
 
-    Warn if the dtype cannot reach a known `rtol`, and return the smallest that it can reach.
+    A tolerance of `None` gets the value that suits the `dtype` of the run. Raise `ValueError` for
+    tolerances that are not positive. If the dtype cannot reach a known `rtol`, warn, and return the
+    smallest `rtol` that it can reach.
     """
     double = dtype == jnp.float64
     usual = (1e-9, 1e-12) if double else (2e-5, 1e-7)
@@ -176,9 +194,10 @@ def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
 
 
 def checked_times(ts: Any, throw: bool) -> Array:
-    """Return `ts` as an array of times that increase, or that decrease, throughout.
+    """Return the saved times of a run as an array (T,), s, after a check.
 
-    Other times raise an error; if they are traced and `throw` is false, they become NaN instead.
+    The times must increase, or decrease, throughout, and there must be two at least. Other times
+    raise an error; if they are traced and `throw` is false, they become NaN instead.
     """
     if isinstance(ts, (Spin, Attitude, Rigid, Point)):
         raise TypeError(f"ts: wanted times, got {type(ts).__name__}; the state comes before them")
@@ -197,7 +216,7 @@ def checked_times(ts: Any, throw: bool) -> Array:
     ahead = xp.where(back, numbers[:-1] > numbers[1:], numbers[1:] > numbers[:-1])
     if xp is not np:
         words = "ts: wanted increasing times, or decreasing ones throughout"
-        return _guard(found, ~ahead.all(), words, throw)
+        return _error_or_nan_if_bad(found, ~ahead.all(), words, throw)
     where = ""
     if not ahead.all():
         i = int(np.argmin(ahead)) + 1
@@ -208,14 +227,15 @@ def checked_times(ts: Any, throw: bool) -> Array:
                 + _checks.advice_for_large_times(found.dtype)
             )
     kind = "decreasing" if back else "increasing"
-    return _guard(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
+    return _error_or_nan_if_bad(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
 
 
 def checked_first_step(dt0: Any, times: Array) -> Array:
-    """Return the length of the step `dt0` in the precision of `times`.
+    """Return the length of the first step that the user gave as `dt0`, s, after a check.
 
-    If the value of `dt0` is known, raise `ValueError` if it is zero, not finite, too short for the
-    precision, or negative in a run forwards in time.
+    `times` (T,), s, are the saved times, whose precision the length gets. If the value of `dt0` is
+    known, raise `ValueError` if it is zero, not finite, too short for the precision, or negative in
+    a run forwards in time.
     """
     step = _checks.array_of_shape(dt0, (), "dt0").astype(times.dtype)
     known = _checks.is_known(times)
@@ -239,10 +259,11 @@ def checked_first_step(dt0: Any, times: Array) -> Array:
 
 
 def checked_start(state0: Any, throw: bool) -> Any:
-    """Return `state0`, checked to be of one body and finite, and to have a unit quaternion.
+    """Return the state at the start of a run after a check.
 
-    An invalid state raises an error. With `throw=False` a traced quaternion whose length is not 1
-    becomes NaN instead.
+    The state must be that of one body, finite, with a unit quaternion if it has one; an invalid
+    state raises an error. With `throw=False` a traced quaternion whose length is not 1 becomes NaN
+    instead, and traced numbers that are not finite are left as they are.
     """
     wanted = "Spin, Attitude or Rigid, or Point without a body"
     _checks.require_single(state0, (Spin, Attitude, Rigid, Point), "state0", requirement=wanted)
@@ -257,7 +278,7 @@ def checked_start(state0: Any, throw: bool) -> Any:
     if isinstance(state0, HasAttitude):
         xp = _checks.namespace(state0.q)
         off = xp.abs(xp.sqrt(xp.sum(xp.square(state0.q))) - 1)
-        q = _guard(
+        q = _error_or_nan_if_bad(
             state0.q,
             off > tolerance(state0.q.dtype),
             "q: wanted a unit quaternion (w, x, y, z), got one whose length is not 1; normalise it "
@@ -268,11 +289,16 @@ def checked_start(state0: Any, throw: bool) -> Any:
     return state0
 
 
-def _guard(value: Array, bad: Any, message: str, throw: bool) -> Array:
-    """Return the `value`, or raise an error with the `message` if it is `bad`.
+def _error_or_nan_if_bad(value: Array, bad: Any, message: str, throw: bool) -> Array:
+    """Return an array after a check: raise an error if it is bad, or make it NaN in a batch.
 
-    With `throw=False` a traced bad value becomes NaN instead, because one bad body in a batch must
-    not end the runs of the other bodies.
+    **Arguments:**
+
+    - `value`: the array that was checked.
+    - `bad`: whether it is bad, a truth value.
+    - `message`: the message of the error.
+    - `throw`: whether a bad value raises an error. With `False` a traced bad value becomes NaN
+      instead, because one bad body in a batch must not end the runs of the other bodies.
     """
     if throw or _checks.is_known(bad):
         return _checks.error_if(value, bad, message)
