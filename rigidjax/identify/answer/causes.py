@@ -208,7 +208,7 @@ def causes(
         sensor: Any = model.records.readings[index].sensor
         cause = time_stamp_cause(model, noise, linear, index)
         if cause is None and _is_vector_error(sensor):
-            rows = _candidate_causes(model, x, noise, linear, index)
+            rows = _candidate_causes(model, x, linear, index)
             given = model, noise, linear, index, free
             shares = [_explained_share(*given, row[1]) for row in rows]
             cause = _largest_cause(sensor, rows, shares)
@@ -312,7 +312,7 @@ def _is_vector_error(sensor: AbstractSensor) -> bool:
 
 
 def _candidate_causes(
-    model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearisation, index: int
+    model: Model, x: Float[Array, " n"], linear: Linearisation, index: int
 ) -> tuple[tuple[str, np.ndarray, str, str], ...]:
     """Return the possible causes of the errors of a sensor, with the change of the readings by
     each.
@@ -321,7 +321,6 @@ def _candidate_causes(
 
     - `model`: the fitted model.
     - `x`: (n,) the free numbers at the best point.
-    - `noise`: the standard deviations of the errors of each sensor.
     - `linear`: the errors and their derivatives at x.
     - `index`: the index of the sensor.
 
@@ -335,7 +334,7 @@ def _candidate_causes(
     axes = np.broadcast_to(np.eye(3), (*shown.shape, 3))
     turned = np.cross(shown[..., None, :], axes).swapaxes(-1, -2)
     unit, itself = reading.sensor.unit, shown[..., None] * axes
-    response = _rate_response(model, x, noise, linear, index)
+    response = _rate_response(model, x, linear, index)
     return (
         ("lag", slope_in_time(model, shown)[..., None], "a clock offset of {size} s",
          "let a Free move the sensor's offset, or the delay of the torque's log"),
@@ -360,7 +359,7 @@ def _candidate_causes(
 
 
 def _rate_response(
-    model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearisation, index: int
+    model: Model, x: Float[Array, " n"], linear: Linearisation, index: int
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that maps torques to the changes of the body rate that the torques make.
 
@@ -373,8 +372,6 @@ def _rate_response(
 
     - `model`: the fitted model.
     - `x`: (n,) the free numbers at the best point.
-    - `noise`: the standard deviations of the errors of each sensor, on which the response does not
-      depend.
     - `linear`: the errors at x with their derivatives, which hold Φ.
     - `index`: the index of the sensor. The change is zero if this sensor is not a `Gyro`.
     """

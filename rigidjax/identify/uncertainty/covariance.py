@@ -704,7 +704,7 @@ def _autocorrelation_time(errors: np.ndarray, mask: np.ndarray) -> tuple[float, 
     the errors of one component of a sensor; `mask` (R, T) true for the errors to use.
     """
     counts = mask.sum(axis=1, keepdims=True)
-    mean = errors.sum(axis=1, keepdims=True) / np.maximum(counts, 1)
+    mean = np.where(mask, errors, 0.0).sum(axis=1, keepdims=True) / np.maximum(counts, 1)
     centred = np.where(mask, errors - mean, 0.0)
     variance = np.sum(centred**2)
     if not variance > 0:
