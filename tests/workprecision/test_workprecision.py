@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import sys
+import types
 
 import diffrax as dfx
 import jax
@@ -276,3 +278,19 @@ def test_a_drift_that_is_bounded_and_one_that_grows():
     early, late = "long-drift, first hundredth", "long-drift"
     assert drift["Splitting4, equal steps", late] < 5 * drift["Splitting4, equal steps", early]
     assert drift["RungeKutta4, equal steps", late] > 10 * drift["RungeKutta4, equal steps", early]
+
+
+def test_a_peer_that_gives_up_leaves_no_record_and_stops_nothing(monkeypatch):
+    from rigidjax.workprecision.peers import _prepare_gradsolve
+
+    def solve(*_, **__):
+        raise RuntimeError("record: trajectory 0 exhausted max_steps=50000 before t1=1.0")
+
+    (ours,) = [m for m in methods("ours") if m.name == "simulate"]
+    fake = types.ModuleType("gradsolve")
+    fake.solve = solve
+    monkeypatch.setitem(sys.modules, "gradsolve", fake)
+    scene = scenes()["heavy-top"]()
+    gives_up = TimedMethod("gives up", "peer", (1e-3, 1e-6), _prepare_gradsolve)
+    records = measure(scene, [gives_up, ours], gradients=False, thin=8, rounds=1)
+    assert {r.method for r in records} == {"simulate"}
