@@ -76,7 +76,10 @@ def exact_complement(value: RealOrArray, complement: RealOrArray) -> Any:
 def _exact_complement_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
-    """Return the value of `exact_complement` and its tangent, minus the tangent of the complement:
-    the rule by which JAX differentiates `exact_complement`.
+    """Return the value of `exact_complement` (`value` as a function of `complement` = 1 − `value`)
+    and its tangent.
+
+    JAX differentiates `exact_complement` by this rule. The tangent of the value is −1 times the
+    tangent of `complement`. `primals` and `tangents` are two pairs: of `value` and of `complement`.
     """
     return exact_complement(*primals), -tangents[1]

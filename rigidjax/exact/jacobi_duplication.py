@@ -101,8 +101,9 @@ def duplicate(functions: Elliptic, modulus: Modulus, mu: Scalar, phase_factor: S
     """Return the elliptic functions S, C, D and the phase ξ at the time 2u, from their values at
     the time u.
 
-    - `functions`: the values at the time u.
-    - `modulus`: the parameters p and q of S, C and D.
+    - `functions`: the values at the time u. S(u) solves dS/du = CD with S(0) = 0, where
+      C² = 1 − pS² and D² = 1 − qS².
+    - `modulus`: the parameters p and q in these equations.
     - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
 
     The phase is ξ(2u) = 2ξ + arctan(B/A), where A and B are `a` and `b` below; it is computed as a
@@ -128,8 +129,9 @@ def taylor_series(time: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scal
     """Compute the elliptic functions S, C, D and the phase ξ at a short time by Taylor series,
     exact to round-off for `√max(p, q) |time| ≤ 0.15`.
 
-    - `time`: the time since S = 0. In float32 the bound is 0.31.
-    - `modulus`: the parameters p and q of S, C and D.
+    - `time`: the time u since S = 0. In float32 the bound is 0.31.
+    - `modulus`: the parameters p and q of S, C and D: S solves dS/du = CD with S(0) = 0, where
+      C² = 1 − pS² and D² = 1 − qS².
     - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫ S²/(1 + μS²) du`.
     """
     hh = time * time
@@ -159,8 +161,8 @@ def growth_integral(S: Scalar, modulus: Modulus, mu: Scalar) -> Scalar:
     """Return the integral ∫ S²/(1 + μS²) du over the time from 0 to u, for a small value `S` of the
     elliptic function at u.
 
-    - `S`: the value S(u).
-    - `modulus`: the parameters p and q of the elliptic functions.
+    - `S`: the value S(u). S solves (dS/du)² = (1 − pS²)(1 − qS²) with S(0) = 0.
+    - `modulus`: the parameters p and q in this equation.
     - `mu`: the number μ.
 
     With S as the variable, the integral is ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)), and the
@@ -183,7 +185,8 @@ def elliptic_functions(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Sc
     S²/(1 + μS²) du`, an angle.
 
     - `u`: a reduced time: |u| is at most a quarter period.
-    - `modulus`: the parameters p and q of S, C and D.
+    - `modulus`: the parameters p and q of S, C and D: S solves dS/du = CD with S(0) = 0, where
+      C² = 1 − pS² and D² = 1 − qS².
     - `mu`: the number μ, between 0 and √(pq).
     - `phase_factor`: the constant factor κ.
 
@@ -209,8 +212,9 @@ def half_period(modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> HalfPerio
     """Return three numbers of half a period of the elliptic function S: the least time T > 0 with
     S(T) = 0; the phase ξ at T; and the mean of S² from 0 to T.
 
-    - `modulus`: the parameters p and q of the elliptic functions.
-    - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫ S²/(1 + μS²) du`.
+    - `modulus`: the parameters p and q of S, which solves (dS/du)² = (1 − pS²)(1 − qS²) with
+      S(0) = 0.
+    - `mu`, `phase_factor`: the numbers μ and κ in the phase ξ, the angle `κ ∫₀ᵘ S²/(1 + μS²) du`.
 
     With λ² = max(p, q), a₀ = 1 and b₀ = √|p − q|/λ, the time is `T = π/(λ agm(a₀, b₀))` (DLMF
     19.8.5), where agm is the arithmetic–geometric mean. With `c₁ = (a₀ − b₀)/2` and `c_{n+1} =
@@ -252,10 +256,13 @@ def _arithmetic_geometric_mean_step(_: Array, state: tuple[Scalar, ...]) -> tupl
 
     - `a`, `b`: the arithmetic mean a_n and the geometric mean b_n.
     - `c`, `ratio`: c_n, which is half the difference of the means of the step before, and 2^{n−1}
-      c_n²/w, where w is min(p, q)/max(p, q) for the parameters p and q of the elliptic functions.
-    - `total`: the sum of ½ and of all `ratio` so far, which gives the mean of S².
-    - `point`, `part`, `sum_parts`: the numbers p_n and Q_n of DLMF 19.8.7–19.8.9, and the sum of
-      Q_n, which gives the phase.
+      c_n²/w, where w is min(p, q)/max(p, q). Here p and q are the parameters of the elliptic
+      function S, which solves (dS/du)² = (1 − pS²)(1 − qS²) with S(0) = 0.
+    - `total`: the sum of ½ and of all `ratio` so far; at the end it gives the mean of S² over half
+      a period.
+    - `point`, `part`, `sum_parts`: the numbers called p_n and Q_n in DLMF 19.8.7–19.8.9, and the
+      sum of all Q_n so far; at the end it gives the integral ∫ S²/(1 + μS²) du over half a period,
+      the phase.
     """
     a, b, c, ratio, total, point, part, sum_parts = state
     square, product = point * point, a * b

@@ -80,9 +80,10 @@ def combine_columns(axes: Mat3, components: Triple) -> Triple:
 
 @compiled_as_one_kernel
 def _axes_and_moments(matrix: Mat3) -> tuple[list[list[Scalar]], Triple]:
-    """Return two things by Jacobi's method: the rows of the orthonormal matrix whose columns are
-    the principal axes of a symmetric `matrix` (3, 3); and the eigenvalues (the principal moments)
-    in ascending order.
+    """Return the principal axes and moments of a symmetric `matrix` (3, 3), by Jacobi's method.
+
+    **Returns** two things: the rows of a matrix, each of whose columns is a principal axis; and the
+    moments (the eigenvalues) in ascending order.
     """
     one, zero = jnp.ones_like(matrix[0, 0]), jnp.zeros_like(matrix[0, 0])
     # Subtract a shift from nearly equal moments: it is exact by Sterbenz' lemma, and so the moments

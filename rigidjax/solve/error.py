@@ -304,13 +304,15 @@ def _run_at_larger_tolerance(
     """Return a run at a larger tolerance, by which the round-off of a given run can be measured.
 
     **Returns** three things: the set-up of the run at the larger tolerance, which takes fewer
-    steps; its states; and a factor. The round-off of the given run is the round-off of the new run
-    times the factor, which is the fourth root of the quotient of the two numbers of steps: the
-    round-off of n steps adds up to about √n times that of one step, while the effect of the last
-    digits of the inputs does not depend on n. Both grow along the motion in the same way at any
-    tolerance at which the states stay near `ys`. A run in float32
-    takes few steps anyway: its set-up and states are returned unchanged, with the factor 1, and so
-    are those of a run in closed form or without `ReplayAdjoint`.
+    steps; its states; and a factor. The round-off of the given run is about the round-off of the
+    new run times the factor. If all round-off came from the steps, the factor would be √k, where k
+    is the quotient of the two numbers of steps, since the round-off of n steps adds up to about √n
+    times that of one step; if all came from the last digits of the inputs, the factor would be 1.
+    The returned factor, the fourth root of k, is between the two. Round-off from both sources grows
+    along the motion in the same way at any tolerance at which the states stay near `ys`.
+
+    A run in float32 takes few steps anyway: its set-up and states are returned unchanged, with the
+    factor 1, and so are those of a run in closed form or without `ReplayAdjoint`.
 
     **Arguments:**
 
@@ -318,7 +320,8 @@ def _run_at_larger_tolerance(
     - `start`: the state at the start of the run.
     - `ts`, `ys`: the saved times (T,), s, and the states of the given run at these times.
     - `count`: the number of steps of the given run.
-    - `search`: two runs at larger tolerances, one of which serves; with `None` a run is made.
+    - `search`: two finished runs at larger tolerances, one of which is returned; with `None` a new
+      run is made.
     """
     replayed = isinstance(setup, DiffraxRun) and setup.is_replayed
     if not replayed or ts.dtype == jnp.float32:

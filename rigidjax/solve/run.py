@@ -184,8 +184,9 @@ def in_forward_time(
 
     **Returns** four things: the field as a function `(s, y, sides)`; the condition as a function
     `(s, y)`, or `None`; the saved times s; and a list with the jump times s of each part of the
-    field that jumps in time. `sides` is a list with one array for each of these parts: the times s
-    at which steps end for its jumps. `None` says that they are the jump times.
+    field that jumps in time. The argument `sides` is a list with one array for each part that
+    jumps: the values of s at which steps end, which may differ from the jump times by some units of
+    round-off; `None` says that steps end exactly at the jump times.
     """
     time = partial(_multiply_by_direction, sign)
 

@@ -204,9 +204,10 @@ class Splitting2(AbstractSplitting):
 
 
 class Splitting4(AbstractSplitting):
-    """Solve the rotation to order 4 by seven kicks and six free flows, in long runs.
+    """Solve the rotation to order 4: a step has seven kicks by the torque and six exact free
+    motions.
 
-    See `Splitting2` for the conditions.
+    This solver is for long runs with fixed steps, under torques that `Splitting2` can take.
 
     Source: Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, method SRKN6b.
 
@@ -218,9 +219,10 @@ class Splitting4(AbstractSplitting):
 
 
 class Splitting6(AbstractSplitting):
-    """Solve the rotation to order 6 by twelve kicks and eleven free flows, in long runs.
+    """Solve the rotation to order 6: a step has twelve kicks by the torque and eleven exact free
+    motions.
 
-    See `Splitting2` for the conditions.
+    This solver is for long runs with fixed steps, under torques that `Splitting2` can take.
 
     Source: Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, method SRKN11b.
 

@@ -58,7 +58,10 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
     The arguments are those of `simulate` with the same names.
     """
     if isinstance(state0, Point) and body is not None:
-        raise TypeError(f"Point is no body: wanted None in its place, got {type(body).__name__}")
+        raise TypeError(
+            "body: wanted None, because a Point is no body and has no inertia; got "
+            f"{type(body).__name__}"
+        )
     if isinstance(torque, AbstractScene | MovingFrame) and not isinstance(state0, Point):
         raise TypeError(
             f"{type(torque).__name__} moves a Point: wanted Point(x, v), got "
@@ -103,8 +106,9 @@ def _require_one_frame(torque: Any) -> None:
         if hasattr(law, "internal_momentum") or isinstance(law, ChangingInertia):
             raise TypeError(
                 f"{type(law).__name__} needs the body rate in an inertial frame, got one in a "
-                "moving frame (BodyInFrame, libration); solve in an inertial frame, for an orbit "
-                "with GravityGradient(mu, position) and a position of time"
+                "moving frame (BodyInFrame, libration); solve in an inertial frame. For a body in "
+                "orbit give the torque GravityGradient(mu, position), where position is a function "
+                "of time"
             )
 
 

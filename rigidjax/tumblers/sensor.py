@@ -52,7 +52,7 @@ class Brightness(AbstractSensor):
     - `semi_axes`: (3,) along the body's axes; `None` for the semi-axes of the uniform ellipsoid
       that has the body's ratios of moments, which are proportional to √λ_k of the second moments
       λ_k of the body.
-    - `offset`: s, as for `Gyro`.
+    - `offset`: the clock offset, s: the reading with the time stamp t was taken at t + offset.
 
     **Raises** `ValueError` for a direction of length zero, a noise or semi-axis that is not
     positive.

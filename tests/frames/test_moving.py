@@ -314,7 +314,7 @@ MISTAKES = [
     (lambda: MovingFrame(Uniform([0.0, 0, 1])).to_inertial(rj.Spin([0.0, 0, 1]), 0.0), TypeError, "rate alone"),
     (lambda: MovingFrame(Uniform([0.0, 0, 1])).to_inertial(Point(np.ones((4, 3)), np.ones((4, 3))), 0.0), ValueError, "batch with jax.vmap"),
     (lambda: Point([1.0, 2], [0.0, 0]), ValueError, r"wanted shape \(3,\), got \(2,\); a plane problem has z = 0"),
-    (lambda: rj.simulate(rj.Inertia(np.eye(3)), REST, [0.0, 1.0]), TypeError, "Point is no body"),
+    (lambda: rj.simulate(rj.Inertia(np.eye(3)), REST, [0.0, 1.0]), TypeError, "because a Point is no body"),
     (lambda: rj.simulate(None, REST, [0.0, 1.0], "cr3bp"), TypeError, "wanted a scene .* got str"),
     (lambda: rj.simulate(None, REST, [0.0, 1.0], lambda t, s, b: jnp.zeros(2)), ValueError, r"wanted shape \(3,\), got \(2,\); force per mass"),
     (lambda: rj.simulate(None, REST, [0.0, 1.0], rj.torques.Damping(np.ones(3))), TypeError, "Damping needs a state with HasSpin"),

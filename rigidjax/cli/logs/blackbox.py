@@ -171,7 +171,12 @@ class _Flight:
                 yield -1 if kind == self.kind.INTRA else order.groups, others | fields
 
     def _next_iteration(self) -> int:
-        """Return the iteration that the next frame must have, by the intervals in the header."""
+        """Return the number of the iteration of the flight controller's loop that the next frame
+        must have.
+
+        A frame is one record of the log. The header says after how many iterations a frame is
+        written.
+        """
         return self.context.last_iter + 1 + self.context.count_skipped_frames()
 
     def _is_frame_next(self, place: int) -> bool:
@@ -280,9 +285,14 @@ class _Order:
         return self.is_valid
 
     def _lacks_frames(self, key: Sequence[int], expected: int) -> bool:
-        """Return whether frames are missing between the last frame and the I frame `key`.
+        """Return whether frames (records of the log) are missing before an I frame, which is a
+        frame that holds whole values and not differences.
 
-        A large jump of the iteration is a pause, in which no frames are missing.
+        The first number of a frame counts the iterations of the flight controller's loop. If it
+        jumps by more than `_ITERATION_JUMP`, the logging was paused, and no frames are missing.
+
+        - `key`: the values of the I frame: the iteration, the time in µs, and the readings.
+        - `expected`: the iteration that the I frame has if no frame is missing.
         """
         is_earlier = (key[1] - self.last[1]) % _WRAP >= _WRAP // 2
         return is_earlier or 0 < (key[0] - expected) % _WRAP < _ITERATION_JUMP

@@ -92,14 +92,15 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
 
 
 def _describe_shifts(named: Sequence[Quantity], sizes: Float[np.ndarray, " quantities"]) -> str:
-    """Return words such as "I1 by 0.02 (interval ±0.1)", which say how far each quantity would
-    move.
+    """Return words such as "I1 by 0.02 (interval ±0.1)", which say how far each reported quantity
+    would move if the model errors that a sensor allows for were real.
 
-    Half the width of the 95 % interval is given if it is finite. At most `MOST` quantities are
-    named.
+    In brackets stands half the width of the 95 % interval of the quantity, if it is finite. At most
+    `MOST` quantities are named.
 
-    **Arguments:** `named` the reported quantities; `sizes` (q,) the size of the move of each
-    quantity, relative to its value for a positive quantity.
+    - `named`: the reported quantities, q of them.
+    - `sizes`: (q,) by how much each quantity moves: relative to its value if the quantity is
+      positive (a moment, a mass), else in its unit.
     """
     words = []
     for quantity, size in list(zip(named, sizes, strict=True))[:MOST]:

@@ -316,9 +316,9 @@ def _count_rivals(
 
     **Arguments:**
 
-    - `starts`: the ends of those searches that fit as well as the best one. One that has not
-      converged is not counted, nor one whose cost exceeds `best_cost` by at most a hundredth of the
-      `margin`.
+    - `starts`: the ends of the searches that fit as well as the best one. An end that has not
+      converged is not counted. An end whose cost exceeds `best_cost` by less than a hundredth of
+      `margin` is the best point itself, up to where the search stopped, and is not counted either.
     - `best_cost`: the least cost (half the sum of squared residuals) of all searches.
     - `margin`: the growth of the cost below which two points fit equally well. A point counts as
       another one if the linearised errors differ, from those at x, by a sum of squares of more than
