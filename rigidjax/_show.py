@@ -8,8 +8,12 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from rigidjax import _checks
+
 # An array with more numbers than this is printed as its shape.
 MOST = 16
+# The units in which reports show angular rates, in rad/s.
+_RATE_UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
 
 
 def fields_as_text(self: Any) -> str:
@@ -46,3 +50,13 @@ def _nested_as_text(value: object) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_nested_as_text, value))}]"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def shown_unit(unit: str, rate_unit: str) -> tuple[float, str]:
+    """Return the factor by which a value with `unit` is multiplied to be shown, and the unit then.
+
+    **Arguments:** `unit` of the value; `rate_unit` the unit in which angular rates are shown:
+    `rad/s`, `deg/s` or `deg/day`. Only values in rad/s are converted.
+    """
+    scale = _RATE_UNITS[_checks.require_option(rate_unit, tuple(_RATE_UNITS), "rate_unit")]
+    return (float(scale), rate_unit) if unit == "rad/s" else (1.0, unit)

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 import rigidjax as rj
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax.cli import spec
 from rigidjax.cli.logs.errors import LogError, LogWarning
 from rigidjax.cli.logs.layouts import imu_columns_of
@@ -416,7 +416,7 @@ def _run_logs(options: argparse.Namespace) -> int:
     print()
     print(rj.identify.report.table(rj.identify.report.rows(fit, rate_unit)))
     for sensor, rms in zip(model.records.sensors, fit.rms, strict=True):
-        scale, unit = rj.identify.report.shown_unit(sensor.unit, rate_unit)
+        scale, unit = _show.shown_unit(sensor.unit, rate_unit)
         print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
     print()
     print(rj.identify.report.verdict(fit))

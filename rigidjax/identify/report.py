@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._names import show
 from rigidjax.identify.answer.result import Fit, require_one_fit
 
-_UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
 Row = tuple[str, float, float, float, str]
 
 
@@ -38,26 +37,13 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
     out: list[Row] = []
     for quantity in fit.quantities:
         low, high = bounds[quantity.name]
-        scale, unit = shown_unit(quantity.unit, rate_unit)
+        scale, unit = _show.shown_unit(quantity.unit, rate_unit)
         name = quantity.name
         if name.startswith("Ω"):
             axis, *where = name.split(" ", 1)
             name = " ".join([axis, "at the start", *where])
         out.append((name, quantity.value * scale, low * scale, high * scale, unit))
     return out
-
-
-def shown_unit(unit: str, rate_unit: str) -> tuple[float, str]:
-    """Return the factor by which a value with `unit` is multiplied to be shown, and the unit then.
-
-    **Arguments:** `unit` of the value; `rate_unit` the unit in which angular rates are shown:
-    `rad/s`, `deg/s` or `deg/day`. Only values in rad/s are converted.
-
-    >>> shown_unit("N m", "deg/s"), shown_unit("rad/s", "rad/s")
-    ((1.0, 'N m'), (1.0, 'rad/s'))
-    """
-    scale = _UNITS[_checks.require_option(rate_unit, tuple(_UNITS), "rate_unit")]
-    return (float(scale), rate_unit) if unit == "rad/s" else (1.0, unit)
 
 
 def table(lines: list[Row]) -> str:
@@ -288,7 +274,7 @@ def write_html(
     '<!doctype html>'
     """
     require_one_fit(fit)
-    units = [shown_unit(unit, rate_unit) for *_, unit in _rms_of_axes(fit)]
+    units = [_show.shown_unit(unit, rate_unit) for *_, unit in _rms_of_axes(fit)]
     sizes = _table_rows_as_html(
         (name, " ".join(f"{scale * x:.3g}" for x in axes), unit)
         for (name, axes, _), (scale, unit) in zip(_rms_of_axes(fit), units, strict=True)

@@ -72,7 +72,8 @@ class LiePoisson(eqx.Module):
 
 
 class LiePoissonWithDirection(eqx.Module):
-    """Evaluate the Lie–Poisson equations of a Hamiltonian H(Π, γ) as a vector field.
+    """Evaluate the Lie–Poisson equations of a Hamiltonian H(Π, γ), the field `hamiltonian`, as a
+    vector field.
 
     Π (3,) is the angular momentum, N m s, and γ (3,) a vector fixed in the world, both in body
     axes; the state is a `MomentumAndDirection`. The equations are dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ and
