@@ -266,7 +266,7 @@ def _compiled_correction(
 @eqx.filter_custom_jvp
 def correct_orbit(
     index: int, tolerance: float, scene: AbstractScene, unknown: Array, held_value: Array
-) -> Any:
+) -> tuple[Array, Array]:
     """Return two things: the three numbers (3,) that make an orbit periodic, by Newton's method;
     and the largest residual, |y|, |v_x| or |v_z| after half a period.
 

@@ -79,7 +79,7 @@ def candidates(
         forms = np.broadcast_to(areas, forms.shape)
     forms = forms / forms.mean(axis=1, keepdims=True)
     arrays = jnp.asarray(moments), jnp.asarray(forms), jnp.asarray(pair), *light
-    motions = _motions_on_grid(jnp.asarray(mode == "long"), *arrays)
+    motions = _motions_on_grid_of_phases(jnp.asarray(mode == "long"), *arrays)
     misfits, sides, q, omega = (np.asarray(v) for v in motions)
     # The best phase is taken for each body.
     phase, least = misfits.argmin(axis=1), misfits.min(axis=1)
@@ -173,7 +173,7 @@ def _rate_with_period_ratio(
 
 
 @jax.jit
-def _motions_on_grid(
+def _motions_on_grid_of_phases(
     long_axis: Array,
     moments: Array,
     forms: Array,

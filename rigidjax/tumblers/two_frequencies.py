@@ -144,7 +144,7 @@ def two_frequencies(
     # The table covers all combinations of multiples of the two frequencies of a pair, also after
     # the refinement has moved a pair beyond the highest frequency.
     table = sum_table(light, 2 * (FIRST + order) * (highest + 1.0))
-    pairs, misfits = _pairs_with_strong_line(table, lines, order)
+    pairs, misfits = _pairs_and_chi2_with_strong_line(table, lines, order)
     pairs, misfits = refine_pairs(
         table, pairs[distinct_pairs(pairs, misfits, count * TRIED)], order
     )
@@ -215,7 +215,7 @@ def _best_sinusoid(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tup
     return grid[best], c[best] @ rows(grid[best])
 
 
-def _pairs_with_strong_line(
+def _pairs_and_chi2_with_strong_line(
     table: Sums, lines: np.ndarray, order: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return two things: the pairs of frequencies (P, 2), on a grid, for which one of the strongest

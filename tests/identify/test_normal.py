@@ -235,6 +235,6 @@ def test_many_recordings_are_fitted_as_few_are():
     assert found.search.word == "found"
     blocks = errors_and_slopes(problem, found.x)
     linear = uncertainty.linearise(problem, found.x, found.noises, blocks)
-    step = found.determined_covariance @ linear.slope
+    step = found.determined_covariance @ linear.misfit_gradient
     # At the least misfit the gradient vanishes, in standard deviations.
     assert np.abs(step / np.sqrt(np.diag(np.asarray(found.determined_covariance)))).max() < 1e-3

@@ -378,7 +378,7 @@ def assess(
     shifts = considered.stacked_shifts(parts, linear.size)
     freedom = freedom_of(model, linear, times, white.determined, shifts)
     limits = flat_limit.flat_limits(
-        model, numbers, -white.determined @ linear.slope, [n for n, _ in of]
+        model, numbers, -white.determined @ linear.misfit_gradient, [n for n, _ in of]
     )
     # In a long curved valley the steps of a search stay short, although the misfit can hardly fall
     # any more. The search has then ended if the minimum of the linearised problem is near.

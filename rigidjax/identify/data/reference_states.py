@@ -176,7 +176,7 @@ def reference_of(recordings: Sequence[Recording], state_type: type) -> Reference
     - `state_type`: the type of the states: `Spin`, `Attitude` or `Rigid`.
     """
     turns = [[*attitudes(r)[1], np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
-    places = [_first_position_and_velocity(r) for r in recordings]
+    places = [_first_motion_and_typical_length(r) for r in recordings]
     dtype = recordings[0].t.dtype
     # Use arrays: with Python floats a program would be compiled for each recording.
     x, v, length = (jnp.asarray(np.stack(part), dtype) for part in zip(*places, strict=True))
@@ -210,7 +210,7 @@ def _typical_rate(recording: Recording) -> float:
     return rate if rate > 0 else 1.0
 
 
-def _first_position_and_velocity(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
+def _first_motion_and_typical_length(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     """Return three things that the readings of a `recording` show: the first position (3,), m; the
     first velocity (3,), m/s; and a typical length of the positions, m.
 

@@ -141,7 +141,7 @@ class Direction(ClockedSensor):
     mounting: Vec3 | None = eqx.field(converter=base.optional_array_field("mounting"), default=None)
 
     def error(self, motion: SensorInput, reading: Array) -> Float[Array, "2"]:
-        predicted = self._predict(motion)
+        predicted = self._predicted_direction(motion)
         # The axes orthogonal to the reading are data, so that no derivative passes through these
         # axes. Axes orthogonal to the prediction would jump as the motion changes.
         first, second = _orthogonal_pair(reading)
@@ -157,14 +157,14 @@ class Direction(ClockedSensor):
         `error` is applied along axes orthogonal to the prediction, whereas the method `error` uses
         axes orthogonal to the reading.
         """
-        predicted = self._predict(motion)
+        predicted = self._predicted_direction(motion)
         first, second = _orthogonal_pair(predicted)
         # The length of `error` is a chord: cos θ = 1 − ½ |error|², sin θ = |error| cos ½θ.
         square = jnp.minimum(error[0] * error[0] + error[1] * error[1], 4.0)
         half = jnp.sqrt(1.0 - 0.25 * square)
         return (1.0 - 0.5 * square) * predicted + half * (error[0] * first + error[1] * second)
 
-    def _predict(self, motion: SensorInput) -> Vec3:
+    def _predicted_direction(self, motion: SensorInput) -> Vec3:
         """Return the predicted reading of the sensor for a `motion`: the direction (3,) in the
         sensor's axes.
 

@@ -78,7 +78,7 @@ class Linearisation(eqx.Module):
         return dataclasses.replace(self, **parts)
 
     @property
-    def slope(self) -> np.ndarray:
+    def misfit_gradient(self) -> np.ndarray:
         """Return the gradient (n,) of the misfit with respect to the free numbers."""
         readings = self.to_all_numbers(self.scores).sum(axis=0)
         priors = self.prior_weights * self.prior_residuals
@@ -526,7 +526,7 @@ def distance_to_minimum(
     for row in directions:
         across = covariance @ row
         covariance = covariance - np.outer(across, across) / max(row @ across, 1e-300)
-    return float(np.sqrt(max(linear.slope @ covariance @ linear.slope, 0.0)))
+    return float(np.sqrt(max(linear.misfit_gradient @ covariance @ linear.misfit_gradient, 0.0)))
 
 
 def _sandwich_covariance(
