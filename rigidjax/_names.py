@@ -31,7 +31,8 @@ def raise_attribute_error(module: str, name: str) -> ModuleType:
     # Tools ask for hidden names, and the import system for modules that are not loaded yet.
     elif name[0] != "_" and not (hasattr(here, "__path__") and find_spec(f"{module}.{name}")):
         paths = _public_paths()
-        # `fit` and `Fit` are two names: the spelling with these capitals goes first.
+        # `fit` and `Fit` are two names: the name as it was written is looked up before the name in
+        # small letters.
         same = next((one for one in (name, name.lower()) if one in paths), None)
         near = [same] if same else difflib.get_close_matches(name.lower(), paths, n=4, cutoff=0.75)
         nearest = list(dict.fromkeys(paths[one] for one in near))[:2]

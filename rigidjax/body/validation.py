@@ -155,9 +155,10 @@ def first_impossible_row(tensors: Float[Array, "n 3 3"]) -> Any:
     """Return the index of the first matrix of a stack that is the inertia tensor of no body, or −1
     if there is none.
 
-    A matrix with a NaN is skipped: in a batch of bodies such a body gets another status.
+    A matrix with a NaN is skipped: in a batch the result of such a body is `nonfinite_input`, and
+    the other bodies are computed.
 
-    - `tensors`: (n, 3, 3) kg m², known numbers
+    - `tensors`: (n, 3, 3) inertia tensors, kg m², that are not traced.
     """
     return _checks.first_bad_row(_are_not_of_a_body, tensors)
 

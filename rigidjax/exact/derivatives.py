@@ -112,8 +112,9 @@ def _variables_and_changes(primals: tuple, tangents: tuple) -> tuple:
       for `flow`.
     - `tangents`: the changes of these three values.
 
-    The first result is that of `inverse_inertia_and_energy`, and the third is that of
-    `derivative_variables`.
+    The first result is that of `inverse_inertia_and_energy`. The ten variables are d12, d23, k12,
+    k13, k23, Π(0), k33 and t, where kij are the entries of the inverse inertia tensor,
+    dij = kii − kjj, and Π(0) (3,) is the body momentum at the start.
     """
     reciprocals, changes = jax.jvp(inverse_inertia_and_energy, primals[:2], tangents[:2])
     return (

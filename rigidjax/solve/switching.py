@@ -43,11 +43,12 @@ _LEVELS = {"floor", "ceil", "round", "convert_element_type", "rem"}
 # Primitives whose result has a kink when two operands become equal or, for `abs`, when the operand
 # passes zero.
 KINKS = {"max", "min", "abs", "clamp"}
-# `_CHOICES`: primitives that compare the elements of an array. `_OPAQUE`: primitives whose content
-# cannot be read. `_SAWS`: primitives whose result is not constant between its jumps (as a saw
-# tooth).
+# Primitives whose result may jump, but at values of the operands that are not searched for: they
+# choose or order elements of an array, or work on the bits of a number.
 _CHOICES = {"argmax", "argmin", "sort", "top_k", "bitcast_convert_type", "nextafter"}
+# Primitives whose content cannot be read.
 _OPAQUE = {"pure_callback", "io_callback", "custom_call", "ffi_call"}
+# Primitives whose result is not constant between its jumps (as a saw tooth).
 _SAWS = {"rem", "atan2", "sort", "top_k", "nextafter"}
 # `_CALLS`: calls whose body is written out in the flat program. `_WHOLE`: calls that stay one
 # equation of the flat program; switches are still searched for in their bodies.

@@ -205,7 +205,11 @@ class _Flight:
         return place
 
     def _values(self, stream: _Bytes, kind: Any) -> tuple[Any, ...]:
-        """Return the decoded fields of one frame."""
+        """Return the numbers of one frame (a record of the log), decoded from the bytes at the
+        present place of `stream`.
+
+        `kind` is the type of the frame, such as INTRA for a frame that holds whole values.
+        """
         context, fields, values = self.context, self.fields[kind], ()
         context.frame_type, context.field_index = kind, 0
         while context.field_index < len(fields):

@@ -318,7 +318,8 @@ def _count_rivals(
 
     - `starts`: the ends of the searches that fit as well as the best one. An end that has not
       converged is not counted. An end whose cost exceeds `best_cost` by less than a hundredth of
-      `margin` is the best point itself, up to where the search stopped, and is not counted either.
+      `margin` is not counted either: it is the best point again, since two searches that reach the
+      same minimum end at slightly different costs.
     - `best_cost`: the least cost (half the sum of squared residuals) of all searches.
     - `margin`: the growth of the cost below which two points fit equally well. A point counts as
       another one if the linearised errors differ, from those at x, by a sum of squares of more than

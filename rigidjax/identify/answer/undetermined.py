@@ -155,8 +155,9 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
 def _readings_change(fit: "Fit", direction: np.ndarray) -> bool:
     """Return whether readings change along a `direction` (n,) although their derivatives are zero.
 
-    The direction is one of the n free numbers of a `fit`. Readings change so if a torque switches
-    at a time, or at a state, that changes along the direction. The change is half the difference of
+    The direction is a vector in the space of the n free numbers of a `fit`. Readings change
+    although their derivatives are zero if a torque switches at a time, or at a state, that changes
+    along the direction. The change is half the difference of
     the readings after a step forwards and a step backwards. A number on which the readings depend
     only by its square has zero derivatives, too, but it does not change this difference.
     """

@@ -83,8 +83,10 @@ def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
     - `record`: the times and readings of the recording.
 
     **Returns** the `Terms`, two arrays with an entry for each component of each reading: its error
-    over its standard deviation; and the logarithm of 2π times its variance. A masked entry is zero.
-    A reading at full scale contributes the logarithm of a probability to the first array alone.
+    e over its standard deviation; and the logarithm of 2π times its variance. The log-density is
+    −½ times the sum of the squares of the first and of the second. A masked entry is zero. For a
+    reading at full scale, of which only a bound is known, the first entry is √(−2 log P), with the
+    probability P of exceeding the bound, and the second is zero.
     """
     errors = errors_of_scene(model, scene, record)
     scaled, log_variance = [], []

@@ -296,13 +296,15 @@ def _with_slots(
 
 
 def _covariance_of_white_errors(fit: Fit, follows_the_motion: bool) -> np.ndarray:
-    """Return the covariance (n, n) of a `fit` without the parts that a posterior density lacks.
+    """Return the covariance (n, n) of the free numbers of a `fit` for a posterior density, which
+    takes the errors of the readings as white.
 
-    The density takes errors as white. Therefore a covariance that allows for considered errors
-    (those within the `Tolerance` of a sensor) is replaced by the covariance for white errors. So is
-    a sandwich covariance, which allows for autocorrelated errors, if it is singular or if
-    `follows_the_motion` is true: the density then has no random torque and no walk, and readings
-    are normal about the motion.
+    The covariance of a fit may allow for more than white errors. In two cases it is replaced by the
+    covariance for white errors. The first case is a covariance that allows for constant errors of
+    the sensors within their `Tolerance`. The second is a sandwich covariance, which allows for
+    autocorrelated errors, if it is singular or if `follows_the_motion` is true. This argument says
+    that the model has no random torque and no number that drifts as a random walk, so that the
+    readings are normal about one motion.
     """
     covariance = np.asarray(fit.covariance)
     if fit.considered and fit.linear is not None:

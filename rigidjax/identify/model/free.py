@@ -271,8 +271,10 @@ def leaf_at(
             "Gyro(bias=[0.0, 0.0, 0.0])"
         )
     if not isinstance(index, int):
-        one = name.split()[0]
-        raise ValueError(f"{name}: wanted one array, got {type(index).__name__}; one {one} each")
+        kind = name.split()[0]
+        raise ValueError(
+            f"{name}: wanted one array, got {type(index).__name__}; give one {kind} for each array"
+        )
     # For a traced leaf `equinox.is_inexact_array_like` raises an error, because the leaf has a
     # `__jax_array__` of `None`.
     if not (eqx.is_inexact_array(leaves[index]) or isinstance(leaves[index], float)):

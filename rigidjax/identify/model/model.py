@@ -510,9 +510,10 @@ def _require_unused_names(slots: Sequence[Slot], charts: AbstractBodyChart | Bod
     """Raise `ValueError` if a `Free` has the name of a quantity of the body that a fit reports,
     such as "I1".
 
-    - `slots`: the `Free`s of a model, as `Slot`s.
+    - `slots`: the prepared `Free`s of a model. A `Free` is a number that a fit may move, and a
+      `Slot` holds its place in the scene and among the free numbers.
     - `charts`: the chart of one body, or the charts of several bodies, whose quantities are
-      reported.
+      reported. A chart is a map from free numbers to a possible body.
     """
     taken = {name for one in chart_list(charts) for name in (*one.log_names, *one.plain_names)}
     for slot in slots:
@@ -788,6 +789,8 @@ def _require_held_steps(integrator: object) -> None:
 def _charts_and_names(recording: Any, chart: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
     """Return three things: the list of all recordings; the chart of one body, or the `Bodies` of
     several charts; and the name of the body of each recording.
+
+    A chart is a map from free numbers to a possible body.
 
     - `recording`: one `Recording`, a sequence of recordings, or for several bodies a dict of name →
       recordings.

@@ -41,8 +41,8 @@ STUCK = 1e12
 # is less than the fraction LITTLE of the cost. A smooth cost is raised by smaller and smaller
 # multiples of the predicted gain as steps get shorter.
 NOISY, LITTLE = 10.0, 1e-4
-# Errors of sensors of unknown noise are taken to be at least this fraction of the unit of the
-# errors: smaller errors are round-off.
+# If the noise of a sensor is estimated, its standard deviation is at least this number times the
+# size in which the errors of the sensor are counted: smaller errors are round-off.
 EXACT = 1e-6
 
 

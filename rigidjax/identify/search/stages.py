@@ -324,11 +324,12 @@ def _search_stride(
 
 
 def _evaluate_at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
-    """Return the state of a search that evaluates the cost of the whole records at the free numbers
-    x (n,) of a `model`, and takes no step.
+    """Return the state of a search that evaluates the cost of all readings at the free numbers x
+    (n,) of a `model`, and takes no step.
 
-    `noise` holds for each sensor the standard deviations (R, k) of its noise. The evaluation uses
-    the compiled program of the search, so that no second program is compiled.
+    `noise` holds for each sensor the standard deviations (R, k) of its noise, for R recordings and
+    k components. The evaluation uses the compiled program of the search, so that no second program
+    is compiled.
     """
     return least_squares_from(model, x, noise, whole_record(model), Settings(0.0, 1.0, 0))
 

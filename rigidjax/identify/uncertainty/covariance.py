@@ -166,14 +166,18 @@ def _linearise_parts(model: Model, x: Array, noise: Noise, blocks: Blocks) -> Py
     - `model`: the model, with R recordings.
     - `x`: (n,) the free numbers.
     - `noise`: the standard deviations of the noise of the sensors.
-    - `blocks`: for each sensor the errors (R, T, k) at x, and their derivatives (R, T, k, m) with
-      respect to the m numbers of each recording.
+    - `blocks`: for each sensor the errors (R, T, k) at x, at T times and in k components, and their
+      derivatives (R, T, k, m) with respect to the m numbers of each recording; both in the unit of
+      the sensor.
 
-    **Returns** three tuples, which are the fields of a `Linearisation`: the errors of the readings
-    in standard deviations, their derivatives, and the weights of the robust loss; the indices (R,
-    m) of the numbers of each recording among all n; and the residuals of the priors of the free
-    numbers (n,), their derivatives (n,), all further residuals (j,), and the derivatives (j, n) of
-    these.
+    **Returns** three tuples, which are the fields of a `Linearisation`:
+
+    - of the readings: the errors and the derivatives of `blocks`, divided by the standard
+      deviations; and the weights of the robust loss;
+    - the indices (R, m) of the numbers of each recording among all n free numbers;
+    - of what is known besides the readings: the residuals (n,) of the priors of the free numbers
+      and their derivatives (n,); and the j residuals of all other priors, with their derivatives
+      (j, n).
     """
     errors, slopes = blocks
     out, slopes = residuals_and_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
