@@ -41,8 +41,9 @@ STUCK = 1e12
 # is less than the fraction LITTLE of the cost. A smooth cost is raised by smaller and smaller
 # multiples of the predicted gain as steps get shorter.
 NOISY, LITTLE = 10.0, 1e-4
-# If the noise of a sensor is estimated, its standard deviation is at least this number times the
-# size in which the errors of the sensor are counted: smaller errors are round-off.
+# If the noise is unknown, the length of the step that ends a search is in proportion to the root
+# mean square of the errors. This root mean square is taken to be at least this number, because
+# smaller errors are round-off.
 EXACT = 1e-6
 
 
