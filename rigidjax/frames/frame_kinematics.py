@@ -94,7 +94,7 @@ class Instant(eqx.Module):
         x = _checks.array_of_shape(x, (3,), "x")
         return linalg3.cross(x, self.rate_change.astype(x.dtype))
 
-    def translation(self) -> Vec3:
+    def translational_acceleration(self) -> Vec3:
         """Return −Mᵀ d²X/dt² (3,), the inertial acceleration from an accelerated origin, axes of
         S'.
         """
@@ -108,7 +108,7 @@ class Instant(eqx.Module):
         """
         x, v = _checks.array_of_shape(x, (3,), "x"), _checks.array_of_shape(v, (3,), "v")
         turning = self.centrifugal(x) + self.coriolis(v) + self.euler_acceleration(x)
-        return turning + self.translation().astype(x.dtype)
+        return turning + self.translational_acceleration().astype(x.dtype)
 
 
 def _require_transformable(state: PyTree) -> None:

@@ -146,11 +146,11 @@ class MovingFrame(eqx.Module):
         """
         return self.at(t).euler_acceleration(x)
 
-    def translation(self, t: ScalarLike) -> Vec3:
+    def translational_acceleration(self, t: ScalarLike) -> Vec3:
         """Return −Mᵀ d²X/dt² (3,), m/s², axes of S': the inertial acceleration from an accelerated
         origin.
         """
-        return self.at(t).translation()
+        return self.at(t).translational_acceleration()
 
     def acceleration(
         self, x: Vector, v: Vector, t: ScalarLike, force: Vector | None = None

@@ -121,7 +121,7 @@ def test_the_four_terms_add_up():
     x, v = NUMBERS[21:24], NUMBERS[24:27]
     parts = frame.centrifugal(x, t) + frame.coriolis(v, t) + frame.euler_acceleration(x, t)
     np.testing.assert_allclose(
-        frame.acceleration(x, v, t), parts + frame.translation(t), rtol=1e-13
+        frame.acceleration(x, v, t), parts + frame.translational_acceleration(t), rtol=1e-13
     )
 
 

@@ -119,7 +119,7 @@ for name, given in {
     "at": {},
     "angular_velocity": {},
     "place": {},
-    "translation": {},
+    "translational_acceleration": {},
     "centrifugal": dict(x=Y),
     "coriolis": dict(v=V),
     "euler_acceleration": dict(x=Y),
@@ -169,7 +169,7 @@ for name in ("to_inertial", "from_inertial"):
         lambda: dict(self=s.frame().at(0.3), state=s.rigid()),
         arguments=("state",),
     )
-row("frames.Instant.translation", lambda: dict(self=s.frame().at(0.3)), arguments=())
+row("frames.Instant.translational_acceleration", lambda: dict(self=s.frame().at(0.3)), arguments=())
 row(
     "frames.InFrame",
     lambda: dict(

@@ -64,9 +64,9 @@ def our_frame(axis, k, place, t, x, u, f):
     now = frame.at(t)
     return [
         now, frame.matrix(t), frame.place(t), frame.angular_velocity(t), now.centrifugal(x),
-        now.coriolis(u), now.euler_acceleration(x), now.translation(), now.fictitious(x, u),
+        now.coriolis(u), now.euler_acceleration(x), now.translational_acceleration(), now.fictitious(x, u),
         frame.centrifugal(x, t), frame.coriolis(u, t), frame.euler_acceleration(x, t),
-        frame.translation(t), frame.acceleration(x, u, t, f),
+        frame.translational_acceleration(t), frame.acceleration(x, u, t, f),
         frame.acceleration_to_inertial(x, u, f, t), frame.force_to_inertial(f, t),
         frame.force_from_inertial(f, t), now.to_inertial_axes(f), now.from_inertial_axes(f),
         frame.jacobi_integral(rj.Point(x, u), t, k), frames.AboutAxis(axis, Quadratic(k)).rate(t),
@@ -80,12 +80,12 @@ way(
         for name in (
             "AboutAxis", "AboutAxis.rate", "Instant", "Instant.centrifugal", "Instant.coriolis",
             "Instant.euler_acceleration", "Instant.fictitious", "Instant.from_inertial_axes",
-            "Instant.to_inertial_axes", "Instant.translation", "MovingFrame", "MovingFrame.acceleration",
+            "Instant.to_inertial_axes", "Instant.translational_acceleration", "MovingFrame", "MovingFrame.acceleration",
             "MovingFrame.acceleration_to_inertial", "MovingFrame.angular_velocity",
             "MovingFrame.at", "MovingFrame.centrifugal", "MovingFrame.coriolis",
             "MovingFrame.euler_acceleration", "MovingFrame.force_from_inertial",
             "MovingFrame.force_to_inertial", "MovingFrame.jacobi_integral", "MovingFrame.matrix",
-            "MovingFrame.place", "MovingFrame.translation",
+            "MovingFrame.place", "MovingFrame.translational_acceleration",
         )
     ) + " Point",
     our_frame, (*FRAME, v.ordinary, v.ordinary, v.ordinary), seen, norm=True, cost=2,
