@@ -705,7 +705,7 @@ leave_out(
     "identify.Linearisation",
     *(f"identify.Linearisation.{name}" for name in (
         "squared_change", "blocks", "dense", "first_times", "information", "rows", "scores", "size",
-        "slope", "to_all_numbers")),
+        "misfit_gradient", "to_all_numbers")),
 )  # fmt: skip
 leave_out(
     "compared with the intervals of Welch and Student: tests/identify/test_freedom.py",
