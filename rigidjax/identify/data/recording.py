@@ -244,8 +244,9 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
     name → input, after checks.
 
     - `t`: (T,) the times of the recording, s.
-    - `inputs`: a mapping of name → input. A function of time is unchanged; samples (T, *k), one for
-      each time, become an array. An error is raised for anything else.
+    - `inputs`: a mapping of name → input. An input that is a function of time is returned
+      unchanged; samples (T, *k), an array of shape k for each time, become an array. An error is
+      raised for anything else.
     """
     _checks.require_instance(
         inputs, Mapping, "inputs", requirement="samples or functions of time by name"
@@ -268,9 +269,9 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
 
 def _require_distinct_times(t: np.ndarray, dtype: np.dtype) -> None:
     """Raise `ValueError` if increasing times `t` (T,), s, become equal when they are rounded to the
-    `dtype`, such as float32.
+    `dtype` in which a recording stores them, such as float32.
 
-    A warning is given if rounding changes a step between two times by more than a tenth.
+    A warning is given if rounding changes a step between two successive times by more than a tenth.
     """
     # Use NumPy: within a trace the numbers of a new JAX array are not known.
     steps, held = np.diff(t), np.diff(t.astype(dtype).astype(float))
@@ -290,15 +291,17 @@ def _checked_reading(
     t: np.ndarray, sensor: AbstractSensor, values: Any, mask: NumbersLike | None = None
 ) -> tuple[AbstractSensor, np.ndarray, np.ndarray, np.ndarray]:
     """Return the readings of a sensor after checks, as four things: the sensor; its readings (T,
-    *reading_shape); a mask (T,), true where there is a reading; and a mask (T,) of the rows that a
-    NumPy masked array hides.
+    *reading_shape); a mask (T,), true where there is a reading; and a mask (T,), true for each time
+    whose reading a NumPy masked array hides.
 
-    A masked reading is replaced by a valid one, so that no NaN is left.
+    `reading_shape` is the shape of one reading of the sensor. Where there is no reading, the first
+    valid reading is filled in, so that no NaN is left.
 
     - `t`: (T,) the times of the recording, s.
     - `sensor`: the sensor.
     - `values`: (T, …) the readings of the user, which may be a NumPy masked array.
-    - `mask`: (T,) true where there is a reading, or `None` if there is one at each time.
+    - `mask`: (T,) true where there is a reading, which may be a NumPy masked array; `None` if there
+      is a reading at each time.
     """
     name = type(sensor).__name__
     if not isinstance(sensor, AbstractSensor):

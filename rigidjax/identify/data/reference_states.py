@@ -81,12 +81,13 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 @jax.jit
 def _attitudes_by_wahba(sums: ArrayLike) -> Array:
-    """Return the attitudes (n, 4), quaternions body → world, that best turn directions in the body
-    into directions in the world.
+    """Return the attitudes (n, 4), quaternions body → world, that best (in the least-squares sense)
+    turn directions in the body into directions in the world.
 
-    `sums` (n, 3, 3) holds the sum Σ world bodyᵀ over the directions, at each of n times. This is
-    `so3.wahba` without its check: a `Model` calls this function within
-    `jax.ensure_compile_time_eval`, where `equinox.error_if` in a compiled function always raises.
+    `sums` (n, 3, 3) holds the sum Σ w bᵀ over pairs of a direction w in the world and the same
+    direction b in the body, at each of n times. This is `so3.wahba` without its check: a `Model`
+    calls this function within `jax.ensure_compile_time_eval`, where `equinox.error_if` in a
+    compiled function always raises.
     """
     return jax.vmap(lambda one: quaternion.from_matrix(nearest_rotation(one)))(sums)
 
@@ -128,8 +129,8 @@ def _rotation_vectors_between(first: ArrayLike, last: ArrayLike) -> Array:
     """Return the shortest rotation vectors (n, 3), rad, in body axes, each of which turns one
     attitude into another.
 
-    `first` and `last` (n, 4) are the attitudes before and after the turn, as quaternions whose
-    signs do not matter.
+    `first` and `last` (n, 4) are the attitudes before and after each of the n turns, as quaternions
+    body → world. The sign of a quaternion does not matter.
     """
 
     def turn(a: Array, b: Array) -> Array:
@@ -193,8 +194,9 @@ def _typical_rate(recording: Recording) -> float:
     """Return the typical size of the body rate in a `recording`, rad/s, or 1 if its readings show
     no rate.
 
-    With a gyro it is the root mean square of the readings, without a gyro the size of the first
-    rate between attitudes, or the estimate of a sensor that has one.
+    With a gyro it is the root mean square of the length of its readings. Without a gyro it is the
+    size of the first rate that is computed from two attitudes. If there is no such rate, or it is
+    zero, it is the estimate of the first sensor that has a method `typical_rate`.
     """
     _, w = rates(recording)
     if readings_of(recording, Gyro):
@@ -212,10 +214,12 @@ def _typical_rate(recording: Recording) -> float:
 
 def _first_motion_and_typical_length(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     """Return three things that the readings of a `recording` show: the first position (3,), m; the
-    first velocity (3,), m/s; and a typical length of the positions, m.
+    first velocity (3,), m/s; and a typical length, m.
 
-    Position and velocity belong to the centre of mass or, if only markers were read, to the origin
-    of the body frame. Position and velocity are zero, and the length is 1, if no sensor shows them.
+    Position and velocity belong to the centre of mass or, if markers take the place of a position
+    sensor, to the origin of the body frame. The typical length is the largest distance of a
+    position from the mean position. What no sensor shows is zero for position and velocity, and 1
+    for the length.
     """
     t, when, x = np.asarray(recording.t), np.zeros(0), np.zeros((0, 3))
     positions, markers = readings_of(recording, Position), readings_of(recording, Marker)
@@ -247,10 +251,11 @@ def _origins_by_markers(
     computed from the positions of markers on the body.
 
     If no time has readings of all markers, only the first marker is used. If the attitude is not
-    known at each time, the mean position of the markers takes the place of the origin.
+    known at each of the n times, the mean position of the markers is returned in place of the
+    origin.
 
     - `recording`: the recording, which shows the times and the attitudes.
-    - `markers`: the `Reading` of each marker.
+    - `markers`: a sequence with the `Reading` of each marker.
     """
     mask = np.all([r.host_mask for r in markers], axis=0)
     if not mask.any():
@@ -266,11 +271,11 @@ def _origins_by_markers(
 
 
 def _first_velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the velocity (3,), m/s, of a body at the first of its positions x (n, 3), m, at the
-    times t (n,), s.
+    """Return the velocity (3,), m/s, of a body at the first of its positions x (n, 3), m, which
+    belong to the times t (n,), s.
 
-    It is the slope of the straight line that fits the first positions (at most five) best, or zero
-    for fewer than two positions.
+    It is the slope of the straight line that fits the first five positions (or all, if there are
+    fewer) best, or zero for fewer than two positions.
     """
     few = slice(0, max(2, min(5, t.size)))
     return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
@@ -279,9 +284,10 @@ def _first_velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
 def _positions_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Return the positions x (n, 3), m, of a body from its distances to k stations.
 
-    The equations `|x|² − 2 s·x + |s|² = d²`, where s is the position of a station and d its
-    distance, become linear in x if their mean over all stations is subtracted. A component of x
-    that the linear equations do not determine is that of the centre of the stations.
+    For each station the equation `|x|² − 2 s·x + |s|² = d²` holds, where s is the position of the
+    station and d its distance. It becomes linear in x if the mean of the equations of all stations
+    is subtracted. If the stations do not determine a component of x, as with stations in one plane,
+    this component is that of the mean position of the stations.
 
     - `stations`: (k, 3) the positions of the stations, m.
     - `lengths`: (n, k) the distance to each station, m, at each of n times.

@@ -39,8 +39,10 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
 
 
 def _is_stackable(leaf: PyTree) -> bool:
-    """Return whether a `leaf` (an end) of a tree of JAX is an array or a Python float, so that
-    `stack` may stack it along a new axis.
+    """Return whether a `leaf` (an end) of a tree of JAX is an array or a Python float.
+
+    Such leaves of several recordings are stacked along a new axis; all other leaves must be the
+    same in all recordings.
     """
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | complex)
 
@@ -65,11 +67,12 @@ def pad_to_few_lengths(model: PyTree) -> Any:
 
 
 def _count_table_rows(recording: Recording, axis: int) -> int:
-    """Return the number of rows of the longest table of time (a `Linear` or `Series`) in the inputs
-    and sensors of a `recording`, or 0 without a table.
+    """Return the number of times of the longest table of time in the inputs and sensors of a
+    `recording`, or 0 without a table.
 
-    The rows of a table are along `axis`: 0 for one recording, 1 for several recordings with a
-    leading axis.
+    A table of time is a `Linear` or `Series`, which interpolates values between times. Inputs are
+    logged quantities such as a motor command. The times of a table are along `axis`: 0 for one
+    recording, 1 for several recordings with a leading axis.
     """
     parts = recording.inputs, recording.sensors
     tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))
@@ -77,11 +80,11 @@ def _count_table_rows(recording: Recording, axis: int) -> int:
 
 
 def _padded_length(count: int) -> int:
-    """Return the number of times to which a recording with `count` times is padded, one of few
-    allowed numbers.
+    """Return the number of times to which a recording (or a table of values) with `count` times is
+    padded: the least allowed number that is not below `count`.
 
-    It is the least allowed number that is not below `count`. The allowed numbers are powers of
-    2^(1/4), rounded up to multiples of 16; 0 stays 0.
+    Only few numbers are allowed, so that few programs are compiled: the powers of 2^(1/4), rounded
+    up to multiples of 16, and 0 for a `count` of 0.
     """
     if not count:
         return 0
@@ -91,8 +94,9 @@ def _padded_length(count: int) -> int:
 
 
 def _stack_leaves(*leaves: PyTree) -> Any:
-    """Return arrays of one shape (the leaves with the same place in several trees) stacked along a
-    new first axis.
+    """Return arrays of one shape, stacked along a new first axis.
+
+    `leaves` are the arrays or numbers with the same place in several trees.
     """
     # Use NumPy if the numbers are not traced: JAX would compile a program for each shape.
     if _checks.is_known(leaves):
@@ -117,8 +121,9 @@ def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "
 
 
 def _constant_array(array: np.ndarray | np.generic) -> Array:
-    """Return a JAX array with the numbers of the NumPy `array`, which is not traced even within
-    `jit`.
+    """Return a JAX array with the numbers of the NumPy `array`.
+
+    Even within `jit` the result is a known array, which JAX does not trace.
     """
     with jax.ensure_compile_time_eval():
         return jnp.asarray(array)
@@ -164,8 +169,8 @@ def take_rows(recording: Recording, end: int, begin: int = 0, axis: int = 0) -> 
 
 
 def _is_table(node: PyTree) -> bool:
-    """Return whether a `node` of a tree of JAX is a table of time: a `Linear` or a `Series`, which
-    interpolates values between times.
+    """Return whether a `node` (a branch or an end) of a tree of JAX is a table of time: a `Linear`
+    or a `Series`, which interpolates values between times.
     """
     return isinstance(node, Linear | Series)
 
@@ -211,11 +216,10 @@ def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0
 
 def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
     """Return a `table` of time (a `Linear` or `Series`, which interpolates values between times)
-    padded to `rows` rows along `axis`.
+    padded to `rows` times along `axis`.
 
-    The last value of the table is repeated after its last time. A table with enough rows is
-    unchanged. `axis` is 0 for the table of one recording, 1 for stacked tables of several
-    recordings.
+    The last value of the table is repeated at later times. A table with enough times is unchanged.
+    `axis` is 0 for the table of one recording, 1 for stacked tables of several recordings.
     """
     missing = rows - table.values.shape[axis]
     if missing <= 0:
@@ -233,9 +237,10 @@ def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
 def _extend_at_end(
     values: ArrayLike, count: int, axis: int, fill: float | bool | None = None
 ) -> Array:
-    """Return the array `values` with `count` entries added at the end of `axis`.
+    """Return the array `values` with `count` entries added at the end of its axis number `axis`.
 
-    Each added entry is the last entry or, if `fill` is given, the number `fill`.
+    Each added entry is a copy of the last entry or, if `fill` is given, filled with the number
+    `fill`.
     """
     # Use NumPy if the numbers are not traced: JAX would compile a program for each shape.
     xp: Any = np if _checks.is_known(values) else jnp

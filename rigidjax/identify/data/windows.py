@@ -292,9 +292,11 @@ def _checked_by_kind(
     """Return the numbers of a user for the parts of a state as a dict of kind → number, after
     checks.
 
-    - `numbers`: a mapping of kind → number, where the kinds are names of parts of a state, such as
-      `q` and `omega`.
-    - `kinds`: the kinds that must be in it.
+    A kind is the name of a part of a state, such as `q` (attitude) or `omega` (body rate).
+
+    - `numbers`: the user's mapping of kind → number.
+    - `kinds`: the kinds that must be in the mapping; an error is raised unless these and no others
+      are there.
     - `name`: what `numbers` is called in an error.
     - `check`: a function of a number and its name in an error, which returns the number or raises.
     """
@@ -308,8 +310,9 @@ def _checked_start_deviation(value: object, name: str) -> float:
     """Return the standard deviation of the measured start of a window as a float, and raise
     `ValueError` unless it is positive or infinite.
 
-    `value` is the number of the user, and `name` what it is called in the error. Infinity means a
-    start that is free.
+    A window is a short part of a record of measured states. Infinity means that the start is free,
+    without a prior about the measured state. `value` is the number of the user, and `name` what it
+    is called in the error.
     """
     number = _checks.known_float(value, name)
     if not number > 0:
@@ -321,12 +324,12 @@ def _checked_start_deviation(value: object, name: str) -> float:
 
 
 def _require_finite_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) -> None:
-    """Raise `ValueError` unless states and inputs have a row of finite numbers for each time, and
-    the quaternions of the states have unit length.
+    """Raise `ValueError` unless states and inputs (logged quantities such as a motor command) have
+    finite numbers for each time, and the quaternions of the states have length 1 to within 0.01.
 
     - `times`: (T,) the times, s.
     - `states`: a `Spin`, `Attitude` or `Rigid` with a leading axis (T,).
-    - `inputs`: a dict of name → samples (T, *k).
+    - `inputs`: a dict of name → samples (T, *k), each sample an array of shape k.
     """
     rows = dict(zip(names(states), jax.tree.leaves(states), strict=True))
     rows |= {f"inputs[{k!r}]": v for k, v in inputs.items()}
@@ -352,10 +355,12 @@ def _require_finite_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str,
 
 
 def _sampling_step(times: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return two things: the time between two successive samples, s; and a mask (T − 1,), false for
-    the intervals between successive `times` (T,) in which samples are missing.
+    """Return two things: the time between two successive samples, s; and a mask (T − 1,) of the
+    intervals between successive `times` (T,), s, which is false where samples are missing.
 
-    `ValueError` is raised for times that are not evenly spaced apart from such gaps.
+    The time between two samples is the median of the intervals. Samples are missing in an interval
+    of more than 1.5 times the median; `ValueError` is raised if any other interval differs from the
+    median by more than a thousandth of it.
     """
     gaps = np.diff(times)
     h = float(np.median(gaps))

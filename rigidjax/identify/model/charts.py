@@ -159,10 +159,11 @@ class PrincipalRatios(AbstractBodyChart):
 
 
 def _checked_typical_moment(value: object) -> Array:
-    """Return the rough size of the moments of inertia, kg m², as an array of shape ().
+    """Return the rough size of the moments of inertia, kg m², from which a fit starts, as an array
+    of shape ().
 
     It raises `ValueError` unless the number `value` is positive. It raises `TypeError` if `value`
-    is a body, since a known body is given in another way.
+    is a body: a known body is given as `Known(body)`, and a first guess by `model.start(body)`.
     """
     if isinstance(value, Inertia | MassProperties):
         raise TypeError(
@@ -288,17 +289,20 @@ class Mass(AbstractBodyChart):
 
     @property
     def _free_indices(self) -> list[int]:
-        """Return the sorted indices of the free numbers among the ten numbers that
-        `rigidjax.body.parameters.pack` makes of mass, inertia and centre of mass.
+        """Return the sorted indices of the free numbers among the ten numbers of a body.
+
+        `rigidjax.body.parameters.pack` makes the ten numbers of mass (index 0), inertia (1 to 6)
+        and centre of mass (7 to 9). The free numbers are those that a fit may move.
         """
         return sorted(place for name in self.free for place in _PARTS[name])
 
     @property
     def _body_length(self) -> Array:
-        """Return the size of the body of the guess, m, as an array of shape ().
+        """Return the size of the body of the guess (the roughly known body of this chart), m, as an
+        array of shape ().
 
-        It is the root of the trace of the second moments over the mass. The free numbers of the
-        centre of mass are in units of this size.
+        It is the square root of Tr 𝔖 / m, where 𝔖 is the matrix of second moments about the centre
+        of mass and m the mass. The free numbers of the centre of mass are in units of this size.
         """
         return jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
 

@@ -282,15 +282,20 @@ def leaf_at(
     return paths[index], leaves[index]
 
 
+# This maps the name of a number in the scene to its unit. The unit of a bias is that of its sensor.
 _UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place": "m"}
 
 
 def _unit_implied_by_name(scene: Scene, path: tuple[Any, ...]) -> str:
-    """Return the unit of the numbers at a `path` in a `scene`, if their name implies one, else an
-    empty text.
+    """Return the unit of the numbers at a `path` in a `scene`, if the name of these numbers implies
+    a unit, else an empty text.
 
     A delay is in s, for instance, a mounting in rad, and the bias of a sensor in the unit of the
-    sensor. `path` is the path (a tuple of keys of JAX) of a leaf of the scene.
+    sensor.
+
+    - `scene`: the body, torque, sensors and initial state of a recording, as a tree of JAX.
+    - `path`: the path (a tuple of keys of JAX) of the numbers in the tree; its last key has the
+      name.
     """
     *way, last = path
     name = getattr(last, "name", "")
@@ -308,11 +313,14 @@ TOLERANCES = {"scale": "scale", "skew": "cross_axis", "bias": "bias", "offset": 
 
 
 def _tolerance_of_sensor(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
-    """Return the tolerance of a sensor, from its data sheet, for the numbers at a `path` in a
-    `scene`, or `None` if there is none.
+    """Return the tolerance that a sensor states for the numbers at a `path` in a `scene`, or `None`
+    if they are not numbers of a sensor, or have no tolerance.
 
-    The tolerance is the standard deviation of these numbers, such as a bias in the sensor's unit;
-    it serves as their prior. `path` is the path (a tuple of keys of JAX) of a leaf of the scene.
+    The tolerance comes from a data sheet. It is taken as the standard deviation of the prior of
+    these numbers, such as a bias in the sensor's unit.
+
+    - `scene`: the body, torque, sensors and initial state of a recording, as a tree of JAX.
+    - `path`: the path (a tuple of keys of JAX) of the numbers in the tree.
     """
     if len(path) != 3 or getattr(path[0], "name", "") != "sensors":
         return None

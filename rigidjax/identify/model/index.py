@@ -119,13 +119,16 @@ def index_of(
 
 
 def _slot_with_places(slot: Slot, column: int, shared: Array | None, own: Array | None) -> Slot:
-    """Return a `slot` (a free leaf of the scene) that knows where its numbers are among the free
-    numbers of the model.
+    """Return a `slot` with the places of its numbers among the free numbers of the model.
 
+    A slot is an array of the scene (the body, torque, sensors and initial state) that a fit may
+    move.
+
+    - `slot`: the slot without these places.
     - `column`: the index of its first number among the free numbers of one recording.
     - `shared`: (groups, …) the indices of the numbers that groups of recordings share, among all
-      free numbers of the model; or `None`.
+      free numbers of the model; `None` if each recording has numbers of its own alone.
     - `own`: (R, …) the indices of the numbers that each of R recordings has alone, among all free
-      numbers of the model; or `None`.
+      numbers of the model; `None` if all numbers are shared.
     """
     return dataclasses.replace(slot, column=column, shared=shared, own=own)

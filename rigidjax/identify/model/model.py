@@ -394,22 +394,24 @@ class Model(eqx.Module):
 
 class _RecordedData(NamedTuple):
     """Hold the parts of a `Model` that come from its recordings, or from windows (short parts of a
-    record of measured states).
+    record of measured states), each of which is then treated as a recording.
 
     **Fields:**
 
-    - `records`: all R recordings, with a leading axis of recordings.
+    - `records`: all R recordings as one `Recording`, whose arrays have a leading axis (R,).
     - `counts`: (R,) the number of times of each recording without padding.
     - `sensors`: the sensors of one recording.
     - `state_kind`: the type of the states: `Spin`, `Attitude` or `Rigid`.
-    - `reference`: the states from which the free initial states are measured.
-    - `start_weight`: (R, n) one over the standard deviation of each of the n numbers of a free
-      initial state about the measured start of a window; `None` without such a prior.
+    - `reference`: the state of each recording from which its initial state is measured: the free
+      numbers of the initial state are changes of this state.
+    - `start_weight`: (R, n) one over the standard deviation of each of the n free numbers of an
+      initial state, in the unit of the number, about the measured start of a window; `None` without
+      such a prior.
     - `clusters`: (R,) the index of the stretch (group of neighbouring windows) of each window;
       `None` for recordings.
     - `kinds`: the number of three-vectors (such as attitude and rate) of a free initial state, 0 if
       the initial state is known.
-    - `widest`: the longest time between two successive samples, s; 0 for windows.
+    - `widest`: the longest time between two successive times of a recording, s; 0 for windows.
     """
 
     records: Recording
@@ -427,12 +429,16 @@ def _data_of_recordings(
     recordings: list[Recording], torque: Torque | None, charts: AbstractBodyChart | Bodies
 ) -> _RecordedData:
     """Return the parts of a `Model` that come from recordings, after checks: the stacked readings,
-    and a reference state of each recording, whose initial state is free.
+    and a reference state of each recording.
+
+    The initial state of a recording is free: its free numbers are changes of the reference state,
+    which is found from the first readings. A chart is a map from free numbers to a possible body.
 
     - `recordings`: the recordings, in their order.
-    - `torque`: the torque of the model, whose inputs every recording must have, or `None`.
-    - `charts`: the chart of one body, or the charts of several bodies; together with sensors and
-      torque it decides which type of state is needed.
+    - `torque`: the torque of the model, whose inputs (logged quantities such as a motor command)
+      every recording must have, or `None`.
+    - `charts`: the chart of one body, or the charts of several bodies. If the sensors or the torque
+      need a position, the charts must describe bodies with a mass.
     """
     _require_recordings(recordings)
     recordings = with_limits(recordings)
@@ -460,9 +466,13 @@ def _data_of_windows(
     state, or in a free state about the measured state.
 
     - `windows`: the windows.
-    - `torque`: the torque of the model, whose inputs the windows must have, or `None`.
-    - `charts`: the chart of one body, or the charts of several bodies.
-    - `stretches`: the number of groups of neighbouring windows, at least 2.
+    - `torque`: the torque of the model, whose inputs (logged quantities such as a motor command)
+      the windows must have, or `None`.
+    - `charts`: the chart (a map from free numbers to a possible body) of one body, or the charts of
+      several bodies. If the measured states or the torque need a position, the charts must describe
+      bodies with a mass.
+    - `stretches`: the number of stretches (groups of neighbouring windows) into which the windows
+      are divided, at least 2.
     """
     require_inputs_of_windows(torque, windows)
     records = windows.records()
@@ -486,9 +496,13 @@ def _require_argument_types(
 ) -> None:
     """Raise `TypeError` unless the arguments of a `Model` have the right types.
 
-    `charts` must be one `AbstractBodyChart` or several in a `Bodies`, `free` a sequence, `loss` an
-    `AbstractLoss`, `prior` an `Entropic` and `integrator` an `AbstractIntegrator`; the last three
-    may be `None`.
+    - `charts`: must be one `AbstractBodyChart` (a map from free numbers to a possible body), or a
+      `Bodies`, which holds the charts of several bodies.
+    - `free`: must be a sequence, whose members are checked later. Each member should be a `Free`, a
+      number that a fit may move.
+    - `loss`: must be an `AbstractLoss`, which gives outliers less weight, or `None`.
+    - `prior`: must be an `Entropic`, a prior about a roughly known body, or `None`.
+    - `integrator`: must be an `AbstractIntegrator`, which computes the motion, or `None`.
     """
     for one in chart_list(charts):
         known = isinstance(one, Inertia | MassProperties)
@@ -507,11 +521,11 @@ def _require_argument_types(
 
 
 def _require_unused_names(slots: Sequence[Slot], charts: AbstractBodyChart | Bodies) -> None:
-    """Raise `ValueError` if a `Free` has the name of a quantity of the body that a fit reports,
-    such as "I1".
+    """Raise `ValueError` if a `Free` (a number that a fit may move) has the name of a quantity that
+    a fit reports of the body, such as "I1", or of its rate, such as "Ωx".
 
-    - `slots`: the prepared `Free`s of a model. A `Free` is a number that a fit may move, and a
-      `Slot` holds its place in the scene and among the free numbers.
+    - `slots`: the prepared `Free`s of a model. A `Slot` is a `Free` together with its place in the
+      scene (the body, torque, sensors and initial state).
     - `charts`: the chart of one body, or the charts of several bodies, whose quantities are
       reported. A chart is a map from free numbers to a possible body.
     """
@@ -544,9 +558,12 @@ def unpack_with_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, U
 
 @eqx.filter_jit
 def _unpack_with_jacobian(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
-    """Return two things, computed in one compiled program: the derivatives of the quantities (body,
-    initial state, values of the `Free`s) that the free numbers x (n,) represent, along a new last
-    axis of each array; and these quantities.
+    """Return two things, computed in one compiled program: the derivatives of the quantities that
+    the free numbers x (n,) of a `model` represent, along a new last axis of each array; and these
+    quantities.
+
+    The quantities are the body, the initial state, and the values of the `Free`s, which are the
+    other numbers that a fit may move.
     """
     return with_jacobian(lambda x: unpack_numbers(model, x), x)
 
@@ -682,8 +699,10 @@ def with_parts(model: Model, **parts: Any) -> Model:
 
 
 def _require_state_type(windows: Windows, kind: type) -> None:
-    """Raise `TypeError` unless the measured states in `windows` are of the type `kind` (`Spin`,
-    `Attitude` or `Rigid`), which the torque needs.
+    """Raise `TypeError` unless the measured states in `windows` (short parts of a record of
+    measured states) are of the type `kind`, which the torque needs.
+
+    `kind` is `Spin`, `Attitude` or `Rigid`.
     """
     if not isinstance(windows.starts, kind):
         raise TypeError(
@@ -693,11 +712,11 @@ def _require_state_type(windows: Windows, kind: type) -> None:
 
 
 def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) -> None:
-    """Raise `ValueError` if a torque reads an input, such as the logged speed of a wheel, that a
-    recording lacks.
+    """Raise `ValueError` if a torque reads an input (a logged quantity such as the speed of a
+    wheel) that a recording lacks.
 
-    `inputs` holds for each recording a dict of name → samples or function of time. The `torque` may
-    be `None`.
+    - `torque`: the torque, which reads an input by its name; `None` reads no input.
+    - `inputs`: for each recording a dict of name → samples or function of time.
     """
     for number, of_one in enumerate(inputs):
         missing = [name for name in inputs_of(torque) if name not in of_one]
@@ -744,26 +763,33 @@ def describe_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
 
 @eqx.filter_jit
 def _compiled_scenes(model: Model, x: Float[Array, " n"]) -> Scene:
-    """Return the scene (body, torques, sensors, initial state) of each recording at the free
-    numbers x (n,), computed in one compiled program.
+    """Return the scene (body, torques, sensors, initial state) of each recording of a `model` at
+    the free numbers x (n,), with a leading axis of recordings, computed in one compiled program.
 
-    Outside of a trace each operation of JAX takes as long as a run of 100 steps.
+    The program is compiled, since single operations of JAX are slow outside of a compiled program.
     """
     return scenes_of(model, x)
 
 
 def _sampled_inputs_read(torque: Torque | None, recording: Recording) -> list[str]:
-    """Return the names of the inputs that the `torque` reads and that are samples in the
-    `recording`, not functions of time.
+    """Return the names of the inputs (logged quantities such as a motor command) that the `torque`
+    reads and that the `recording` holds as samples, not as functions of time.
+
+    No name is returned if the `torque` is `None`.
     """
     return [name for name in inputs_of(torque) if not callable(recording.inputs[name])]
 
 
 def _require_even_times(torque: Torque | None, recording: Recording, number: int) -> None:
-    """Raise `ValueError` if the `torque` reads inputs that are samples, and the times of the
-    `recording` are not evenly spaced.
+    """Raise `ValueError` if the `torque` reads sampled inputs, and the times of the `recording` are
+    not evenly spaced to a thousandth of the first step.
 
-    `number` is the index of the recording in the model, for the error.
+    Inputs are logged quantities such as a motor command. Each sample is held constant over one
+    step, and all steps are equal; an input that is a function of time needs no even times.
+
+    - `torque`: the torque of the model, or `None`.
+    - `recording`: the recording with the times and inputs.
+    - `number`: the index of the recording in the model, for the error.
     """
     names, steps = _sampled_inputs_read(torque, recording), np.diff(np.asarray(recording.t, float))
     if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
@@ -775,8 +801,11 @@ def _require_even_times(torque: Torque | None, recording: Recording, number: int
 
 
 def _require_held_steps(integrator: object) -> None:
-    """Raise `ValueError` unless the integrator is `None` or a `HeldSteps`, which holds samples
-    constant over each step.
+    """Raise `ValueError` unless the `integrator` that a user gave is `None` or a `HeldSteps`, which
+    takes one step from each time to the next and holds samples constant over this step.
+
+    It is called for a model of windows or with sampled inputs, for which all other integrators are
+    refused.
     """
     if integrator is not None and not isinstance(integrator, HeldSteps):
         raise ValueError(
@@ -787,17 +816,16 @@ def _require_held_steps(integrator: object) -> None:
 
 
 def _charts_and_names(recording: Any, chart: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
-    """Return three things: the list of all recordings; the chart of one body, or the `Bodies` of
-    several charts; and the name of the body of each recording.
+    """Return three things: the list of all recordings; the chart of one body, or the charts of
+    several bodies in a `Bodies`; and a tuple with the name of the body of each recording.
 
-    A chart is a map from free numbers to a possible body.
+    A chart is a map from free numbers to a possible body. If there is only one body, its name is an
+    empty text.
 
     - `recording`: one `Recording`, a sequence of recordings, or for several bodies a dict of name →
-      recordings.
-    - `chart`: the chart of the body, or for several bodies a dict of name → chart with the same
-      names; an error is raised for other names.
-
-    The names are empty texts for one body.
+      one recording or a sequence of them.
+    - `chart`: the chart of the body, or for several bodies a dict of name → chart. An error is
+      raised unless both dicts have the same names.
     """
     if isinstance(recording, Mapping) or isinstance(chart, Mapping):
         if not (isinstance(recording, Mapping) and isinstance(chart, Mapping)):
@@ -830,8 +858,11 @@ def _charts_and_names(recording: Any, chart: Any) -> tuple[list[Recording], Any,
 
 
 def _require_recordings(recordings: Sequence[Any]) -> None:
-    """Raise an error unless there is at least one recording, and each is a single `Recording` (not
-    a batch) of known numbers (not traced by JAX).
+    """Raise an error unless there is at least one recording, and each member of the sequence
+    `recordings` is a single `Recording` of known numbers.
+
+    A batch of recordings (arrays with a further leading axis) is refused, and so are readings that
+    are traced by JAX.
     """
     if not recordings:
         raise ValueError("Model: wanted at least one Recording, got an empty sequence")
@@ -852,10 +883,11 @@ def _require_recordings(recordings: Sequence[Any]) -> None:
 
 
 def _numbers_in_chart(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " chart"]:
-    """Return the free numbers (size,) that represent a `body` in a `chart`, or zeros for `None`.
+    """Return the free numbers (size,) that represent a `body` in a `chart` (a map from free numbers
+    to a possible body), or zeros if `body` is `None`.
 
-    An error is raised for a batch of bodies, and for a body that has no finite numbers in the
-    chart.
+    An error is raised for a batch of bodies, for a body with NaN or infinity, and for a body that
+    has no finite numbers in the chart.
     """
     if body is None:
         return _zeros_by_numpy(chart.size)
@@ -874,7 +906,8 @@ def _numbers_in_chart(chart: AbstractBodyChart, body: Body | None) -> Float[Arra
 
 
 def _zeros_by_numpy(*shape: int) -> Array:
-    """Return an array of zeros of this `shape` in JAX's default float type.
+    """Return an array of zeros of this `shape` (one integer for each axis) in JAX's default float
+    type.
 
     NumPy makes the zeros, since JAX would compile a program for each shape.
     """
@@ -887,8 +920,14 @@ def _smallest_state_type(
     """Return the smallest type of state (`Spin`, `Attitude` or `Rigid`) that the sensors and the
     torque need.
 
-    `Rigid` needs a mass: `ValueError` is raised if one of the `charts` (of one body, or of several)
-    describes an inertia alone.
+    `Rigid`, a state with a position, is needed if a sensor or the torque reads the position, or if
+    a part of the torque is a force. Its motion needs the mass.
+
+    - `sensors`: the sensors of a recording.
+    - `torque`: the torque on the body, or `None`.
+    - `charts`: the chart (a map from free numbers to a possible body) of one body, or the charts of
+      several bodies. `ValueError` is raised if `Rigid` is needed and one of the charts describes an
+      inertia without a mass.
     """
     needed = [sensor.feels for sensor in sensors]
     if torque is not None:

@@ -104,21 +104,24 @@ class NormalMatrix(eqx.Module):
         return self._join_rows(first, last).reshape(rhs.shape)
 
     def _split_rows(self, x: Array) -> tuple[Array, Array]:
-        """Return two parts of an array x (n, …): the rows (s, …) of the s numbers that recordings
-        share; and the rows (R, k, …) of the k numbers that each of R recordings has alone.
+        """Return two parts of an array x (n, …), which has one entry for each of the n numbers of
+        the normal matrix.
 
-        If no recording has numbers alone, both parts are x.
+        The two parts are the entries (s, …) of the s numbers that recordings share; and the entries
+        (R, k, …) of the k numbers that each of R recordings has alone. If no recording has numbers
+        alone, both results are the whole of x.
         """
         return (
             (x, x) if self.own_blocks is None else (x[: self.core.shape[0]], x[self.own_blocks.at])
         )
 
     def _join_rows(self, shared: Array, own: Array | None) -> Array:
-        """Return an array (n, …) of the rows of all n numbers, the inverse of `_split_rows`.
+        """Return an array (n, …) with one entry for each of the n numbers of the normal matrix,
+        joined from two parts.
 
-        - `shared`: (s, …) the rows of the s numbers that recordings share.
-        - `own`: (R, k, …) the rows of the k numbers that each of R recordings has alone; it is not
-          read if no recording has such numbers.
+        - `shared`: (s, …) the entries of the s numbers that recordings share.
+        - `own`: (R, k, …) the entries of the k numbers that each of R recordings has alone. If no
+          recording has such numbers, `own` is not read, and the result is `shared`.
         """
         if self.own_blocks is None:
             return shared

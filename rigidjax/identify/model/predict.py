@@ -120,12 +120,12 @@ class FixedSteps(AbstractIntegrator):
 
 
 def _tolerance_converter(name: str) -> Callable[[ScalarLike], Array]:
-    """Return a function that makes an array of shape () of a tolerance, as the `converter` of a
-    dataclass field.
+    """Return a function that makes an array of shape () of a tolerance (one number), for use as the
+    `converter` of a dataclass field.
 
-    `name` is the name of the field, for the error if the tolerance is not a known number. A
-    compiled program takes an array as an argument, so that another tolerance needs no new
-    compilation.
+    `name` is the name of the field. It appears in the error that the function raises unless the
+    tolerance is one number that JAX does not trace. A compiled program takes an array as an
+    argument, so that another tolerance needs no new compilation.
     """
     return lambda value: jnp.asarray(_checks.known_float(value, name), jnp.result_type(float))
 
@@ -367,12 +367,17 @@ def errors_along(
 
 
 def _checked_error(sensor: AbstractSensor, motion: SensorInput, value: Array) -> Array:
-    """Return the error (k,), reading minus prediction, of the reading `value` of a `sensor`, after
-    checks.
+    """Return the error (k,), reading minus prediction, of one reading of a `sensor` whose error has
+    k components, after checks.
 
-    The sensor predicts the reading from `motion`, which holds time, state, body and equations of
-    motion. A user may have written the sensor's method `error`: it is an error if this method reads
-    more of the state than the sensor says, or returns another shape than (k,).
+    A user may have written the sensor's method `error`. A `TypeError` is raised if this method
+    reads a part of the state that the sensor's member `feels` does not name, and a `ValueError` if
+    it returns another shape than (k,).
+
+    - `sensor`: the sensor.
+    - `motion`: what the sensor predicts the reading from: time, state, body and equations of
+      motion.
+    - `value`: the reading.
     """
     name = type(sensor).__name__
     try:
@@ -461,16 +466,19 @@ def _readings_along_motion(
     *,
     key: PRNGKeyArray | None,
 ) -> Float[Array, "times ..."]:
-    """Return the readings (T, *reading_shape) of one sensor along a motion, in its unit, computed
-    in one compiled program.
+    """Return the readings (T, *reading_shape) of one sensor at T times along a motion, in the unit
+    of the sensor, computed in one compiled program.
+
+    `reading_shape` is the shape of one reading of the sensor.
 
     - `sensor`: the sensor, with its bias, clock offset, low-pass filter and full scale.
     - `body`, `torque`: the body, and the torque of the motion or `None`.
     - `ts`: (T,) the time stamps of the readings, s.
-    - `state0`, `states`: the initial state, and the states at `ts`; `Coupled` if the torque has
-      states of its own.
-    - `key`: the random key of the noise and of the jitter of the time stamps; `None` for readings
-      without noise and jitter.
+    - `state0`: the initial state of the body.
+    - `states`: the states at `ts`; if the torque has states of its own (such as the speed of a
+      motor), a `Coupled`, which holds the states of the body and of the torque.
+    - `key`: the random key of the noise and of the jitter (random error of the time stamps); `None`
+      for readings without noise and jitter.
     """
     jitter, late = getattr(sensor, "jitter", None), None
     if key is not None and jitter is not None:
@@ -495,8 +503,12 @@ def _readings_along_motion(
 def _require_sensor(sensor: PyTree, state0: State, key: object) -> None:
     """Raise an error unless `sensor` is a sensor whose readings of a motion can be simulated.
 
-    The sensor must be able to read the state `state0` of the motion. With a random `key` the sensor
-    must also have a known noise, and no jitter of unknown size.
+    - `sensor`: must be a single sensor, not a batch. Its readings must have as many numbers as its
+      error has components, unless the sensor has a method `reading_of`.
+    - `state0`: the initial state of the motion, which must have the parts that the sensor reads.
+    - `key`: a random key, or `None` for readings without noise. With a key the noise of the sensor
+      must be known. If the sensor has jitter (a random error of its time stamps), with a key this
+      jitter must be of known size, and the sensor may not have a low-pass filter.
     """
     name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
     _checks.require_instance(sensor, AbstractSensor, "sensor", requirement=wanted)

@@ -92,8 +92,8 @@ class Huber(AbstractLoss):
 
 
 def _checked_weight(value: float) -> Scalar:
-    """Return the weight of a prior, a number, as an array of shape (), and raise `ValueError`
-    unless it is positive.
+    """Return the weight of a prior (the factor of its divergence) as an array of shape (), and
+    raise `ValueError` unless the number `value` is positive.
     """
     return jnp.asarray(_checks.positive_float(value, "weight"), jnp.result_type(float))
 
@@ -149,11 +149,11 @@ class Entropic(eqx.Module):
 
 
 def _signed_root_of_divergence(c: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return `√(c² − 1 − 2 log c)` with the sign of c − 1 for each of n positive numbers c, which
-    is smooth through c = 1.
+    """Return `√(c² − 1 − 2 log c)` with the sign of c − 1 for each of n positive numbers c (n,).
 
-    The square is the divergence between the variances c² and 1. Near c = 1 the root is computed by
-    a series, since the formula would lose its digits.
+    With this sign the root is a smooth function of c also at c = 1, where the root is zero. Its
+    square is the log-determinant divergence of the variance c² from the variance 1. Near c = 1 the
+    root is computed by a series, since the formula would lose its digits there.
     """
     x = c - 1.0
     near = jnp.abs(x) < 1e-2
@@ -166,8 +166,11 @@ def _signed_root_of_divergence(c: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def _pseudo_inertia(body: MassProperties) -> Float[Array, "4 4"]:
-    """Return the pseudo-inertia J (4, 4) of a `body`: the second moments J = ∫ r̃ r̃ᵀ dm of the
-    vectors r̃ = (r, 1), where r is the position of a mass element in the body frame.
+    """Return the pseudo-inertia J (4, 4) of a `body`: the second moments `J = ∫ r̃ r̃ᵀ dm` of the
+    four-vectors r̃ = (r, 1).
+
+    Here r is the position of the mass element dm in the body frame, and the integral is over the
+    body.
     """
     m, c = body.mass, body.com
     upper = body.second_moment + m * c[:, None] * c[None, :]

@@ -200,11 +200,15 @@ def by_recording(
 
 @by_recording.def_jvp
 def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
-    """Return two things: the value of `by_recording`; and its derivative along a change of the rows
-    (the free numbers of each recording).
+    """Return two things: the values of a function of each recording, with a leading axis (R,) of
+    recordings; and the derivatives of these values along a change of the free numbers.
 
-    `primals` are the three arguments of `by_recording`, and `tangents` their changes. An error is
-    raised if anything but the rows changes.
+    It is the rule by which JAX differentiates `by_recording`. An error is raised if anything but
+    the free numbers changes.
+
+    - `primals`: the three arguments of `by_recording`: the free numbers (R, columns) of each of R
+      recordings; the model; and the function.
+    - `tangents`: the changes of these three arguments.
     """
     (rows, model, function), (step, *rest) = primals, tangents
     if jax.tree.leaves(rest):
@@ -240,12 +244,16 @@ def errors_and_jacobians(
 def _values_and_jacobians(
     model: "Model", rows: Array, function: Callable[..., PyTree[Array]]
 ) -> tuple[PyTree[Array], PyTree[Array]]:
-    """Return two things: `function` of every recording, with a leading axis (R,); and its
-    derivatives with respect to the free numbers of the recording, along a new last axis.
+    """Return two things: the value of `function` for every recording, with a leading axis (R,) of
+    recordings; and the derivatives of these values with respect to the free numbers of the
+    recording, along a new last axis.
 
-    - `rows`: (R, columns) the free numbers of each of the R recordings of the `model`.
-    - `function`: a function such as `errors_in_sensor_units`, with the same arguments, of one
-      recording.
+    - `model`: the model, which has the R recordings.
+    - `rows`: (R, columns) the free numbers of each recording.
+    - `function`: a function of one recording, called as `function(model, row, record, reference,
+      body_index)` with the free numbers, the readings, the reference state and the index of the
+      body of the recording. It returns an array or a tree of arrays, such as the errors of the
+      readings.
     """
 
     def value_and_jacobian(row: Row, *rest: PyTree) -> tuple[PyTree, PyTree]:

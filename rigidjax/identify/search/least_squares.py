@@ -48,9 +48,10 @@ EXACT = 1e-6
 
 
 def _setting_as_array(value: ArrayLike) -> np.ndarray:
-    """Return a setting of a search (one number) as a NumPy array of JAX's default float type.
+    """Return a setting of a search (the number `value`) as a NumPy array of JAX's default float
+    type.
 
-    Outside of a trace each conversion by JAX takes as long as a run of 100 steps.
+    NumPy is used, since a conversion by JAX is slow outside of a compiled program.
     """
     return np.asarray(value, jnp.result_type(float))
 
@@ -188,16 +189,18 @@ def _next_state(
     the cost of n numbers.
 
     The point of the evaluation is accepted if its cost is lower than the lowest cost so far. The
-    damping is adapted to the ratio of actual to predicted gain, and the next point is computed.
+    damping is adapted to the ratio of actual to predicted gain (fall of the cost), and the next
+    point is computed.
 
     - `state`: the state before the evaluation.
-    - `evaluation`: at the point `state.trial`: values to keep, the cost, the normal matrix (n, n)
-      and the gradient (n,).
+    - `evaluation`: what was found at the point `state.trial`: values to keep, the cost, the normal
+      matrix (n, n) and the gradient (n,).
     - `order_one`: (n,) one for numbers of order one, which no step changes by more than `LONGEST`;
       zero for other numbers.
-    - `settings`: the settings of the search.
-    - `gain_of_noise`: given the kept values and the normal matrix, this function returns the gain
-      of a fit from noise alone (see `Settings.level`); or `None`.
+    - `settings`: the settings of the search, such as its tolerance.
+    - `gain_of_noise`: a function of the kept values and the normal matrix that returns the gain of
+      a fit that follows only the noise. The search ends after a step with a small fraction
+      (`settings.level`) of this gain. With `None` it does not end in this way.
     """
     values, cost, normal, slope = evaluation
     parts = jax.tree.leaves((cost, normal, slope))
@@ -274,8 +277,9 @@ def _damped_step(
 
     - `normal`, `slope`: the normal matrix (n, n) and the gradient (n,) of the cost at the point.
     - `order_one`: (n,) one for numbers of order one, zero for other numbers.
-    - `damping`: in units of the diagonal of the normal matrix, at least of one for a number of
-      order one.
+    - `damping`: the damping. The damping times the diagonal of the normal matrix is added to this
+      diagonal; for a number of order one whose diagonal element is less than one, the damping
+      itself is added.
     """
     diagonal = normal.diagonal
     diagonal = jnp.maximum(diagonal, jnp.maximum(1e-12 * jnp.max(diagonal), 1e-300))

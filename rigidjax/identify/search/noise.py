@@ -99,14 +99,17 @@ def initial_noise(model: Model) -> Noise:
 
 
 def _variance_by_median(squares: np.ndarray, mask: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Return the variance (groups,) of the errors of each group of recordings, by a median that
-    outliers hardly change.
+    """Return the variance (groups,) of a component of the errors for each group of recordings, by a
+    median that outliers hardly change.
 
-    The median is taken over the readings of a group. An estimate with the weights of the robust
-    loss would be too small without outliers, and too large with many outliers.
+    The median of the squared lengths is taken over the readings of a group, and divided by the
+    median of χ² with k degrees of freedom. Readings with an unused component are left out; the
+    variance is 0 for a group without other readings. A mean with the weights of the robust loss
+    (which gives outliers less weight) would be too small without outliers, and too large with many
+    outliers.
 
     - `squares`: (R, T) the squared lengths of the errors, at T times of R recordings.
-    - `mask`: (R, T, k) true for the components of the errors that are used.
+    - `mask`: (R, T, k) true for each of the k components of an error that is used.
     - `groups`: (R,) the index of the group of each recording.
     """
     half, _ = median_of_chi2(mask.shape[-1])
@@ -131,14 +134,16 @@ def _remaining_shares(model: Model, x: Array, blocks: Blocks, noise: Noise) -> l
     """Return, for each sensor, the share (groups,) of the expected sum of squared errors that
     remains after a fit, for each group of recordings.
 
-    A fit makes the errors smaller than the noise. The share is one minus the mean leverage of the
-    errors of the group, and at least 0.1.
+    A fit makes the errors smaller than the noise. The share is one minus N / M, and at least 0.1.
+    Here M is the number of the sensor's errors in the group, and N is the number of free numbers
+    that these errors determine (the sum of their leverages).
 
     - `model`: the model, which says which recordings form a group.
     - `x`: (n,) the free numbers after the fit.
     - `blocks`: the errors of all readings at x, and their derivatives with respect to the free
       numbers.
-    - `noise`: for each sensor the standard deviations (R, k) of its noise.
+    - `noise`: for each sensor the standard deviations (R, k) of its noise, for R recordings and k
+      components of an error.
     """
     groups, readings = np.asarray(model.noise_groups), model.records.readings
     sizes = [np.bincount(groups, one.channel_mask.sum(axis=(1, 2))) for one in readings]
@@ -162,18 +167,22 @@ def _most_likely_noise_and_jitter(
     known_noise: bool,
     tau: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return two things: the most likely standard deviation σ (R,) of the noise of a sensor; and
-    the most likely standard deviation τ (R,), s, of its time stamps.
+    """Return two things: the most likely standard deviation σ (R,) of the noise of a sensor, in the
+    unit of the given errors; and the most likely standard deviation τ (R,), s, of its time stamps.
 
-    The errors of one reading have the covariance `σ² 1 + τ² u uᵀ`. The iteration updates τ² and σ²
-    alternately: τ² by Fisher scoring of the squared components of the errors along u, whose mean is
-    `σ² + τ² |u|²`; and σ² by a step of expectation and maximisation (EM).
+    The k errors of one reading have the covariance matrix `σ² E + τ² u uᵀ`, where E is the unit
+    matrix. The iteration updates τ² and σ² alternately: τ² by Fisher scoring of the squared
+    components of the errors along u, whose mean is `σ² + τ² |u|²`; and σ² by a step of expectation
+    and maximisation (EM).
 
-    - `errors`: (R, T, k) the errors of a sensor with k channels, at T times of R recordings.
-    - `u`: (R, T, k) the time derivative of the prediction.
+    - `errors`: (R, T, k) the errors of a sensor with k channels, at T times of R recordings,
+      divided by the noise (known, or its present estimate), weighted by the robust loss, and
+      enlarged by what the fit has taken from them.
+    - `u`: (R, T, k) the derivative of the errors with respect to the clock offset of the sensor,
+      per second, divided by the same noise.
     - `count`: (R, T) the number of channels that were read.
     - `groups`: (R,) the group of each recording; the recordings of a group share σ and τ.
-    - `known_noise`: whether σ is known; it is then 1.
+    - `known_noise`: whether the noise is known; σ is then 1, since the errors are divided by it.
     - `tau`: (R,) a known τ; `None` to estimate τ.
     """
     size, total = np.sum(u**2, axis=-1), np.sum(errors**2, axis=-1)

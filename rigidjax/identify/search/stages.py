@@ -172,14 +172,14 @@ def _expected_gain_of_noise(
     model: Model, evaluation: Evaluation, normal: NormalMatrix
 ) -> Float[Array, ""]:
     """Return `½ tr(K G⁻¹)`, the mean amount by which a fit that follows only the noise lowers the
-    cost of windows.
+    cost (half the sum of squared residuals) of windows.
 
-    It is the excess of the cost at the true numbers over the least cost. G is the normal matrix of
-    the shared numbers, from which the initial states of the windows are eliminated. K is the sum of
-    g gᵀ over stretches (groups of neighbouring windows), where g is the gradient of the cost of one
-    stretch. Errors may be correlated within a stretch (Takeuchi 1976; Burnham and Anderson 2002,
-    doi:10.1007/b97636, section 7.2). The gradient with respect to the initial states is left out:
-    near the least cost each initial state is at its own optimum.
+    The amount is the cost at the true numbers minus the least cost. G is the normal matrix of the
+    numbers that the windows share, from which the initial states of the windows are eliminated. K
+    is the sum of g gᵀ over stretches (groups of neighbouring windows), where g is the gradient of
+    the cost of one stretch. Errors may be correlated within a stretch (Takeuchi 1976; Burnham and
+    Anderson 2002, doi:10.1007/b97636, section 7.2). The gradient with respect to the initial states
+    is left out: near the least cost each initial state is at its own optimum.
 
     - `model`: the model, whose recordings are windows (short parts of a record of measured states).
     - `evaluation`: the errors, and the gradient of the cost of each window.
@@ -213,11 +213,11 @@ def is_order_one(model: Model, kind: DTypeLike) -> Float[Array, " n"]:
 
 
 def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
-    """Return the rows B (m, n) by which the curvature of the bodies' charts adds BᵀB to the normal
-    matrix of the n free numbers of a `model`.
+    """Return a matrix B (m, n) for the curvature of the charts of the bodies: BᵀB is added to the
+    normal matrix of the n free numbers of a `model`.
 
-    A chart maps free numbers to a body; its curvature matters for a flat body
-    (`AbstractBodyChart.bend`).
+    A chart is a map from free numbers to a possible body. Its curvature matters if a body may be
+    flat, and each chart gives its own part of the m rows (`AbstractBodyChart.bend`).
 
     - `x`: (n,) the free numbers.
     - `slope`: (n,) the gradient of the cost at x.
@@ -229,12 +229,13 @@ def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
 
 
 def _model_until_last_weight(model: Model, weights: Float[Array, "records times"]) -> Model:
-    """Return the `model` with an integrator that stops soon after the last time at which a reading
-    counts.
+    """Return the `model` with an integrator that computes no states long after the last reading
+    with a weight above zero.
 
-    The integrator goes on for `_BEYOND` more samples, if the record has so many. A model with an
-    adaptive integrator is returned unchanged. `weights` (R, T) holds the weight of each reading in
-    the fit of R recordings; zero for a reading that does not count.
+    The states are computed up to `_BEYOND` samples after the time of this reading, if the record
+    has so many, since a low-pass filter uses later samples, too. A model whose integrator is not a
+    `FixedSteps` or `HeldSteps` is returned unchanged. `weights` (R, T) holds the weight of each
+    reading in the fit of R recordings with T times; zero for a reading that is not fitted.
     """
     steps = model.integrator
     if not isinstance(steps, FixedSteps | HeldSteps):
@@ -247,11 +248,12 @@ def _model_until_last_weight(model: Model, weights: Float[Array, "records times"
 
 
 def _zeros_of_evaluation(model: Model, kind: DTypeLike) -> Evaluation:
-    """Return an `Evaluation` (errors, their derivatives, and gradients of the cost) of zeros of the
-    dtype `kind`, in the shapes of a `model`.
+    """Return an `Evaluation` that holds zeros in place of the errors of a `model`, their
+    derivatives, and the gradients of the cost; a compiled search needs it for the shapes of its
+    first state.
 
-    The shapes are computed from the shapes in the model, since tracing `terms.errors_and_jacobians`
-    for its shapes would take seconds.
+    `kind` is the dtype of the zeros. The shapes are computed from the shapes in the model, since
+    tracing the function that computes the errors (`terms.errors_and_jacobians`) would take seconds.
     """
     count, times = model.records.t.shape
     columns = model.index.places.shape[1]
@@ -282,10 +284,11 @@ def weights_of_beginning(model: Model, part: float) -> Float[Array, "records tim
 
 
 def _attempt_of(state: LMState) -> Attempt:
-    """Return the best point of a search as an `Attempt` (free numbers, cost, convergence), with the
-    errors and derivatives at this point if they were kept.
+    """Return the best point of a search as an `Attempt` (free numbers, cost, convergence).
 
-    `state` is the last state of the search.
+    The `Attempt` also has the errors and derivatives at this point if the last evaluation of the
+    search was at this point, since a search keeps only those of its last evaluation. `state` is the
+    last state of the search.
     """
     blocks = state.evaluation.blocks if bool(state.evaluated_at_best) else None
     return Attempt(state.point, state.cost, state.converged, blocks)
@@ -308,14 +311,16 @@ def _search_stride(
 
     - `x`: (n,) the free numbers at the start of the stride.
     - `task`: the model, its noise, and the tolerance.
-    - `weights`: (R, T) the weights of the readings.
+    - `weights`: (R, T) the weights of the readings at T times of R recordings.
     - `damping`: the damping of the first step.
-    - `aim`: a cost that another search reached; the search ends if it is not likely to reach this
+    - `aim`: a cost that another search reached; this search ends if it is not likely to reach this
       cost. Zero for none.
     - `margin`: the search ends at a cost of this value or less. Zero for none.
     - `steps`: the largest number of steps, `task.stride` unless given.
-    - `level`: as for `Settings`. Without a `level` the search ends at a distance of about
-      `TOLERANCES` tolerances from the minimum.
+    - `level`: for a model of windows (short parts of a record of measured states), the search ends
+      after a step whose gain (fall of the cost) is about the predicted gain, but less than this
+      fraction of the gain of a fit from noise alone. Without a `level` the fraction is chosen so
+      that the search ends at a distance of about `TOLERANCES` tolerances from the minimum.
     """
     steps, count = task.stride if steps is None else steps, nominal_count(task.model)
     level = (TOLERANCES * task.tolerance) ** 2 if level is None else level
@@ -324,8 +329,8 @@ def _search_stride(
 
 
 def _evaluate_at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
-    """Return the state of a search that evaluates the cost of all readings at the free numbers x
-    (n,) of a `model`, and takes no step.
+    """Return the state of a search that evaluates the cost (half the sum of squared residuals) of
+    all readings at the free numbers x (n,) of a `model`, and takes no step.
 
     `noise` holds for each sensor the standard deviations (R, k) of its noise, for R recordings and
     k components. The evaluation uses the compiled program of the search, so that no second program
@@ -465,14 +470,17 @@ def _fit_windows(
     """Return the result of the search from one start over windows (short parts of a record of
     measured states), in fits to longer and longer beginnings of each window.
 
-    The first searches use the first ninth, then the first third of each window, since a prediction
-    over a long time with poor numbers diverges.
+    The first searches use the first ninth, then the first third of each window, if this part has
+    enough steps (`SHORTEST`), since a prediction over a long time with poor numbers diverges. Then
+    the whole windows are fitted. If this ends with a higher cost than that of the start, the whole
+    windows are fitted once more, from the start.
 
     - `x`: (n,) the free numbers at the start.
     - `task`: the model, its noise, the tolerance, and the largest number of steps.
     - `aim`: the cost that another start reached; a search that is not likely to reach this cost
       ends early.
-    - `watch`: a function that is called with each `Attempt` at a fit to the whole windows.
+    - `watch`: a function that is called with each `Attempt` (result so far) of a fit to the whole
+      windows.
     """
     model, begin = task.model, x
     length = model.records.t.shape[1] - 1

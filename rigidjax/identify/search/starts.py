@@ -152,10 +152,11 @@ def balance_of_momentum(
 
 @eqx.filter_jit
 def _torques_at(torque: Torque, t: ArrayLike, w: ArrayLike) -> Array:
-    """Return the values (n, 3) of a `torque` at the times t (n,), s, and the body rates w (n, 3),
-    rad/s.
+    """Return the values (n, 3) of a `torque`, N m, at the times t (n,), s, and the body rates w (n,
+    3), rad/s.
 
-    The torque depends on time and body rate alone.
+    The torque must depend on time and body rate alone. The body is not given, and a body of unit
+    inertia takes its place.
     """
     body = Inertia(jnp.eye(3))
     return jax.vmap(lambda time, omega: evaluate(torque, time, Spin(omega), body))(t, w)

@@ -162,13 +162,17 @@ def _descent_steps(
     x: Float[Array, " n"], memory: PyTree, model: Model, noise: Noise, descent: Descent, keys: Array
 ) -> tuple[Float[Array, " n"], PyTree, Float[Array, " steps"]]:
     """Return three things after several steps of stochastic gradient descent: the free numbers x
-    (n,); the state of the optimiser; and the misfit (steps,) before each step.
+    (n,); the state of the optimiser; and an array (steps,) with the misfit before each step.
+
+    Each step uses a batch, a few recordings drawn at random. The misfit is that of the batch,
+    scaled up to the number of all recordings, plus that of the priors.
 
     - `x`: (n,) the free numbers before the first step.
     - `memory`: the state of the optimiser before the first step.
     - `model`: the readings and the free numbers.
-    - `noise`: for each sensor the standard deviations (R, k) of its noise.
-    - `descent`: the optimiser, and the number of recordings in a step.
+    - `noise`: for each sensor the standard deviations (R, k) of its noise, for R recordings and k
+      components of an error.
+    - `descent`: the optimiser, and the number of recordings in a batch.
     - `keys`: (steps,) a random key for each step, which draws its recordings.
     """
 
