@@ -108,7 +108,7 @@ def _power_of_ten(number: float) -> int:
 def _interval_as_text(texts: list[str]) -> str:
     """Return an interval as text, such as "1.2 … 1.3", or "not determined" if an end is NaN.
 
-    The list `texts` holds the value and the low and the high end of the interval, as text.
+    The list `texts` holds three texts: the value, the low end and the high end of the interval.
     """
     return "not determined" if "nan" in texts[1:] else f"{texts[1]} … {texts[2]}"
 
@@ -207,10 +207,10 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
 
 
 def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
-    """Return, for each sensor of a `fit`, its name, its root mean square errors, and its unit.
+    """Return three things for each sensor of a `fit`: its name; the root mean square error of each
+    of its components; and its unit.
 
-    There is one root mean square error for each component of the sensor. Readings at full scale are
-    left out.
+    Masked readings and readings at full scale are left out.
     """
     out = []
     for error, reading in zip(fit.residuals, fit.model.records.readings, strict=True):

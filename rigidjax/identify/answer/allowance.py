@@ -19,6 +19,7 @@ MOST = 3
 # A free bias is reported as large if it exceeds this share of the root mean square of the readings:
 # the bias of a real gyro is about a hundredth of the rates in a record that is worth a fit.
 REMARKABLE = 0.2
+# The words for the small constant errors whose sizes are in `considered.USUAL`.
 _WAYS = {
     "scale": "an error of 1 % in the scale of one axis",
     "cross_axis": "an axis that leans by 1°",
@@ -93,7 +94,8 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
 
 def _describe_shifts(named: Sequence[Quantity], sizes: Float[np.ndarray, " quantities"]) -> str:
     """Return words such as "I1 by 0.02 (interval ±0.1)", which say how far each reported quantity
-    would move if the model errors that a sensor allows for were real.
+    would move if a sensor had a small constant error, such as an error of 1 % in the scale of one
+    axis.
 
     In brackets stands half the width of the 95 % interval of the quantity, if it is finite. At most
     `MOST` quantities are named.

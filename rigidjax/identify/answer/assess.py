@@ -142,10 +142,12 @@ def _describe_errors(
     - `model`, `reading`: the fitted model, and the readings of the sensor.
     - `error`: (R, T, k) reading minus prediction in the unit of the sensor, for R recordings, T
       times and k components.
-    - `mask`: (R, T, k) true for the errors that count.
-    - `factor`: the root mean square error over the known noise; 1 is not written.
-    - `share`: the squared errors over the variance of the readings, or `None` if the readings are
-      constant or have another unit than the errors.
+    - `mask`: (R, T, k) true for the errors to use: those of readings that are neither masked nor at
+      full scale.
+    - `factor`: by how many times the errors are larger than the known noise. It is written only if
+      it is above 1.
+    - `share`: the sum of squared errors divided by the sum of squares of the readings about their
+      mean, or `None` if the readings are constant or have another unit than the errors.
     - `span`: the number of samples over which the errors are autocorrelated, or `None` for white
       errors.
     """
@@ -167,12 +169,18 @@ def _describe_errors(
 
 
 def _describe_interval(model: Model, error: np.ndarray, mask: np.ndarray) -> str:
-    """Describe the shortest interval of time that contains half of the sum of squared errors.
+    """Describe the shortest interval of time that contains half of the sum of squared errors of a
+    sensor.
 
-    It is taken from the recording with the largest sum; the words are "all along" if it is longer
-    than 40 % of the recording. The arguments are the fitted `model`, which holds the times of R
-    recordings; the errors `error` (R, T, k) of one sensor at T times; and `mask` (R, T, k), true
-    for the errors that count.
+    The interval lies in the recording with the largest sum of squared errors. If it is longer than
+    40 % of this recording, the words are "all along".
+
+    **Arguments:**
+
+    - `model`: the fitted model, which holds the times of R recordings.
+    - `error`: (R, T, k) the errors of the sensor at T times, in k components.
+    - `mask`: (R, T, k) true for the errors to use: those of readings that are neither masked nor at
+      full scale.
     """
     squares = np.sum(np.where(mask, error, 0.0) ** 2, axis=-1)
     row = int(np.argmax(squares.sum(axis=1)))
@@ -196,7 +204,7 @@ def _sums_of_squares(
 
     **Arguments:** `reading` the readings of the sensor with their mask; `error` (R, T, k) reading
     minus prediction, for R recordings, T times and k components; `mask` (R, T, k) true for the
-    errors that count.
+    errors to use, those of readings that are neither masked nor at full scale.
     """
     values = np.asarray(reading.values)[reading.host_mask]
     varies = float(np.sum((values - values.mean(axis=0)) ** 2))
@@ -206,9 +214,10 @@ def _sums_of_squares(
 def _excess_by_median(squares: np.ndarray, size: int) -> float:
     """Return the factor by which whitened errors are larger than noise of unit variance.
 
-    The factor is the root of the median of the squared lengths over the median for unit noise. It
-    is 1 if the median is less than five standard deviations above that for unit noise. The median
-    is taken because outliers are expected under a robust loss, and outliers would dominate χ².
+    The factor is √(m/m₁): m is the median of the squared lengths of the errors, and m₁ is the
+    median that noise of unit variance has. The factor is 1 if m is less than five of its standard
+    deviations above m₁, since so small an excess may be chance. The median is taken because
+    outliers are expected under a robust loss, and outliers would dominate χ².
 
     **Arguments:** `squares` (N,) the squared length of each of N errors, in standard deviations of
     the noise; `size` the number of components of an error.
@@ -228,19 +237,20 @@ def _is_white(
 ) -> bool:
     """Return whether the errors of a sensor are not autocorrelated, by Ljung and Box's test.
 
-    The fit removes the covariance `slope covariance slopeᵀ` from white errors and so makes the
-    errors correlated, which shows in many short recordings (Box and Pierce 1970,
+    A fit makes white errors correlated: it subtracts `slope covariance slopeᵀ` from their
+    covariance, which shows in many short recordings (Box and Pierce 1970,
     doi:10.1080/01621459.1970.10481180). The test allows for this correlation.
 
     **Arguments:**
 
     - `errors`: (R, T, k) the whitened errors (in standard deviations) in R recordings, at T times,
       of k components.
-    - `used`: (R, T, k) true for the errors that count.
+    - `used`: (R, T, k) true for the errors to use: those of readings that are neither masked nor at
+      full scale.
     - `slope`: (R, T, k, m) the derivatives of the errors with respect to the m free numbers of each
       recording.
-    - `covariance`: (R, m, m) the covariance of the free numbers of each recording, for white
-      errors.
+    - `covariance`: (R, m, m) the covariance of the free numbers of each recording, computed as if
+      the errors were white.
     - `has_noise`: whether the noise is known. If the noise is known, errors that are far smaller
       than the noise are no evidence of autocorrelation.
     """
@@ -321,9 +331,10 @@ def _count_rivals(
       `margin` is not counted either: it is the best point again, since two searches that reach the
       same minimum end at slightly different costs.
     - `best_cost`: the least cost (half the sum of squared residuals) of all searches.
-    - `margin`: the growth of the cost below which two points fit equally well. A point counts as
-      another one if the linearised errors differ, from those at x, by a sum of squares of more than
-      twice this margin.
+    - `margin`: the growth of the cost below which two points fit equally well. A point is another
+      one if the errors there, by the linearisation at x, differ from the errors at x by a sum of
+      squares of more than twice this margin. Distant points of a flat valley, which predict the
+      same readings, are therefore not counted.
     - `linear`: the errors at the best point, with their derivatives.
     - `x`: (n,) the free numbers at the best point.
     """
@@ -456,18 +467,21 @@ def _sentences_on_allowance(
     quantities: Sequence[Quantity],
     slopes: np.ndarray,
 ) -> str:
-    """Return sentences on the sensor errors that the intervals of a fit allow for and do not allow
-    for.
+    """Return sentences on the constant errors of sensors that the intervals of a fit allow for, and
+    on those that the intervals do not allow for.
 
-    They say how far such errors move the moments and ratios of the body or, if none is reported,
-    the values of the `Free`s.
+    Intervals allow for the errors of a sensor that has a `Tolerance`. For a sensor without one, the
+    sentences say how far a small error of its scale or of its axes would move the moments and
+    ratios of the body or, if none is reported, the values of the `Free`s (numbers that a fit may
+    move).
 
     **Arguments:**
 
     - `model`, `noise`: the fitted model, and the standard deviations of the errors of its sensors.
     - `linear`: the errors and their derivatives at the best point.
-    - `covariance`: (n, n) the covariance of the free numbers for white errors.
-    - `parts`: the considered errors, which the sensors with a `Tolerance` may have.
+    - `covariance`: (n, n) the covariance of the free numbers, computed as if the errors were white.
+    - `parts`: the errors that the intervals allow for: the constant errors, within its `Tolerance`,
+      of each sensor that has one.
     - `quantities`: the q reported quantities.
     - `slopes`: (q, n) the derivatives of the quantities with respect to the free numbers; further
       rows, for the flatness of bodies, are not used.
@@ -485,12 +499,17 @@ def _sentences_on_allowance(
 def _with_considered(
     covariance: uncertainty.Covariance, parts: tuple[considered.Consideration, ...], model: Model
 ) -> uncertainty.Covariance:
-    """Return the `covariance` of a fit plus the covariance that the considered errors of sensors
-    make.
+    """Return the `covariance` of a fit plus the covariance that the constant errors of sensors
+    within their `Tolerance` make.
 
-    A considered error is one that a sensor with a `Tolerance` may have, and that the fit does not
-    estimate. **Arguments:** `covariance` the covariance of the free numbers; `parts` the considered
-    errors, with the change of the free numbers by each; `model` the fitted model.
+    Such an error is called considered: the fit does not estimate it, but the intervals allow for
+    it.
+
+    **Arguments:**
+
+    - `covariance`: the covariance of the free numbers.
+    - `parts`: the considered errors, with the change of the free numbers by each.
+    - `model`: the fitted model.
     """
     if not parts:
         return covariance

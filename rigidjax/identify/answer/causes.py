@@ -51,6 +51,7 @@ RATES = {
     "axes in the order y, z, x": _SAME[[2, 0, 1]],
     "axes in the order z, x, y": _SAME[[1, 2, 0]],
 }
+# These functions correct quaternions (n, 4) for each mistake with which attitudes may be read.
 ATTITUDES = {
     "the quaternion's scalar last, not first": lambda q: np.roll(q, 1, axis=-1),
     "the quaternion from world to body": lambda q: q * [1.0, -1.0, -1.0, -1.0],
@@ -111,7 +112,9 @@ def _euler_residual(
     fits the recorded body rates best; and the margin of this tensor, positive if a body can have
     it.
 
-    The margin is the smallest second moment over the largest one in magnitude.
+    The matrix of second moments of a tensor I is `½ tr(I) E − I`, with the unit matrix E; its
+    eigenvalues are positive for a real body. The margin is the smallest eigenvalue of this matrix,
+    divided by the magnitude of the eigenvalue that has the largest magnitude.
 
     **Arguments:**
 
@@ -279,14 +282,17 @@ def _largest_cause(
     """Return the cause that explains the largest share of the squared errors of a `sensor`.
 
     Causes that explain nearly as large a share are joined to it by "or". The result is `None` if
-    the largest share is too small. A cause that is linear only while it is small is left out if its
-    size is large.
+    the largest share is at most 0.7. The share is computed as if the readings changed in proportion
+    to the size of a cause. An error of the scale, mounting or skew that comes out large is left
+    out, since this is false for it; only a large scale error that is the same for all axes is kept,
+    since it shows a wrong unit.
 
     **Arguments:**
 
     - `sensor`: the sensor that has the errors.
-    - `rows`: for each possible cause its name, its direction (R, T, 3, c) in the readings, its
-      words and its remedy, as `_candidate_causes` returns them.
+    - `rows`: for each possible cause its name; the change (R, T, 3, c) of the readings by a cause
+      of unit size, for R recordings, T times, three axes and the c numbers of the cause; the cause
+      in words; and its remedy in words.
     - `shares`: for each possible cause the share that it explains, and its size (c,).
     """
     candidates = [
@@ -324,10 +330,10 @@ def _candidate_causes(
     - `linear`: the errors and their derivatives at x.
     - `index`: the index of the sensor.
 
-    **Returns** for each cause its name, such as "bias"; the change (R, T, 3, c) of the readings in
-    R recordings, at T times, along three axes, if the cause has unit size; the cause in words; and
-    the remedy in words. A cause with c numbers, such as a bias with three components, makes c
-    changes.
+    **Returns** for each cause four things: its name, such as "bias"; the change (R, T, 3, c) of the
+    readings by a cause of unit size; the cause in words, in which `{size}`, if it occurs, stands
+    for the size; and the remedy in words. The change is given for R recordings, T times, three axes
+    and the c numbers of the cause, such as the three components of a bias.
     """
     reading = model.records.readings[index]
     t, shown = np.asarray(model.records.t), np.asarray(reading.values) - linear.raw[index]
@@ -405,8 +411,9 @@ def _explained_share(
     """Return two things: the share of a sensor's squared errors that a cause explains, 0 to 1; and
     the size (c,) of the cause.
 
-    The size holds the least-squares coefficients of the errors on the c directions of the cause
-    (the changes of the readings by a cause of unit size).
+    A cause has c numbers, such as the three components of a bias. The direction of a number is the
+    change of the readings if it is one. The size holds the coefficients of the c directions in the
+    least-squares fit of the errors.
 
     **Arguments:**
 

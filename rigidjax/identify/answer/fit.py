@@ -186,8 +186,9 @@ def _faster_device(model: Model) -> Any:
     """Return the CPU if a fit of the `model` is faster there than on the default device, else
     `None`.
 
-    The result is `None` for a model with many numbers, on a machine without a GPU, and if the user
-    chose a device by `jax.default_device` or put arrays of the model on a device.
+    The result is `None` in four cases: the arrays of the model hold so many numbers that a GPU is
+    faster; the machine has no GPU; the user chose a device by `jax.default_device`; or the user put
+    arrays of the model on a device.
     """
     chosen: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     if chosen is not None or jax.default_backend() == "cpu":
@@ -202,8 +203,8 @@ def _with_original_readings(original: Model, fitted: Model) -> Model:
     """Return the `fitted` model with the readings of the `original` model in place of its padded
     ones.
 
-    A fit pads readings by masked rows, so that recordings of similar length share one program. The
-    jitter (errors of time stamps) that the fit estimated is kept.
+    A fit adds masked readings at the end of each recording, so that recordings of similar length
+    share one compiled program. The errors of time stamps (jitter) that the fit estimated are kept.
     """
     records = original.records
     for index, r in enumerate(fitted.records.readings):
@@ -226,7 +227,10 @@ def _finite_cost(attempt: Attempt) -> float:
 
 
 def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
-    """Estimate the unknown noise of sensors and the best point alternately, until both settle.
+    """Estimate the unknown noise of sensors and the best point alternately, until the noise settles
+    or a largest number of rounds is reached.
+
+    If all noise is known, the arguments are returned.
 
     **Arguments:** `best` the best point for the present noise; `task` the model and the noise of
     its sensors, with the tolerance and the largest number of steps of a search. **Returns** two
@@ -301,7 +305,7 @@ def _search_from_each(
       which each new end is saved; `None` for no file.
     - `progress`: a function that is called with a line of text after each search, or `None`.
     - `interrupts`: a list, to which a line is added after an interrupt (Ctrl-C). The remaining
-      starts are then left out.
+      starts are then left out; the interrupt is raised if no search has got anywhere.
     """
     like, print_of = Attempt(points[0]), ""
     if checkpoint is not None:
@@ -416,10 +420,11 @@ def _converged_integrator(
 
 
 def _estimate_widths_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
-    """Estimate the unknown spreads of `Free`s and the best point alternately, until both settle.
+    """Estimate the unknown spreads of `Free`s (numbers that a fit may move) and the best point
+    alternately, until the spreads settle or a largest number of rounds is reached.
 
     The spread of a `Free` is the standard deviation, between recordings, of its value about the
-    value that the recordings share.
+    value that the recordings share. If no spread is unknown, the arguments are returned.
 
     **Arguments:** `best` the best point for the present spreads; `task` the model with these
     spreads and the noise of its sensors, with the tolerance and the largest number of steps of a
@@ -446,13 +451,16 @@ def _estimate_widths_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
 def _expected_widths(best: Attempt, task: Task, indices: list[int]) -> np.ndarray:
     """Return the expected spread (k,) of each of k `Free`s whose value differs between recordings.
 
-    The spread is the root mean square, over recordings, of the deviation of the value from the
-    value that the recordings share. The expectation is over the posterior density at the point
-    `best`, which Laplace's method takes as normal.
+    A `Free` is a number that a fit may move. Its spread is the root mean square, over recordings,
+    of the deviation of its value from the value that the recordings share. The expectation is over
+    the posterior density at the point `best`, which Laplace's method takes as normal.
 
-    **Arguments:** `best` the end of a search, with the errors and their derivatives there; `task`
-    the model and the noise of its sensors; `indices` the indices of the k `Free`s in
-    `task.model.slots`.
+    **Arguments:**
+
+    - `best`: the end of a search, with the errors and their derivatives there.
+    - `task`: the model and the noise of its sensors.
+    - `indices`: the indices of the k `Free`s in `task.model.slots`, which describes all `Free`s of
+      the model.
     """
     linear = linearise(task.model, best.x, task.noise, best.blocks)
     variance, x = np.diag(white_covariance(linear).determined), np.asarray(best.x)

@@ -235,8 +235,8 @@ class Fit(eqx.Module):
         unit.
 
         R is the number of recordings, T the number of times and k the number of components. The
-        rows with which a fit pads the readings are left out. **Raises** `ValueError` for a fit
-        without its errors.
+        readings that a fit adds to fill up its arrays are left out. **Raises** `ValueError` for a
+        fit that does not hold its errors (`linear` is `None`).
         """
         if self.linear is None:
             raise ValueError(

@@ -153,13 +153,15 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
 
 
 def _readings_change(fit: "Fit", direction: np.ndarray) -> bool:
-    """Return whether readings change along a `direction` (n,) although their derivatives are zero.
+    """Return whether readings change along a `direction` (n,) although their derivatives along it
+    are zero.
 
-    The direction is a vector in the space of the n free numbers of a `fit`. Readings change
-    although their derivatives are zero if a torque switches at a time, or at a state, that changes
-    along the direction. The change is half the difference of
-    the readings after a step forwards and a step backwards. A number on which the readings depend
-    only by its square has zero derivatives, too, but it does not change this difference.
+    The direction is a vector in the space of the n free numbers of a `fit`. Such a change comes
+    from a torque that switches at a time, or at a state, that moves along the direction; without a
+    torque the result is false. The change is half the difference of the readings after a step
+    forwards and a step backwards, and it counts if it is more than a hundredth of the noise, over
+    all readings together. A number on which the readings depend only by its square has zero
+    derivatives, too, but it does not change this difference.
     """
     if fit.model.torque is None:
         return False
@@ -181,7 +183,8 @@ def _combination_of_row(
 ) -> Combination:
     """Return the combination of numbers, which the data leave undetermined, that one row describes.
 
-    The row is one of the reduced row echelon form of all undetermined directions.
+    The row is one of the reduced row echelon form of a matrix, which has one row for each direction
+    of the free numbers that the data do not determine.
 
     **Arguments:**
 
@@ -213,11 +216,14 @@ def _combination_of_row(
 
 
 def _names_and_units(model: Model) -> list[tuple[str, str, bool]]:
-    """Return the name, the unit, and whether changes are relative, of all numbers that a report may
-    name.
+    """Return three things for each number that a report may name: its name; its unit; and whether
+    its changes are given as relative changes.
 
-    The numbers are, in the order of `_values_and_slopes`, the reported quantities of the `model`,
-    the components of its inertia tensors, and the initial attitudes, positions and velocities.
+    The numbers are, in this order: the reported quantities of the `model`; the components of its
+    inertia tensors; the initial attitudes, as turns about the world's axes and then about the
+    body's axes; the initial positions; and the initial velocities. Of the last four kinds only
+    those that the initial state has are listed, and none for a model of windows
+    (short stretches of a log), whose many initial states are not reported.
     """
     out = labels(model)
     for name, chart in charts_by_suffix(model):
@@ -239,9 +245,11 @@ def _names_and_units(model: Model) -> list[tuple[str, str, bool]]:
 def _values_and_slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
     """Return the derivatives (M, n) and the values (M,) of all M numbers that a report may name.
 
-    The numbers are the reported quantities of the `model`, the components of its inertia tensors
-    and the initial attitudes, positions and velocities. A positive quantity is given by its
-    logarithm. The derivatives are taken with respect to the n free numbers, at `point` (n,).
+    The numbers are, in this order: the reported quantities of the `model`, a positive one by its
+    logarithm; the components of its inertia tensors; the initial attitudes, as turns about the
+    world's axes and then about the body's axes; the initial positions; and the initial velocities.
+    The initial states are left out for a model of windows (short stretches of a log). The
+    derivatives are taken with respect to the n free numbers, at `point` (n,).
     """
     reference = model.reference
     start = jax.vmap(ReferenceStates.start_at)(reference, point[model.index.start])
@@ -271,8 +279,9 @@ def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.nda
     """Return a mask (M,), true for the numbers whose changes along undetermined directions are
     reported.
 
-    The changes of an inertia tensor are reported as changes of its moments, or as changes of its
-    components if some change turns its principal axes.
+    Of the moments and the tensor components of a body only one kind is reported, since they
+    describe the same changes: the moments, or the components if some change turns the principal
+    axes. All other numbers are reported.
 
     **Arguments:** `fit` the fit; `names` the names of the M numbers; `changes` (k, M) the changes
     of the numbers along k directions that the data do not determine.
@@ -294,7 +303,7 @@ def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.nda
 def _turns_principal_axes(tensor: np.ndarray, changes: np.ndarray) -> bool:
     """Return whether any of k changes of an inertia `tensor` (3, 3) turns its principal axes.
 
-    Each row of `changes` (k, 6) changes the components of the tensor, in the order of `BASIS`.
+    Each row of `changes` (k, 6) changes the components xx, yy, zz, yz, xz and xy of the tensor.
     """
     steps = np.einsum("mk,kij->mij", changes, BASIS)
     _, axes = np.linalg.eigh(tensor)
@@ -414,8 +423,8 @@ def _describe_undetermined(fit: "Fit") -> list[str]:
     """Describe, each in a sentence, the combinations of numbers that the data of a `fit` do not
     determine.
 
-    At most `SEVERAL` combinations are described, and the rest is counted. The list is empty if the
-    data determine all numbers.
+    At most `SEVERAL` combinations are described; of further ones only the number is given. The list
+    is empty if the data determine all numbers.
     """
     combinations = undetermined_combinations(fit)
     if not combinations:

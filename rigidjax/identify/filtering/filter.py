@@ -228,7 +228,8 @@ def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
 
     A scene holds all on which readings depend: the body, the torques, the sensors and the initial
     state. The torque in the returned scene reads the inputs that the recording holds, such as a log
-    of thrust. The scene is taken at the free numbers x (n,) of the model.
+    of thrust. Numbers of the scene that are free have the values of x (n,), the free numbers of the
+    model.
     """
     row = model.index.rows(x)[0]
     record, reference, body_index = stacking.pick_records(
@@ -532,9 +533,9 @@ def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) 
     **Arguments:**
 
     - `scene`: the body, torques and sensors.
-    - `drifts`: the walks, which are numbers of the scene that drift randomly, such as the bias of a
-      gyro.
-    - `belief`: the estimated state, with a root of its covariance, before the step.
+    - `drifts`: the numbers that drift as random walks, such as the bias of a gyro.
+    - `belief`: the estimated state before the step, with a root of its covariance C
+      (a matrix B with B Bᵀ = C).
     - `stop`: the new time, s, and for each sensor its reading at this time and whether there is
       one.
     """
@@ -558,12 +559,14 @@ def _predict_and_update(
     **Arguments:**
 
     - `dynamics`: the equations of motion, the noise of the torques, and the sensors.
-    - `belief`: the estimated state, with a root of its covariance, before the step.
+    - `belief`: the estimated state before the step, with a root of its covariance C
+      (a matrix B with B Bᵀ = C).
     - `stop`: the new time, s, and for each sensor its reading at this time and whether there is
       one.
 
-    **Returns** the new `Belief`, and the `ReadNumbers` with the arrays (k,) of the innovations
-    (reading minus prediction), their variances and a mask, for the k components of all sensors.
+    **Returns** the new `Belief`, and the `ReadNumbers` with three arrays (k,) for the k components
+    of all sensors: the innovations (reading minus prediction); their variances; and a mask, true
+    for a component that was read and is below full scale.
     """
     dtype = belief.root.dtype
     # Subtract times before they are rounded to the dtype of the state: after a thousand seconds the
@@ -613,9 +616,9 @@ def scan_filter(
 def _filter(run: FilterInput) -> Filtered:
     """Return the result of the Kalman filter `filter`, computed in one compiled program.
 
-    The argument `run` holds the checked arguments of `filter`: the scene (body, torques and
-    sensors), the walks, the readings, the belief before the first reading, and the times of the
-    steps.
+    The argument `run` holds the checked arguments of `filter`: the body, torques, sensors and
+    initial state; the numbers that drift as random walks, such as the bias of a gyro; the readings;
+    the estimate before the first reading; and the times at which the steps end.
     """
     both = scan_filter(run, lambda belief, read: (belief, read))[2]
     beliefs, read = run.grid.at_rows(both)
@@ -629,9 +632,9 @@ def _log_likelihood(run: FilterInput) -> Scalar:
     """Return the logarithm of the density of all readings, by a Kalman filter in one compiled
     program.
 
-    The argument `run` holds the checked arguments of `log_likelihood`: the scene (body, torques and
-    sensors), the walks, the readings, the belief before the first reading, and the times of the
-    steps.
+    The argument `run` holds the checked arguments of `log_likelihood`: the body, torques, sensors
+    and initial state; the numbers that drift as random walks, such as the bias of a gyro; the
+    readings; the estimate before the first reading; and the times at which the steps end.
     """
     return roots.innovation_terms(*scan_filter(run, lambda _, read: read)[2]).log_density
 

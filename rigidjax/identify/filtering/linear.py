@@ -197,18 +197,20 @@ def linear_smooth(
 def _checked_arguments(
     model: LinearModel, readings: Readings, mean: Mean, root: Root, mask: Mask
 ) -> tuple[Parts, Array, Array, Array, Array]:
-    """Return the arguments of `linear_filter` as checked arrays.
+    """Return the arguments of `linear_filter` (a Kalman filter) or `linear_smooth` as checked
+    arrays.
 
     **Arguments:**
 
     - `model`: the linear model, with n entries of the state and k numbers read at a time.
     - `readings`: (T, k) the numbers read at each of T times.
-    - `mean`, `root`: (n,) the mean of the first state, and (n, n) a root of its covariance.
-    - `mask`: (T, k) true for the numbers that count; `None` if all count.
+    - `mean`, `root`: (n,) the mean of the first state, and (n, n) a root of its covariance C
+      (a matrix B with B Bᵀ = C).
+    - `mask`: (T, k) true for the numbers to use; `None` to use all.
 
     **Returns** five things: the arrays of the `model` as a dict of field name → array; the
     readings, with zeros in place of masked ones; the `mean`; the `root`; and the mask (T, k).
-    **Raises** `ValueError` for shapes that do not fit, and for NaN that is not masked.
+    **Raises** `ValueError` for shapes that do not fit, and for NaN or infinity that is not masked.
     """
     _checks.require_instance(model, LinearModel, "model")
     n, k = model.size, model.deviation.shape[-1]

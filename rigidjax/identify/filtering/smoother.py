@@ -139,8 +139,9 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
 
     **Arguments:**
 
-    - `run`: the checked arguments of `smooth`: the scene (body, torques and sensors), the walks,
-      the readings, the belief before the first reading, and the times of the steps.
+    - `run`: the checked arguments of `smooth`: the body, torques, sensors and initial state; the
+      numbers that drift as random walks, such as the bias of a gyro; the readings; the estimate
+      before the first reading; and the times at which the steps end.
     - `iterations`: the largest number of iterations.
     - `tolerance`: the iteration ends when no number moves by more than this part of its standard
       deviation.
@@ -196,12 +197,13 @@ def _iterate(
     **Arguments:**
 
     - `dynamics`: the equations of motion, the noise of the torques, and the sensors.
-    - `belief`: the estimated state, with a root of its covariance, before the first reading.
+    - `belief`: the estimated state before the first reading, with a root of its covariance C
+      (a matrix B with B Bᵀ = C).
     - `stops`: the N times at which steps end, with their readings.
     - `path`: the N + 1 states about which the problem is linearised, at the time of the `belief`
       and at the N times.
-    - `kicks`: (N, m) the m unit normal numbers that make the noise of the torques in each step from
-      a state of `path` to the next.
+    - `kicks`: (N, m) for each step from a state of `path` to the next, m unit normal numbers, which
+      make the noise of the torques in this step.
 
     **Returns** three things: the N + 1 new states; the estimate of the changes of the states, with
     their covariances; and the largest change of a number, in standard deviations.
@@ -209,16 +211,18 @@ def _iterate(
     dtype = belief.root.dtype
 
     def linearise(row: tuple) -> tuple:
-        """Return two things: one step of the motion, linearised; and the linearised readings at its
-        end.
+        """Return two things: one step of the motion, linearised; and the readings at its end,
+        linearised.
 
         The `row` holds five things: the time t0 before the step, s; the time and the readings at
         its end (`Stops`); the states of the path before and after the step; and the unit normal
-        numbers (m,) that make its noise.
+        numbers (m,) that make the noise of the torques in the step.
 
         The linearised step is three arrays F, G and d: an error e of the state before the step
         becomes `F e + d + G u` after the step, with the unit normal noise u. The linearised
-        readings are those of `linearise_readings`.
+        readings are four arrays: the derivatives of the predicted readings with respect to an error
+        of the state; reading minus prediction; the standard deviations of the noise; and a mask,
+        true for a component that was read and is below full scale.
         """
         t0, stop, x, y, kick = row
         after, grown, noise = dynamics.predict(

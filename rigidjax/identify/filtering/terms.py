@@ -82,11 +82,10 @@ def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
     - `scene`: the body, torque, sensors and initial state of the recording.
     - `record`: the times and readings of the recording.
 
-    **Returns** the `Terms`, two arrays with an entry for each component of each reading: its error
-    e over its standard deviation; and the logarithm of 2π times its variance. The log-density is
-    −½ times the sum of the squares of the first and of the second. A masked entry is zero. For a
-    reading at full scale, of which only a bound is known, the first entry is √(−2 log P), with the
-    probability P of exceeding the bound, and the second is zero.
+    **Returns** the `Terms`, two arrays with an entry for each component of each reading: z, its
+    error divided by its standard deviation σ; and l = log(2πσ²). The log-density is −½ Σ (z² + l).
+    For a masked reading both entries are zero. For a component at full scale, of which only a bound
+    is known, z is √(−2 log P), with the probability P of exceeding the bound, and l is zero.
     """
     errors = errors_of_scene(model, scene, record)
     scaled, log_variance = [], []

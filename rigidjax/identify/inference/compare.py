@@ -89,10 +89,10 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 def _log_mean_square_errors(fit: Fit) -> np.ndarray:
     """Return the logarithm of the mean square error of each sensor of a `fit`, (sensors,).
 
-    Jitter (errors of time stamps) correlates the errors of a sensor. Such errors are first
-    whitened, so that they have the variance of the noise alone; then the mean logarithm of the
-    factor by which jitter raises their variance is added. White errors with this mean square have
-    the same likelihood.
+    Jitter (errors of time stamps) correlates the errors of a sensor and raises their variance. The
+    errors of a sensor with jitter are therefore first whitened, so that they have the variance of
+    the noise alone; then the mean logarithm of the factor by which jitter raises the variance is
+    added. White errors with this mean square have the same likelihood.
     """
     out, model = 2.0 * np.log(np.maximum(fit.rms, 1e-300)), fit.model
     errors, _ = errors_and_slopes(model, fit.x)
@@ -149,11 +149,12 @@ def cross_validate(
 
 
 def _with_shared_fixed(model: Model, of_others: Fit) -> Model:
-    """Return a `model` whose body and shared numbers have the values of the fit `of_others`, fixed.
+    """Return a `model` whose body and shared numbers are fixed at their values in the fit
+    `of_others`.
 
     It is used to predict one recording by a fit of all other recordings. The `model` holds this
-    recording alone. In the result only its initial state, and the `Free`s with a value for each
-    recording, are free.
+    recording alone. In the result only two things are free: its initial state, and each `Free` (a
+    number that a fit may move) that has a value for each recording.
     """
     x = model.start()
     for slot, fitted in zip(model.slots, of_others.model.slots, strict=True):

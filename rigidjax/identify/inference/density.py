@@ -174,10 +174,10 @@ def map_draws(
 def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
     """Return two things: a slot for each sensor of a `model` whose noise is unknown; and variances.
 
-    A slot is the description of a `Free`, a number that the data determine. Here it is a factor of
-    the noise of the sensor, one for each group of recordings that share their noise, and the free
-    number is its logarithm. The variances (groups,), one array for each slot, are those of these
-    logarithms.
+    A slot is the description of a `Free`, a number that a fit may move. Here it is a factor of the
+    noise of the sensor, one for each group of recordings that share their noise, and the free
+    number is its logarithm. The variances, one array (groups,) for each slot, say how well the
+    readings determine these logarithms: 1/(2N) for a group with N numbers read by the sensor.
     """
     groups, slots, variances = np.asarray(model.noise_groups), [], []
     for index, reading in enumerate(model.records.readings):
@@ -198,7 +198,7 @@ def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
 def _process_slots(process: Process | None, prior: Array) -> list[Slot]:
     """Return a slot for the factor of each number of a random torque, such as its spectral density.
 
-    A slot is the description of a `Free`, a number that the data determine; the free number is the
+    A slot is the description of a `Free`, a number that a fit may move; the free number is the
     logarithm of the factor.
 
     **Arguments:** `process` the random torque, or `None`, which has no numbers; `prior` the
@@ -226,7 +226,7 @@ def _slot_of_factor(
     """Return the slot of a positive factor of one number of a scene; the free number is its
     logarithm.
 
-    A slot is the description of a `Free`, a number that the data determine. A scene is the body,
+    A slot is the description of a `Free`, a number that a fit may move. A scene is the body,
     torques, sensors and initial state of a recording.
 
     **Arguments:**
@@ -234,8 +234,9 @@ def _slot_of_factor(
     - `path`: the path of the number (a leaf) in the tree of the scene.
     - `name`, `unit`: the name of the factor in reports, and the unit of the number.
     - `shape`: the shape of the factor.
-    - `labels`, `groups`: the names of the groups of recordings with a factor each, and the index of
-      the group of each recording; `()` and `None` for a factor that all recordings share.
+    - `labels`, `groups`: for a factor that each group of recordings has by itself, the names of the
+      groups, and the index of the group of each recording; `()` and `None` for a factor that all
+      recordings share.
     - `prior`: the standard deviation of the prior of the logarithm, or `None` for a flat prior.
     """
     one = jnp.ones(())
@@ -246,7 +247,8 @@ def _path_of(model: Model, where: Callable[[Scene], Any]) -> tuple[Any, ...]:
     """Return the path, in the tree of a scene of the `model`, of the leaf that `where` picks.
 
     A scene is the body, torques, sensors and initial state of a recording. The function `where`
-    picks a leaf of it, such as `lambda s: s.sensors[0].noise`. The leaf may be `None`.
+    picks a leaf of it, such as `lambda s: s.sensors[0].noise`. The leaf may be `None`, such as the
+    noise of a sensor if it is unknown.
     """
     scene = scene_template(model, model.records)
     marked = eqx.tree_at(where, scene, 0.0, is_leaf=lambda node: node is None)
@@ -267,8 +269,8 @@ def _with_slots(
     - `model`: the old model with n free numbers.
     - `noises`: for each sensor the standard deviations of its errors, which the new model gets.
     - `process`: the random torque of the new model, or `None`.
-    - `slots`: the slots (descriptions of a `Free`) of the additional free numbers, which no single
-      recording has alone.
+    - `slots`: a slot (the description of a `Free`, a number that a fit may move) for each
+      additional number. None of these numbers is given separately for each recording.
 
     The indices (n,) say which of the new free numbers each old one is.
     """
@@ -299,12 +301,15 @@ def _covariance_of_white_errors(fit: Fit, follows_the_motion: bool) -> np.ndarra
     """Return the covariance (n, n) of the free numbers of a `fit` for a posterior density, which
     takes the errors of the readings as white.
 
-    The covariance of a fit may allow for more than white errors. In two cases it is replaced by the
-    covariance for white errors. The first case is a covariance that allows for constant errors of
-    the sensors within their `Tolerance`. The second is a sandwich covariance, which allows for
-    autocorrelated errors, if it is singular or if `follows_the_motion` is true. This argument says
-    that the model has no random torque and no number that drifts as a random walk, so that the
-    readings are normal about one motion.
+    It is the covariance of the fit, except in two cases. In these cases the covariance of the fit
+    allows for more than white errors, and the covariance for white errors is returned:
+
+    - The covariance of the fit allows for constant errors of the sensors within their `Tolerance`.
+    - It is a sandwich covariance, which allows for autocorrelated errors, and it is singular or
+      `follows_the_motion` is true.
+
+    `follows_the_motion` says that the model has no random torque and no number that drifts as a
+    random walk, so that the readings are normal about one motion.
     """
     covariance = np.asarray(fit.covariance)
     if fit.considered and fit.linear is not None:

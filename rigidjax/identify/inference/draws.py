@@ -255,8 +255,8 @@ def _draw_chains(density: LogDensity, root: Array, keys: Array, sampler: Sampler
     **Arguments:**
 
     - `density`: the logarithm of the density of x (n,), with a central point x0.
-    - `root`: (n, n) a root of the covariance of x. The sampler draws z (n,), with `x = x0 + root
-      z`.
+    - `root`: (n, n) a root of the covariance C of x (a matrix B with B Bᵀ = C). The sampler draws z
+      (n,), with `x = x0 + root z`.
     - `keys`: a key of `jax.random` for each chain.
     - `sampler`: a function of a key, a log-density of z and the first z, which returns draws of z
       (samples, n).
@@ -458,7 +458,8 @@ def _weighted_draws(
 
     - `density`: the logarithm of the density, as a function of n numbers.
     - `mode`: (n,) the maximum of the density, and of the t distribution.
-    - `covariance`: (n, n) the shape of the t distribution.
+    - `covariance`: (n, n) the covariance of the normal approximation at the maximum. The t
+      distribution has this shape, but is somewhat wider.
     - `key`: a key of `jax.random`.
     - `count`: the number m of draws.
     """

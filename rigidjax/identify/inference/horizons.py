@@ -73,8 +73,8 @@ def _model_on_windows(
     """Return two things: a fitted model with other windows as its recordings; and its free numbers
     (m,).
 
-    A window is a short piece of a record. Its measured start is taken as known, so that the free
-    numbers of the new model are those that all windows share.
+    A window is a short stretch of a log of measured states. The state at its start is taken as
+    known, so that the free numbers of the new model are those that all windows share.
 
     **Arguments:** `model` the fitted model of windows; `x` (n,) its free numbers at the best point;
     `windows` the other windows.

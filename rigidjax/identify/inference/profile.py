@@ -116,16 +116,18 @@ def _interval_end(
 ) -> float:
     """Return one end of a profile interval of a quantity, or infinity if the search finds no end.
 
-    At the end the misfit, minimised over all other numbers, has grown by a given amount.
+    At an end the misfit, minimised over all other numbers, has grown by the square of `reach`. An
+    infinite end has the sign of `side`.
 
     **Arguments:**
 
     - `pull_to`: a function that fits the model with the quantity pulled towards a target. Given the
       distance of the target from the best value, in standard deviations, it returns two numbers:
-      the growth of the misfit minus the growth at the end of an interval; and the value of the
-      quantity (its logarithm, if the quantity is positive).
+      the growth of the misfit minus the square of `reach`; and the value of the quantity (its
+      logarithm, if the quantity is positive).
     - `reach`: the first distance to try, in standard deviations.
-    - `largest`: the distance at which the search is given up, in standard deviations.
+    - `largest`: the search is given up beyond this distance or four times `reach`, whichever is
+      larger, in standard deviations.
     - `side`: −1 for the lower end of the interval, 1 for the upper end.
     """
     from scipy.optimize import brentq

@@ -94,7 +94,7 @@ def _mounted_attitude(q: Array, mounting: Vec3 | None) -> Array:
     (4,).
 
     Both attitudes are quaternions to the world frame. The rotation vector `mounting` (3,), rad,
-    turns the body's axes into the sensor's axes; with `None` these are the same axes.
+    turns the body's axes into the sensor's axes. With `None` the sensor's axes are the body's axes.
     """
     return q if mounting is None else quaternion.multiply(q, quaternion.exp(mounting))
 
@@ -168,8 +168,9 @@ class Direction(ClockedSensor):
         """Return the predicted reading of the sensor for a `motion`: the direction (3,) in the
         sensor's axes.
 
-        It is the unit vector `world` of the sensor, turned from the world frame by the attitude of
-        the body and the mounting of the sensor.
+        The field `world` of the sensor is the known direction, a unit vector in the world frame.
+        The reading is this vector in the sensor's axes, which follow from the attitude of the body
+        and the mounting of the sensor.
         """
         return quaternion.rotate_inverse(
             _mounted_attitude(motion.state.q, self.mounting), self.world
@@ -183,15 +184,18 @@ class Direction(ClockedSensor):
 
 
 def _has_wrong_length(rows: np.ndarray) -> np.ndarray:
-    """Return a mask (T,), true where the length of a row of `rows` (T, k) differs from 1.
+    """Return a mask (T,), true where the length of a row of `rows` (T, k) differs from 1 by more
+    than 1e-6.
 
-    A difference of 1e-6 is allowed. The rows are unit vectors or unit quaternions.
+    The rows are unit vectors or unit quaternions.
     """
     return np.abs(np.linalg.norm(rows, axis=1) - 1) > 1e-6
 
 
 def _orthogonal_pair(line: Vec3) -> tuple[Vec3, Vec3]:
-    """Return two unit vectors that are orthogonal to the unit vector `line` and to each other."""
+    """Return two unit vectors that are orthogonal to each other and to the direction `line`, a unit
+    vector.
+    """
     least = jnp.eye(3, dtype=line.dtype)[jnp.argmin(jnp.abs(line))]
     first = cross(line, least)
     first = first / jnp.sqrt(dot(first, first))

@@ -122,14 +122,14 @@ def _end_slopes(gaps: Array, steps: Array, after_gap: Array, is_last: Array) -> 
     """Return two arrays (n, k): the time derivatives of a sampled input at the begin, and at the
     end, of each of n intervals between samples.
 
-    A derivative is that of the parabola through three neighbouring samples, or of the straight line
-    through two samples next to a gap (a hole in the log).
+    A derivative is that of the parabola through three neighbouring samples. Next to a hole in the
+    log it is that of the straight line through two samples.
 
     **Arguments:**
 
-    - `gaps`: (n,) the lengths of the intervals, s.
+    - `gaps`: (n,) the lengths of all intervals, s.
     - `steps`: (n, k) the changes of the k channels of the input over the intervals.
-    - `after_gap`: (n,) true for an interval that is a gap.
+    - `after_gap`: (n,) true for an interval that is a hole in the log.
     - `is_last`: (n,) true for the padding after the last sample.
     """
     h, chord = gaps[:, None], steps / gaps[:, None]
@@ -186,9 +186,9 @@ def _propagator(order: int, w: Array, duration: Array) -> Array:
     """Return the matrix (order, order) by which a transient of a low-pass filter decays over a
     time.
 
-    The transient is the difference of the filter's state (the output y and, for order 2, ẏ/w) from
-    the particular solution for its input. The equation is `ẏ = w(u − y)` for order 1 and `ÿ + √2 w
-    ẏ + w² y = w² u` for order 2.
+    The equation of the filter, with its input u and output y, is `ẏ = w(u − y)` for order 1 and
+    `ÿ + √2 w ẏ + w² y = w² u` for order 2. The transient is the difference of the filter's state
+    (y and, for order 2, ẏ/w) from the particular solution for its input.
 
     **Arguments:** `order` the order of the filter, 1 or 2; `w` its angular frequency, 2π times its
     cutoff, rad/s; `duration` the time, s.
@@ -210,19 +210,21 @@ def _filter_samples(
 ) -> Array:
     """Return the output (n + 1, k) of a low-pass filter at all samples, by a scan over n intervals.
 
-    The state of the filter (the output y and, for order 2, ẏ/w) is the particular solution for the
-    input, a cubic in each interval between samples, plus a transient that decays.
+    The state of the filter (the output y and, for order 2, ẏ/w with the angular frequency w of the
+    filter) is the particular solution for the input, a cubic in each interval between samples, plus
+    a transient that decays.
 
     **Arguments:**
 
     - `start`: (k, order) the state of the filter at the first sample, for k channels.
     - `solution_at_begin`, `solution_at_end`: (n, k, order) the particular solutions at the begin
       and at the end of each interval.
-    - `propagator`: a function of the length of an interval, s, that returns the matrix (order,
-      order) by which a transient decays.
-    - `gaps`: (n,) the lengths of the intervals, s.
-    - `after_gap`: (n,) true for an interval that is a gap (a hole in the log). After a gap the
-      state is the particular solution at the begin of the next interval, without a transient.
+    - `propagator`: a function of the length of an interval, s, that returns the matrix
+      (order, order) by which a transient decays.
+    - `gaps`: (n,) the lengths of all intervals, s.
+    - `after_gap`: (n,) true for an interval that is a hole in the log. At the end of such an
+      interval the state is set to the particular solution at the begin of the next interval,
+      without a transient.
     """
 
     def step(state: Array, row: tuple[Array, ...]) -> tuple[Array, Array]:

@@ -11,6 +11,8 @@ from rigidjax.identify.sensors.base import AbstractSensor, SensorInput
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import minus_small
 
+# What a state of each kind must have for a reading of it; and two sizes: how many numbers a reading
+# has, and how many components its error has (an attitude has 4 numbers, but an error of 3).
 _FEELS = {Spin: HasSpin, Attitude: HasAttitude, Rigid: HasPose}
 _SIZES = {Spin: (3, 3), Attitude: (7, 6), Rigid: (13, 12)}
 # A reading is split at these indices into the parts of the state, such as q and Ω.

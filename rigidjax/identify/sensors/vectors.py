@@ -40,9 +40,10 @@ class VectorSensor(ClockedSensor):
         """Return the predicted reading (3,) of a `vector` v (3,) in the body frame, in the unit of
         v.
 
-        It is `scale · S exp(−mounting) v + bias`: exp turns v to the axes of the sensor, and the
-        matrix S is `[[1, a, b], [0, 1, c], [0, 0, 1]]` for the `skew` (a, b, c) of axes that are
-        not orthogonal.
+        It is `scale · S exp(−mounting) v + bias`, with the fields of the sensor. The rotation
+        exp(−mounting) turns v to the axes of the sensor. The matrix S is
+        `[[1, a, b], [0, 1, c], [0, 0, 1]]` for the `skew` (a, b, c) of axes that are not
+        orthogonal. A field that is `None` has no effect.
         """
         reading = vector
         if self.mounting is not None:

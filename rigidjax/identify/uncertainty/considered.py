@@ -144,16 +144,17 @@ def _changes_by_unit_errors(
     """Return the changes (R, T, 3, c) of the readings of a sensor if it has a unit error of one
     `kind`.
 
-    The changes are for R recordings and T times of a reading of three components.
+    The changes are for R recordings, T times, the three components of a reading, and the c
+    components of the error.
 
     **Arguments:**
 
     - `model`: the fitted model with its readings.
     - `linear`: the errors of the readings at the best point; reading minus error is the prediction.
     - `index`: the index of the sensor.
-    - `kind`: the name of the error. It has c components: "scale" three relative errors of scale;
-      "bias" three, in the unit of the sensor; "clock" one delay of 1 s; "cross_axis" six, one for
-      each pair of axes (i, j), where axis i also reads what axis j reads.
+    - `kind`: the name of the error: "scale" has three components, relative errors of scale; "bias"
+      three, in the unit of the sensor; "clock" one, a delay of 1 s; "cross_axis" six, one for each
+      pair of axes (i, j) with i ≠ j, where axis i also reads all that axis j reads.
     """
     reading = model.records.readings[index]
     shown = np.asarray(reading.values) - linear.raw[index]

@@ -167,17 +167,17 @@ def _linearise_parts(model: Model, x: Array, noise: Noise, blocks: Blocks) -> Py
     - `x`: (n,) the free numbers.
     - `noise`: the standard deviations of the noise of the sensors.
     - `blocks`: for each sensor the errors (R, T, k) at x, at T times and in k components, and their
-      derivatives (R, T, k, m) with respect to the m numbers of each recording; both in the unit of
-      the sensor.
+      derivatives (R, T, k, m) with respect to the m numbers of each recording; errors and
+      derivatives are in the unit of the sensor.
 
-    **Returns** three tuples, which are the fields of a `Linearisation`:
+    **Returns** three things, from which a `Linearisation` is made:
 
-    - of the readings: the errors and the derivatives of `blocks`, divided by the standard
-      deviations; and the weights of the robust loss;
+    - a tuple on the readings: the errors and the derivatives of `blocks`, in standard deviations of
+      the noise; and the weights of the robust loss;
     - the indices (R, m) of the numbers of each recording among all n free numbers;
-    - of what is known besides the readings: the residuals (n,) of the priors of the free numbers
-      and their derivatives (n,); and the j residuals of all other priors, with their derivatives
-      (j, n).
+    - a tuple on what is known besides the readings: the residuals (n,) of the priors of single free
+      numbers; the derivative (n,) of each with respect to its number; the j residuals of all other
+      priors; and their derivatives (j, n).
     """
     errors, slopes = blocks
     out, slopes = residuals_and_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
@@ -288,8 +288,9 @@ class Root(eqx.Module):
         """Return the covariance (n, n) of n free numbers in their own units, from the one of scaled
         numbers.
 
-        The argument `covariance` (n, n) is that of the numbers multiplied by `size`, which are of
-        order one. The directions `null`, which the data do not determine, are projected out.
+        The argument `covariance` (n, n) is that of the numbers multiplied by the field `size`,
+        which makes them of order one. The directions in the field `null`, which the data do not
+        determine, are projected out.
         """
         if len(self.null):
             covariance = covariance - self.null.T @ (self.null @ covariance)
@@ -402,17 +403,19 @@ def _factor_of_shared_numbers(
     selected: np.ndarray,
     shared: np.ndarray,
 ) -> np.ndarray:
-    """Return a triangular matrix (QR) that replaces all errors of recordings without own numbers.
+    """Return a triangular matrix (QR) that replaces the errors of all recordings without own
+    numbers.
 
-    The errors of such recordings depend only on the s numbers that recordings share. The matrix (q,
-    s) has the same Gram matrix as the derivatives of the errors with respect to these numbers.
+    The errors of such recordings depend only on the s numbers that recordings share. The matrix
+    (q, s) has the same Gram matrix as the derivatives of the errors with respect to these numbers.
 
     **Arguments:**
 
     - `linear`: the derivatives of the errors of all R recordings.
     - `triangles`: (R, q, m) for each recording the triangular factor (QR) of the weighted
       derivatives with respect to its m numbers.
-    - `size`: (n,) the factors of the n free numbers that scale their columns to order one.
+    - `size`: (n,) for each free number the divisor of the derivatives with respect to it, which
+      makes them of order one.
     - `selected`: (R,) true for recordings whose errors depend on shared numbers only.
     - `shared`: (s,) the indices of the shared numbers among all n.
     """
@@ -426,10 +429,10 @@ def _factor_of_shared_numbers(
 def _owning_recordings(linear: Linearisation) -> np.ndarray:
     """Return, for each of n free numbers, the index of the only recording that depends on it.
 
-    The index is −1 for a number on which several recordings depend. It is −1, too, for numbers of
-    different recordings that occur together in one of the residuals `extra`, such as a prior that
-    ties them. The argument `linear` holds the numbers of each recording, and the derivatives of
-    these residuals.
+    The index is −1 for a number on which no recording, or more than one, depends. It is −1, too,
+    for numbers of different recordings that one prior ties together. The argument `linear` holds
+    the numbers of each recording, and the derivatives of the residuals of such priors
+    (`extra_slopes`).
     """
     records, n = len(linear.places), linear.size
     owner, used = np.full(n + 1, -1), np.zeros((records, n + 1), bool)
@@ -449,12 +452,13 @@ def _range_and_null_space(
     """Compute the range and the null space of a matrix by a singular value decomposition.
 
     The argument `rows` (q, k) holds derivatives of q residuals with respect to k numbers, with
-    columns of order one. A direction counts as null if its singular value is below 1e-8 of the
-    largest one (of 1 if all are smaller than 1).
+    columns of order one. A direction is taken as null if its singular value is at most 1e-8 of the
+    largest one (of 1 if all are smaller than 1); the other r directions are determined.
 
     **Returns** four things: an orthonormal basis (q, r) of the range; a root (k, r) of the inverse
     of the Gram matrix `rowsᵀ rows`, within the determined directions; the null directions (j, k),
-    which the rows do not determine; and all singular values.
+    which the rows do not determine; and all singular values. A root of a matrix A is a matrix B
+    with B Bᵀ = A.
     """
     u, singular, directions = np.linalg.svd(rows, full_matrices=False)
     determined = singular > BLIND * singular.max(initial=1.0)
@@ -538,17 +542,19 @@ def _sandwich_covariance(
 ) -> np.ndarray:
     """Return the covariance (n, n) of a fit for errors that are correlated in time.
 
-    It is the sandwich `H⁻¹ M H⁻¹` of `covariance_of`, where H⁻¹ is the covariance for white errors,
-    and M is `Jᵀ C J` with the covariance C of the errors in time, plus the information of priors.
-    Each number gets the largest of its variances for several decay times of the autocorrelation and
-    for white errors. The derivatives J are first written in orthonormal columns (QR), since
+    It is the sandwich `H⁻¹ M H⁻¹`, where H⁻¹ is the covariance for white errors, and M is `Jᵀ C J`
+    with the derivatives J of the errors and the covariance C of the errors in time, plus the
+    information of priors. Each number gets the largest of several variances: for several decay
+    times of the autocorrelation, for white errors and, with many recordings, from the scatter
+    between recordings. The derivatives J are first written in orthonormal columns (QR), since
     round-off in products of the derivatives themselves could make variances negative.
 
     **Arguments:**
 
     - `linear`: the errors at the best point, with their derivatives J and weights.
-    - `white`: the covariance for white errors, with a root of it.
-    - `times`: the correlation times of the errors, and the number of independent errors.
+    - `white`: the covariance for white errors, with a root of it (a matrix B with B Bᵀ = H⁻¹).
+    - `times`: over how many samples the errors are correlated, and the number of independent
+      errors.
     """
     columns, triangles = np.linalg.qr(linear.dense)
     longest = max(int(np.median((linear.weights[0] > 0).sum(axis=1))) // 2, 2)
@@ -579,12 +585,13 @@ def _spectra_in_time(linear: Linearisation, columns: np.ndarray) -> tuple[np.nda
 
     A channel is one component of one sensor.
 
-    **Arguments:** `linear` the errors of R recordings at T times, with their weights; `columns` (R,
-    N, m) orthonormal columns that span the derivatives of the N errors of each recording.
+    **Arguments:** `linear` the errors of R recordings at T times, with their weights; `columns`
+    (R, N, m) orthonormal columns that span the derivatives of the N errors of each recording.
 
-    **Returns** the spectra (R, k, 2, T + 1, m), with the real and the imaginary part at each of T +
-    1 frequencies, multiplied by the standard deviation of the errors of the channel; and the
-    fractions (k, 1, 1) of the variance, from `smooth_share`.
+    **Returns** two things: the spectra (R, k, 2, T + 1, m) of the columns, with the real and the
+    imaginary part at each of T + 1 frequencies, multiplied by the standard deviation of the errors
+    of the channel; and for each channel the fraction (k, 1, 1) of the variance of its errors that
+    is smooth in time, 0 to 1.
     """
     first, slopes, shares = 0, [], []
     for error, weight in zip(linear.errors, linear.weights, strict=True):
@@ -612,14 +619,15 @@ def _correlated_information(
     """Return `Jᵀ C J` (R, m, m), for errors whose covariance C in time has a white and a smooth
     part.
 
-    The smooth part has an autocorrelation that decays exponentially over `decay_time` samples; the
-    rest of the variance is white. J holds the derivatives of the errors of R recordings.
+    J holds the derivatives of the errors of R recordings with respect to m numbers. The smooth part
+    has an autocorrelation that decays exponentially over `decay_time` samples; the rest of the
+    variance is white.
 
     **Arguments:**
 
-    - `spectra`: (R, k, 2, T + 1, m) the spectra in time of J for k channels (components of
-      sensors), multiplied by the standard deviation of the errors, as `_spectra_in_time` returns
-      them.
+    - `spectra`: (R, k, 2, T + 1, m) the Fourier transforms in time of J, the real and the imaginary
+      part at each of T + 1 frequencies, for k channels (components of sensors), multiplied by the
+      standard deviation of the errors of the channel.
     - `smooth_shares`: (k, 1, 1) the fraction of the variance of each channel that is smooth.
     - `decay_time`: the decay time, in samples.
     """
@@ -704,8 +712,12 @@ def _autocorrelation_time(errors: np.ndarray, mask: np.ndarray) -> tuple[float, 
     neighbouring errors.
 
     The autocorrelation time is `1 + 2 Σ ρ_l`, with the correlation ρ_l of errors that are l samples
-    apart; it is 1 for white errors. **Arguments:** `errors` (R, T) for R recordings and T times,
-    the errors of one component of a sensor; `mask` (R, T) true for the errors to use.
+    apart; it is 1 for white errors. The sum ends before the first ρ_l that is below twice its
+    standard deviation, or that has fewer than ten pairs of errors. The correlation of neighbours is
+    0 if they have fewer than ten pairs.
+
+    **Arguments:** `errors` (R, T) for R recordings and T times, the errors of one component of a
+    sensor; `mask` (R, T) true for the errors to use.
     """
     counts = mask.sum(axis=1, keepdims=True)
     mean = np.where(mask, errors, 0.0).sum(axis=1, keepdims=True) / np.maximum(counts, 1)
@@ -730,8 +742,8 @@ def _sums_of_lagged_products(rows: np.ndarray) -> np.ndarray:
     """Return, for each lag l from 0 to T − 1, the sum of the products of entries that are l times
     apart.
 
-    The argument `rows` (R, T) holds x[r, i] for R rows and T times. The sums (T,) of x[r, i] x[r, i
-    + l] over all r and i are computed by FFT.
+    The argument `rows` (R, T) holds x[r, i] for R recordings and T times. The sums (T,) of
+    `x[r, i] x[r, i + l]` over all r and i are computed by FFT.
     """
     size = rows.shape[1]
     return np.fft.irfft(np.sum(np.abs(np.fft.rfft(rows, 2 * size)) ** 2, axis=0), 2 * size)[:size]

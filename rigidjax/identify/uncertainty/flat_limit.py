@@ -118,7 +118,8 @@ def bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
 def _bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
     """Return the bodies of a `model` at its free numbers x (n,), computed in one compiled program.
 
-    They are in the order of the charts (the parametrisations of the bodies).
+    They are in the order of the charts of the model (the maps from free numbers to a possible
+    body).
     """
     # Compile one program: outside of a trace each operation of JAX takes as long as a run of 100
     # steps.
@@ -128,12 +129,14 @@ def _bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
 def _numbers_of_thicker_body(
     chart: AbstractBodyChart, body: Inertia | MassProperties
 ) -> Array | None:
-    """Return the numbers of a slightly thicker body in its chart; `None` for a body that is not
-    flat.
+    """Return the free numbers of a slightly thicker body, or `None` for a body that is not flat.
 
-    A flat body has the moments I1 + I2 = I3, or nearly so. The result is a vector of the numbers of
-    the `chart` (the parametrisation of the body). It is `None`, too, for a `body` with NaN, and for
-    a chart that a user wrote, whose limit is not known.
+    A flat body has the moments I1 + I2 = I3, or nearly so. The result is also `None` for a `body`
+    with NaN, for a `chart` that leaves the moments fixed, and for a chart that a user wrote, whose
+    limit is not known.
+
+    **Arguments:** `chart` the chart (a map from free numbers to a possible body), whose free
+    numbers are returned; `body` the body that may be flat.
     """
     # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
     if isinstance(body, MassProperties):
@@ -154,11 +157,11 @@ def _numbers_of_thicker_body(
 
 
 def _ends_at_flat_bodies(chart: AbstractBodyChart) -> bool:
-    """Return whether the bodies of a `chart` end at flat bodies, those with the moments I1 + I2 =
-    I3.
+    """Return whether flat bodies, those with the moments I1 + I2 = I3, are the limit of the bodies
+    that a `chart` can describe.
 
-    It is true if the chart (the parametrisation of a body by free numbers) is one of this package
-    and changes moments of inertia, not the mass alone.
+    A chart is a map from free numbers to a possible body. The result is true if the chart is one of
+    this package and changes moments of inertia, not the mass alone.
     """
     return type(chart).__module__ == AbstractBodyChart.__module__ and any(
         name != "mass" for name in chart.log_names

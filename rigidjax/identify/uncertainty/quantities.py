@@ -342,11 +342,11 @@ def standard_deviations(slope: np.ndarray, covariance: np.ndarray, null: np.ndar
 
 
 def _standard_deviations(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (m,) of linear functions of n numbers of a given `covariance`
+    """Return the standard deviations (m,) of m linear functions of n numbers with the `covariance`
     (n, n).
 
     The argument `slope` (m, n) holds the derivatives of the functions. A deviation is NaN if its
-    variance is negative or as small as round-off.
+    variance is negative or no larger than round-off.
     """
     values, axes = np.linalg.eigh(covariance)
     along = slope @ axes
