@@ -148,9 +148,9 @@ def _convert_to_si(value: Any, name: str, si_unit: str = "") -> Any:
     other values are returned unchanged.
 
     - `value`: anything that a user may pass for an array.
-    - `name`: the name of the argument in messages; it also selects a unit in `_UNITS`.
-    - `si_unit`: the SI unit whose dimension the quantity must have; if it is empty, the unit that
-      `_UNITS` lists for `name`, if any.
+    - `name`: the name of the argument, such as `mass`, for messages.
+    - `si_unit`: the SI unit whose dimension the quantity must have; if it is empty, the unit of
+      `name` in the table `_UNITS` is taken; without an entry there, any dimension is accepted.
     """
     if is_rotation(value):
         # Written out, since `as_quat(scalar_first=True)` needs SciPy 1.14.
@@ -186,7 +186,7 @@ def _powers_of_si_units(value: Any, unit: Any) -> dict[str, Any] | None:
     """Return the dimension of a quantity as powers of SI units, such as {"m": 1, "s": -2}; angles
     are left out.
 
-    The result is `None` if the quantity is neither of astropy nor of pint.
+    The result is `None` for a quantity of another package than astropy or pint.
 
     - `value`: the quantity.
     - `unit`: the unit of the quantity, an object of the same library.
@@ -220,8 +220,8 @@ def require_same_batch(**arrays: tuple[Array, int]) -> None:
 
 @functools.cache
 def _warn_of_lost_digits() -> None:
-    """Warn, once in a process, that float64 numbers become float32 because the 64 bits of JAX are
-    off.
+    """Warn, once in a process, that float64 numbers become float32 because JAX computes with 32
+    bits (`jax_enable_x64` is off).
     """
     # The cache makes this warning appear once in a process.
     warnings.warn(
@@ -303,13 +303,14 @@ def _compiled_index_of_first(faults: Callable[[Any, Any], Any], rows: Array) -> 
 
     - `faults`: a function (xp, rows) of the array module and the rows that returns booleans (n,),
       true for the rows with a fault.
-    - `rows`: (n, …) the rows that are searched.
+    - `rows`: (n, …) the rows (entries along the first axis) that are searched.
     """
     return _index_of_first_true(jnp, faults(jnp, rows))
 
 
 def _is_not_finite(xp: ModuleType, rows: Array | np.ndarray) -> Any:
-    """Return booleans (n,): whether each of the `rows` (n, …) contains a NaN or an infinity.
+    """Return booleans (n,), one for each of the `rows` (n, …): whether it contains a NaN or an
+    infinity.
 
     `xp` is the module of the array, `numpy` or `jax.numpy`.
     """

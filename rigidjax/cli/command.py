@@ -67,8 +67,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _raise_interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
-    """Raise a Ctrl-C (`KeyboardInterrupt`) again if Python dropped it, as in JAX's callback of the
-    garbage collector.
+    """Raise a Ctrl-C (`KeyboardInterrupt`) again if Python dropped it, as it does within the
+    function that JAX lets the garbage collector call.
 
     `dropped` holds an exception that Python could not raise, as `sys.unraisablehook` gets it; other
     exceptions are reported as usual.
@@ -111,7 +111,7 @@ def _check_output_files(options: argparse.Namespace, parser: argparse.ArgumentPa
     """Check the output files that the `options` name, and end the program with a message of the
     `parser` if a file could not be written after the fit.
 
-    A name of the figure without an ending gets the ending `.png`.
+    If the figure's file name has no ending, the ending `.png` is added to it in `options`.
     """
     figure = options.figure
     if figure is not None and figure.name and not figure.suffix.strip("."):
@@ -143,7 +143,8 @@ def _keep_compiled_programs() -> None:
     """Set JAX to store compiled programs in the user's cache folder, so that the next start takes
     seconds.
 
-    Programs of `workprecision` are not kept: it measures how long they take to compile.
+    Programs of the command `workprecision` are not stored, since it measures how long they take to
+    compile.
     """
     if jax.__version_info__ < (0, 12):
         # Messages of XLA are hidden: for each program that it loads, XLA reports two of its own
@@ -304,11 +305,12 @@ def _run_demo(options: argparse.Namespace) -> int:
 
 
 def _channels_of_options(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Channel]:
-    """Return the sensors of a log that the command line describes.
+    """Return the sensors of a log that the command line describes, each as a `Channel` (kind,
+    columns, unit, noise and limit).
 
     - `options`: the options of the command line: `--sensor`, or else `--unit`, `--noise` and
       `--limit` of one gyro.
-    - `rates`: the names of the three columns of the body rates, for this gyro.
+    - `rates`: the names of the three columns of the body rates; they are used for this gyro only.
     """
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
@@ -328,7 +330,8 @@ def _read_logs(
     options: argparse.Namespace,
 ) -> tuple[list[spec.Channel], list[rj.identify.Recording], rj.identify.Model]:
     """Read the logs that the `options` of the command line name. Return three things: the sensors
-    of the first log; the recordings of all logs; and the model that the options describe.
+    of the first log; the recordings of all logs (times, readings and sensors); and the model (body,
+    torque and free numbers) that the options describe.
     """
     if options.columns and options.time:
         raise LogError("--time: not together with --columns, whose first name is the time column")
@@ -372,8 +375,8 @@ def _print_units(path: str, time: str, time_unit: str, channels: Sequence[spec.C
 
 @contextlib.contextmanager
 def _warnings_as_lines(strict: bool) -> Iterator[None]:
-    """Print each warning about a log in one line, within a `with` block; if `strict` is true, raise
-    the first of these warnings as an error.
+    """Print each warning about a log that is given within a `with` block, in one line; if `strict`
+    is true, raise the first of these warnings as an error.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("error" if strict else "always", LogWarning)
@@ -458,13 +461,15 @@ def _write_outputs(
     """Write the figure, the report and the numbers of a fit that the options ask for, and return
     the exit code.
 
-    An output that fails is reported, and all other outputs are still written.
+    If an output fails, a message is printed, and all other outputs are still written. The exit code
+    is 0 after a good fit, 1 after a fit that is not good, 2 after a failed output, and 130 after
+    Ctrl-C.
 
     - `fit`: the result of the fit.
     - `options`: the options of the command line.
     - `title`: the title of the report.
     - `files_read`: the names of the files that were read.
-    - `names`: the names of the recordings.
+    - `names`: the names of the recordings that were fitted.
     - `units`: the units of rates and times, by the names of the arguments `rate_unit` and
       `time_unit`.
     - `more_rows`: rows of further quantities: name, value, low and high end of the interval, and

@@ -27,8 +27,8 @@ from rigidjax.motion.torques import Damping, Flywheel, Input, Series, Sum, Wheel
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation import euler
 
-# Each word of the option `--model` names a function that returns a chart of the body, given the
-# typical size of a moment of inertia, kg m².
+# Each word of the option `--model` names a function that returns a chart of the body (a map from
+# free numbers to a possible body), given the typical size of a moment of inertia, kg m².
 MODELS: dict[str, Callable[[float], charts.AbstractBodyChart]] = {
     "ratios": lambda _: charts.Ratios(),
     "principal-ratios": lambda _: charts.PrincipalRatios(),
@@ -267,11 +267,11 @@ def _typical_rate(path: str | Path, channel: Channel, rates: np.ndarray) -> floa
 def _sensor_and_readings(
     channel: Channel, values: np.ndarray, factor: float, has_bias: bool
 ) -> tuple[AbstractSensor, np.ndarray]:
-    """Return two things: the sensor that a channel of a log describes; and its readings (T, 3), for
-    attitudes quaternions (T, 4).
+    """Return two things: the sensor that a `Channel` of a log describes; and its readings at T
+    times, (T, 3), or quaternions (T, 4) if it is a sensor of attitudes.
 
     - `channel`: the kind, the columns, the noise and the limit of the sensor.
-    - `values`: (T, columns) the values of its columns, in SI units.
+    - `values`: (T, 3) the values of its columns, in SI units, or (T, 4) for quaternions.
     - `factor`: the factor from the unit of the channel to SI.
     - `has_bias`: whether the sensor gets a bias, initially zero, which a fit can estimate.
     """
@@ -299,11 +299,12 @@ def input_names(wheels: Sequence[WheelColumn]) -> list[str]:
 
 
 def _fill_missing_rows(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays: the times; and the values of an evenly spaced series in which missing rows
-    are interpolated.
+    """Return two arrays, the times and the values of a series with even spacing: where a time of
+    this spacing is missing, its value is interpolated.
 
-    If a time differs from an even spacing by more than a thousandth of a step, both arrays are
-    returned unchanged.
+    Both arrays are returned unchanged if a time differs from an even spacing by more than a
+    thousandth of a step, if there are fewer than two times, or if the filled series would be more
+    than about ten times as long.
 
     - `t`: (T,) increasing times, s.
     - `values`: (T,) the values at these times.
@@ -324,8 +325,8 @@ def _fill_missing_rows(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, n
 def _logged_speeds(
     path: str | Path, t: np.ndarray, table: dict[str, np.ndarray], wheels: Sequence[WheelColumn]
 ) -> dict[str, Series]:
-    """Return the logged speed of each wheel as a series in time, rad/s, by the name of its input
-    (`input_names`).
+    """Return the logged speed of each wheel as a series in time, rad/s, by the name (`wheel`, or
+    `wheel 1`, `wheel 2`, … if there are several) under which the torque finds it.
 
     - `path`: the path of the log, for messages.
     - `t`: (T,) the times, s.
@@ -348,12 +349,13 @@ def _logged_speeds(
 
 def _torque_of_options(wheels: Sequence[WheelColumn], free: Sequence[str]) -> Torque | None:
     """Return the torque on the body: that of the wheels and, if `free` contains "drag", a linear
-    drag.
+    drag with coefficients initially zero.
 
     Without wheels and drag it returns `None`.
 
     - `wheels`: the wheels whose speeds were logged.
-    - `free`: some of `bias`, `drag`, `delay`; for `delay` each wheel gets a delay, initially zero.
+    - `free`: some of `bias`, `drag`, `delay`, the numbers that a fit may move; for `delay` each
+      wheel gets a delay, initially zero; `bias` has no effect here.
     """
     delay = 0.0 if "delay" in free else None
     parts: list[Torque] = [
@@ -405,13 +407,14 @@ def model_of(
 def _free_numbers_of_options(
     sensors: Sequence[AbstractSensor], wheels: Sequence[str], typical: float, free: Sequence[str]
 ) -> list[Free]:
-    """Return the free numbers of a fit beyond the body and its motion: biases and places of
-    sensors, the drag, and the delays of wheels.
+    """Return a list of `Free`, each of them numbers that a fit may move in addition to the body and
+    its motion: biases of sensors, places of accelerometers, the drag, and the delays of wheels.
 
-    - `sensors`: the sensors of one recording.
-    - `wheels`: the names of the inputs that hold the speeds of the wheels.
-    - `typical`: the typical size of a moment of inertia, kg m².
-    - `free`: some of `bias`, `drag`, `delay`, the numbers that the command line makes free.
+    - `sensors`: the sensors of one recording; a bias is free if the sensor has one.
+    - `wheels`: the names of the wheels, for the names of their delays.
+    - `typical`: the typical size of a moment of inertia, kg m², from which the scale of the drag
+      follows.
+    - `free`: some of `bias`, `drag`, `delay`; drag and delays are free if they are named here.
     """
 
     def of_sensor(index: int, name: str) -> Callable[[Scene], Any]:

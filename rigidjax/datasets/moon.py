@@ -78,8 +78,8 @@ class Moon(eqx.Module):
             raise ValueError(f"Moon: wanted years in order in 1900 to 2199, got {first}, {last}")
 
         def table(name: str, step: int) -> np.ndarray:
-            """Return the Chebyshev coefficients (intervals, 3, terms) of one table of the
-            ephemeris, in the years of this object.
+            """Return the Chebyshev coefficients (intervals, 3, coefficients) of one table of the
+            ephemeris, for the years of this object and at least ten days before and after.
 
             - `name`: the name of the table in the file names of DE421, such as `moon`.
             - `step`: the length of an interval of the result, days; longer intervals are divided.
@@ -174,8 +174,8 @@ class Moon(eqx.Module):
 
     @property
     def _core_inertia(self) -> Inertia:
-        """Return the inertia of the liquid core, kg m²: flattened, with a fraction of the Moon's
-        largest moment, both from DE421.
+        """Return the inertia of the liquid core, kg m². Its largest moment is a fraction of the
+        Moon's largest moment, and the core is flattened; fraction and flattening are from DE421.
         """
         c = self.constants
         share, flat = c["IFAC"] * self.body().tensor[2, 2], 1 - c["COBLAT"]
@@ -238,15 +238,16 @@ class _BetaGammaChart(AbstractBodyChart):
 
 
 class _LiquidCore(eqx.Module):
-    """Describe the torque on the mantle of the Moon, with a liquid core inside.
+    """Describe the torque on the mantle of the Moon from gravity and from a liquid core inside the
+    mantle.
 
     The core acts on the mantle by friction at the boundary and by the flattening of the boundary.
     The state of this torque, `own` in its methods, is the angular velocity of the core (3,), rad/s,
     mantle frame. **Fields:** `state0` (3,) the initial angular velocity of the core; `tensor` (3,
-    3) the inertia of the core, kg m²; `friction` the torque per difference of the angular
-    velocities, N m s; `gravity` the torque of Earth and Sun on the whole Moon. Source: Folkner and
-    others 2014 (DE430), section III; Williams and others 2001, Lunar rotational dissipation in
-    solid body and molten core, JGR 106:27933.
+    3) the inertia of the core, kg m²; `friction` the torque of friction divided by the difference
+    of the two angular velocities, N m s; `gravity` the torque of Earth and Sun on the whole Moon.
+    Source: Folkner and others 2014 (DE430), section III; Williams and others 2001, Lunar rotational
+    dissipation in solid body and molten core, JGR 106:27933.
     """
 
     feels: ClassVar[type] = HasAttitude
@@ -323,19 +324,21 @@ def _integrate_core(
 
 
 def _shift_along_z(table: Chebyshev, z: float) -> Chebyshev:
-    """Return a Chebyshev `table` of positions (3,), m, with the length `z`, m, added to the third
-    component of each position.
+    """Return a Chebyshev `table` of positions (3,), m, as functions of time, with the length `z`,
+    m, added to the third component of each position.
     """
     moved = table.coefficients.at[:, 2, 0].add(z)
     return eqx.tree_at(lambda t: t.coefficients, table, moved)
 
 
 def _subdivide_polynomials(rows: np.ndarray, parts: int) -> np.ndarray:
-    """Return Chebyshev coefficients on shorter intervals: each interval is divided into equal
-    parts, and the functions do not change.
+    """Return the Chebyshev coefficients of the same functions on shorter intervals: each interval
+    is divided into equal parts.
 
-    - `rows`: (intervals, k, terms) the coefficients of k functions on each interval.
-    - `parts`: the number of parts of each interval. The result is (intervals · parts, k, terms).
+    - `rows`: (intervals, k, terms) the coefficients of k functions on each interval, where `terms`
+      is the number of coefficients of a function.
+    - `parts`: the number of parts of each interval; the result has the shape (intervals · parts, k,
+      terms).
     """
     count, k, terms = rows.shape
     if parts == 1:

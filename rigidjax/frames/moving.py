@@ -246,7 +246,8 @@ def require_frame(frame: object, name: str) -> Any:
 
 
 class _ComposedMotion(eqx.Module):
-    """Describe the motion of a frame that moves as `inner` does within the moving frame `outer`.
+    """Describe the motion of a frame that moves relative to the moving frame `outer` as `inner`
+    states, seen from the inertial frame.
 
     The methods `rotation`, `rate` and `origin` are functions of the time, s, for a `MovingFrame`:
     the rotation matrix (3, 3), the angular velocity (3,), rad/s, and the origin (3,), m.
@@ -269,7 +270,7 @@ class _ComposedMotion(eqx.Module):
 
 
 class _InverseMotion(eqx.Module):
-    """Describe the motion of the inertial frame S relative to the moving frame S' = `frame`.
+    """Describe the motion of the inertial frame relative to the moving frame `frame`.
 
     The methods `rotation`, `rate` and `origin` are functions of the time, s, for a `MovingFrame`:
     the rotation matrix (3, 3), the angular velocity (3,), rad/s, and the origin (3,), m.

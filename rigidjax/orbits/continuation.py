@@ -68,13 +68,15 @@ def family(
 
 
 def _is_lost(start: Array, numbers: Array, left: Array) -> Array:
-    """Return booleans (N,): whether Newton's method failed at each member of a family, or went to
-    an orbit of less than half or more than twice the period of the member before it.
+    """Return booleans (N,), one for each of the N members of a family of periodic orbits: whether
+    Newton's method failed there, or went to an orbit of less than half or more than twice the
+    period of the member before it.
 
     - `start`: (4,) the numbers x, z, v_y, T/2 of the orbit before the first member: its position,
       its velocity and half of its period T, where it crosses y = 0 at a right angle.
     - `numbers`: (N, 4) the numbers x, z, v_y, T/2 of the members.
-    - `left`: (N,) the largest residual of each member, |y|, |v_x| or |v_z| after half a period.
+    - `left`: (N,) the largest of |y|, |v_x| and |v_z| of each member after half a period; Newton's
+      method failed if it is NaN or above the usual tolerance.
     """
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
@@ -84,14 +86,15 @@ def _is_lost(start: Array, numbers: Array, left: Array) -> Array:
 def _orbits_unless_lost(
     numbers: Array, is_lost: Array, place: Callable[[int], str], message: str, advice: str
 ) -> PeriodicOrbit:
-    """Return the members of a family as one `PeriodicOrbit` with a leading axis N, or raise an
-    error if a member is lost.
+    """Return the N members of a family as one `PeriodicOrbit` with a leading axis, or raise an
+    error if a member is lost (if Newton's method did not find it).
 
     - `numbers`: (N, 4) the numbers x, z, v_y, T/2 of the members: position, velocity and half of
       the period T, where an orbit crosses y = 0 at a right angle.
-    - `is_lost`: (N,) whether Newton's method failed at each member.
+    - `is_lost`: (N,) true for each member that is lost.
     - `place`: a function that returns, for the index of the first lost member, the words that name
-      it in the message; it is used if `is_lost` is known.
+      it in the message; it is called only if `is_lost` is known, and not traced as within
+      `jax.jit`.
     - `message`, `advice`: the words of the error before and after this place.
     """
     known = _checks.is_known(is_lost) and bool(is_lost.any())
@@ -104,7 +107,8 @@ def _members_at_values(
     scene: "AbstractReversible", start: Array, held_values: Array, index: int, tolerance: float
 ) -> Any:
     """Return two arrays: the numbers x, z, v_y, T/2 (N, 4) of the members of a family of periodic
-    orbits, one for each held value; and the largest residual (N,) of each.
+    orbits, one for each of N held values; and the largest residual (N,) of each, |y|, |v_x| or
+    |v_z| after half a period.
 
     The numbers are position, velocity and half of the period T, where an orbit crosses y = 0 at a
     right angle. Each member is predicted along the tangent of the family and corrected by Newton's
@@ -113,7 +117,7 @@ def _members_at_values(
     - `scene`: the equations of motion.
     - `start`: (4,) the numbers of an orbit near the first member.
     - `held_values`: (N,) the values of the number that each member must have.
-    - `index`: the index, 0 to 3, of the number that is held.
+    - `index`: the index, 0 to 3, of the number that is held, which is the same for all members.
     - `tolerance`: the largest residual of a member.
     """
     free = np.delete(np.arange(4), index)
@@ -188,7 +192,7 @@ def _orbit_derivative(scene: "AbstractReversible", numbers: Array, index: int) -
     - `numbers`: (4,) x, z, v_y, T/2 of the orbit: position, velocity and half of the period T,
       where it crosses y = 0 at a right angle.
     - `index`: the index, 0 to 3, of the number with respect to which the orbit is differentiated;
-      for 3 it is the whole period.
+      for 3 the derivative is with respect to the whole period T, not to T/2.
     """
     unknown = _derivative_along_family(scene, numbers, index)
     change = orbit_of(correction.insert_held(unknown, jnp.ones_like(unknown[0]), index))
@@ -236,11 +240,13 @@ def follow(
 def _follow_family(
     scene: "AbstractReversible", start: Array, step: Array, count: int, index: int, tolerance: float
 ) -> Any:
-    """Return two arrays for the next `count` members N of a family of periodic orbits, at equal
-    steps of arclength: their numbers x, z, v_y, T/2 (N, 4); and the largest residual (N,) of each.
+    """Return two arrays for the next N = `count` members of a family of periodic orbits, at equal
+    steps of arclength: their numbers x, z, v_y, T/2 (N, 4); and the largest residual (N,) of each,
+    |y|, |v_x| or |v_z| after half a period.
 
     The numbers are position, velocity and half of the period T, where an orbit crosses y = 0 at a
-    right angle. The method is pseudo-arclength continuation.
+    right angle. The method is pseudo-arclength continuation: a step along the tangent of the
+    family, then Newton's method across the tangent.
 
     - `scene`: the equations of motion.
     - `start`: (4,) the numbers of the orbit from which the family is followed.
@@ -256,8 +262,9 @@ def _follow_family(
         """Return the unit tangent (4,) of the family at a member, in the direction that has a
         positive product with `previous`.
 
-        - `matrix`: (3, 4) the Jacobian of the periodicity residual with respect to the four numbers
-          of the member; its product with the tangent is zero.
+        - `matrix`: (3, 4) the Jacobian of the periodicity residual (y, v_x, v_z after half a
+          period) with respect to the four numbers x, z, v_y, T/2 of the member; its product with
+          the tangent is zero.
         - `previous`: (4,) the tangent at the member before.
         """
         rows = jnp.concatenate([matrix, previous[None]])
@@ -350,7 +357,7 @@ def bifurcation(
 
 def _stability_index(scene: "AbstractReversible", orbit: PeriodicOrbit, index: int) -> float:
     """Return one stability index ν = ½(λ + 1/λ) of a periodic orbit as a Python float, where λ is
-    an eigenvalue of the monodromy matrix; raise an error if it is complex.
+    an eigenvalue of the monodromy matrix; raise `ValueError` if the index is complex.
 
     `index`, 0 or 1, selects one of the two stability indices of the `orbit` in the `scene`.
     """
@@ -363,7 +370,8 @@ def _stability_index(scene: "AbstractReversible", orbit: PeriodicOrbit, index: i
 
 @eqx.filter_jit
 def _stability_of_orbit(scene: "AbstractReversible", orbit: PeriodicOrbit) -> Array:
-    """Return both stability indices (2,) of an `orbit` in the `scene`, complex, the larger real
-    part first; this program is compiled.
+    """Return both stability indices ν = ½(λ + 1/λ) (2,) of a periodic `orbit`, complex, the larger
+    real part first, by a compiled program. Here λ, 1/λ are the two pairs of eigenvalues of the
+    monodromy matrix other than 1, 1, and `scene` has the equations of motion.
     """
     return scene.stability_indices(orbit)

@@ -19,6 +19,7 @@ from rigidjax.frames.point import Point
 from rigidjax.rotation.linalg3 import components
 
 _NAMES = ("x", "z", "vy", "period")
+# The largest number of steps of Newton's method.
 MAX_STEPS = 25
 
 
@@ -184,8 +185,8 @@ def transition_matrix(
 def _compiled_transition_matrix(
     scene: AbstractScene, numbers: Array, t: Array, rtol: float, atol: float
 ) -> Array:
-    """Return the state-transition matrix (6, 6), the derivatives of the final with respect to the
-    initial position and velocity.
+    """Return the state-transition matrix (6, 6), the derivatives of the final position and velocity
+    with respect to the initial position and velocity.
 
     - `scene`: the equations of motion.
     - `numbers`: (6,) the initial position and velocity (x, v).
@@ -255,7 +256,7 @@ def _compiled_correction(
     forward and reverse mode.
 
     - `scene`: the equations of motion.
-    - `unknown`: (3,) the start of Newton's method.
+    - `unknown`: (3,) the values of the other three numbers, from which Newton's method starts.
     - `held_value`: the number that is held.
     - `index`: its place, 0 to 3, among the four numbers.
     - `tolerance`: the largest accepted residual.
@@ -289,13 +290,14 @@ def correct_orbit(
 
 @correct_orbit.def_jvp
 def _correct_orbit_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-    """Return the outputs of `correct_orbit`, and their derivatives along given tangents, by the
-    implicit function theorem.
+    """Return the outputs of `correct_orbit` (the three numbers that make an orbit periodic, and the
+    largest residual), and their derivatives along given tangents, by the implicit function theorem.
 
     - `primals`: the arguments of `correct_orbit`: index, tolerance, scene, unknown numbers (3,) and
       held value.
     - `tangents`: the tangents of these arguments, `None` for constants; only the tangents of the
-      scene and of the held value count, since the corrected orbit does not depend on the start.
+      scene (the equations of motion) and of the held value are used, since the corrected orbit does
+      not depend on the start.
     """
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 # a motion, too.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 Branch = Literal["stable", "unstable"]
+# The tolerances of a step where a manifold starts.
 _TIGHT = dict(rtol=1e-13, atol=1e-14)
 # The number of steps of inverse iteration; each step reduces the error of an eigenvector at least a
 # hundredfold.
@@ -125,7 +126,8 @@ def _compiled_manifold_point(
     - `orbit`: the unstable periodic orbit.
     - `phase`: the point of the orbit, in periods since `orbit.state`.
     - `branch`: `"stable"` or `"unstable"`, the manifold.
-    - `side`: 1 or −1, the half of the manifold.
+    - `side`: 1 for the half of the manifold that goes to larger x at the start of the orbit, −1 for
+      the opposite half.
     - `distance`: the distance of the state from the orbit, in (x, v).
     """
     value, vector = unstable_direction(scene.monodromy(orbit))
@@ -225,8 +227,8 @@ def manifold_start(
 
 
 def _positive_distance(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
-    """Return `value` as one positive number in the precision `dtype` (`None` keeps its own), or
-    raise an error that begins with `name`.
+    """Return `value` as one positive number in the precision `dtype` (`None` keeps the precision of
+    `value`), or raise an error that begins with `name`.
     """
     distance = _checks.array_of_shape(value, (), name)
     return _checks.require_sign(
@@ -238,8 +240,8 @@ def _positive_distance(value: ScalarLike, name: str, dtype: DTypeLike | None) ->
 def _manifold_trajectories(
     scene: "AbstractReversible", starts: Point, ts: Array, branch: Branch
 ) -> Point:
-    """Return the motions (N, T) that start at given states on a stable or unstable manifold, NaN
-    after a collision.
+    """Return the motions that start at N given states on a stable or unstable manifold, as one
+    `Point` with leading axes (N, T) for T times, NaN after a collision.
 
     Motions on a stable manifold are computed backwards in time, as the mirror images, in y → −y, of
     motions forwards in time.

@@ -45,8 +45,9 @@ def _root_near(coefficients: list[Scalar], start: Scalar) -> Scalar:
     """Return a root of a polynomial by seven steps of Newton's method.
 
     - `coefficients`: the coefficients, that of the highest power first.
-    - `start`: a number near the root. The starts in `distances` are so near to the roots, for every
-      mass ratio, that seven steps are enough.
+    - `start`: a number near the root. The starts that `distances` gives (estimates of the distances
+      of the equilibrium points L1, L2, L3) are so near to the roots, for every mass ratio, that
+      seven steps are enough.
     """
 
     def step(_: object, x: Scalar) -> Scalar:
@@ -129,7 +130,9 @@ def orbit_guess(
 
 
 def _checked_amplitude(value: ScalarLike | None) -> Scalar:
-    """Return the amplitude of an orbit as one finite number, or raise an error."""
+    """Return `value`, the amplitude of an orbit, as one finite number, or raise an error, also for
+    `None`.
+    """
     return _checks.require_finite(_checks.array_of_shape(value, (), "amplitude"), "amplitude")
 
 
@@ -140,7 +143,7 @@ def _potential_coefficient(mu: Scalar, unit: Scalar, point: int, n: int) -> Scal
     The unit of length of the expansion is the distance of the point from the nearer body. Source:
     Richardson 1980, eq 8.
 
-    - `mu`: the mass ratio μ.
+    - `mu`: the mass ratio μ, the mass of the second body divided by the mass of both.
     - `unit`: the distance of the point from the nearer body, in units of the distance between the
       bodies.
     - `point`: 1, 2 or 3 for L1, L2, L3.

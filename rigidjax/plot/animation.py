@@ -181,7 +181,8 @@ def _duration_and_picture_count(
     """Return two numbers: the duration of a film, s; and the number of its pictures, at least 2.
 
     - `ts`: (T,) the times of the motion, s.
-    - `seconds`: the wanted duration, s; `None` for that of the motion, but 20 s at most.
+    - `seconds`: the wanted duration, s; `None` takes the duration of the motion, or 20 s for a
+      longer motion.
     - `fps`: the number of pictures a second.
     """
     if seconds is None:

@@ -61,11 +61,11 @@ def inertia_ellipsoid(
 
 
 def _body_and_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
-    """Return two things: the body; and bodies sampled from the uncertainty of a fit, with a leading
-    axis, or `None` without a fit.
+    """Return two things: the body; and `samples` bodies drawn at random from the uncertainty of a
+    fit, as one body with a leading axis, or `None` if `body` is no fit.
 
-    - `body`: an `Inertia`, a `MassProperties`, or a `Fit` of one body, whose Gaussian approximation
-      is sampled.
+    - `body`: an `Inertia`, a `MassProperties`, or a `Fit` of one body; the samples follow the
+      Gaussian distribution with its covariance.
     - `samples`: the number of sampled bodies.
     """
     if isinstance(body, Inertia | MassProperties):
@@ -88,8 +88,8 @@ def _draw_outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
     """Draw the outlines of ellipsoids r·A⁻¹r = 1 on the planes xy, xz and yz, with a legend.
 
     - `ax`: (3,) matplotlib axes, one for each plane.
-    - `shapes`: the matrices A (n, 3, 3) by name: `body`, and if given `cloud` (bodies sampled from
-      the uncertainty) and `truth`.
+    - `shapes`: the matrices A (n, 3, 3) of n ellipsoids by name: `body` (n = 1), and if given
+      `cloud` (bodies sampled from the uncertainty) and `truth` (n = 1).
     - `unit`: the unit of length, in the labels.
     """
     # The outline of r·A⁻¹r = 1 reaches √A_ii along axis i. All three panels have the same scale,
@@ -118,7 +118,8 @@ def _draw_outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
 
 def _matrix_of_ellipsoid(body: Inertia | MassProperties) -> Any:
     """Return the matrix A (3, 3) of the ellipsoid r·A⁻¹r = 1 that is drawn for a body: 5𝔖/m, m²,
-    for a body with mass m and second moment 𝔖, or 𝔖 for an `Inertia`.
+    for a body with mass m, or 𝔖, kg m², for an `Inertia`, where 𝔖 = ∫ r rᵀ dm (3, 3) is its second
+    moment of mass.
     """
     if isinstance(body, MassProperties):
         return body.second_moment * (5.0 / body.mass)

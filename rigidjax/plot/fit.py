@@ -64,10 +64,10 @@ def _dense_states(fit_result: Any, record: Any, index: int) -> tuple[np.ndarray,
     """Return two things: 800 evenly spaced times, s; and the fitted states at these times, for a
     smooth line between the readings.
 
-    The result is `None` under a torque or for more than 300 readings.
+    The result is `None` for a body under a torque, and for a recording with more than 300 times.
 
-    - `fit_result`: a `Fit`.
-    - `record`: one of its recordings.
+    - `fit_result`: a `Fit`, the result of a fit.
+    - `record`: one of its recordings, which has the times of the readings.
     - `index`: the index of this recording in the fit.
     """
     model, body, state0 = fit_result.model, fit_result.body, fit_result.state0
@@ -95,9 +95,10 @@ def _draw_sensor(
     - `upper_axes`, `lower_axes`: matplotlib axes.
     - `ts`: (T,) the times of the readings, s.
     - `reading`: the sensor with its readings and their mask.
-    - `errors`: (T, k) the residuals, in the unit of the sensor.
-    - `dense_states`: times and fitted states for a smooth line, as `_dense_states` returns them, or
-      `None`.
+    - `errors`: (T, k) the residuals (reading minus prediction) at T times in k components, in the
+      unit of the sensor.
+    - `dense_states`: evenly spaced times, s, and the fitted states there, for a smooth line; or
+      `None` for a line through the predictions at the times of the readings.
     - `units`: the number of seconds in the unit of time, the factor from rad/s to the unit of
       rates, and the name of this unit.
     """

@@ -122,7 +122,7 @@ def _draw_energy_curves(ax: Any, i: np.ndarray, energies: int) -> None:
 
     - `ax`: 3-D axes of matplotlib.
     - `i`: (3,) the principal moments, ascending.
-    - `energies`: the number of curves without the separatrix.
+    - `energies`: the number of curves besides the separatrix.
     """
     import contourpy
 

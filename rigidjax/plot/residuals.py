@@ -60,11 +60,11 @@ def _draw_sensor_residuals(
     """Draw the residuals of one sensor in four panels: over time, as a histogram, as
     autocorrelation, and as power spectrum.
 
-    - `row`: (4,) matplotlib axes.
-    - `t`: (T,) the times, in the unit of the picture.
-    - `standardised`: (T, k) the residuals divided by their standard deviation, for each axis of the
-      sensor.
-    - `mask`: (T,) true where there is a reading.
+    - `row`: (4,) matplotlib axes, one for each panel.
+    - `t`: (T,) the T times of the readings, in the unit of the picture.
+    - `standardised`: (T, k) the residuals divided by their standard deviation, for the k axes of
+      the sensor.
+    - `mask`: (T,) true at times with a reading; other residuals are not drawn.
     """
     over_time, spread, memory, spectrum = row
     colours, names = COLOURS[: standardised.shape[1]], "xyz"[: standardised.shape[1]]
@@ -146,7 +146,8 @@ def power_spectrum(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _autocorrelation(values: np.ndarray, lags: np.ndarray) -> np.ndarray:
-    """Return the correlation (L,) of a series with itself, at each of the given lags.
+    """Return the correlation (L,) of a series with itself, at each of L given lags, as a share of
+    that at lag 0; it is zero for a constant series.
 
     - `values`: (T,) the series; its mean is subtracted.
     - `lags`: (L,) the lags, positive whole numbers of samples.

@@ -61,8 +61,8 @@ def sum_table(light: tuple[Array, ...], highest: float) -> Sums:
 
 @jax.jit
 def _sums_at_frequencies(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
-    """Return two arrays (F,) of complex sums over the readings of a light curve, one entry for each
-    frequency f of `grid`: `Σ w² exp 2πi f (x − ½)`; and `Σ w z exp 2πi f (x − ½)`.
+    """Return two arrays (F,) of complex sums over the T readings of a light curve, one entry for
+    each of the F frequencies f of `grid`: `Σ w² exp 2πi f (x − ½)`; and `Σ w z exp 2πi f (x − ½)`.
 
     - `grid`: (F,) the frequencies, 1/span, where the span is the time from the first to the last
       reading.
@@ -84,13 +84,15 @@ def _sums_at_frequencies(grid: Array, x: Array, z: Array, w: Array) -> tuple[Arr
 
 
 def _interpolate_sums(table: Array, f: Array) -> Array:
-    """Return complex sums over the readings at the frequencies `f`, interpolated in a `table` of
-    such sums.
+    """Return complex sums over the readings of a light curve at the frequencies `f`, interpolated
+    in a `table` of such sums.
 
-    The interpolation is the polynomial (Lagrange) through the `NEAR` nearest entries.
+    The interpolation is the polynomial (Lagrange) through the nearest entries, whose number is
+    `NEAR`.
 
-    - `table`: (F,) complex, the sums at the frequencies (k − NEAR/2)/DENSE for k = 0, 1, …, in
-      1/span, where the span is the time from the first to the last reading.
+    - `table`: (F,) complex, the sums at F frequencies, (k − NEAR/2)/DENSE for k = 0, 1, …, F − 1,
+      in 1/span with `DENSE` frequencies for each 1/span, where the span is the time from the first
+      to the last reading.
     - `f`: the wanted frequencies, 1/span, an array of any shape, which is also the shape of the
       result. The sum at a negative frequency is the complex conjugate of the sum at the opposite
       frequency.
@@ -130,10 +132,12 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
 
     def sums_at_multiples(sums: Array, pair: Array, first_order: int, second_order: int) -> Array:
         """Return the sums (2 m + 1, 2 n + 1) over the readings at the frequencies j f₁ + k f₂, for
-        |j| ≤ m and |k| ≤ n.
+        whole numbers |j| ≤ m and |k| ≤ n.
 
-        - `sums`: (F,) the table of these sums, as in a field of `Sums`.
-        - `pair`: (2,) the frequencies f₁ and f₂, 1/span.
+        - `sums`: (F,) the table of these sums, complex, at F evenly spaced frequencies: the field
+          `window` or `data` of `Sums`.
+        - `pair`: (2,) the frequencies f₁ and f₂, 1/span, where the span is the time from the first
+          to the last reading.
         - `first_order`: m, the largest multiple of f₁.
         - `second_order`: n, the largest multiple of f₂.
         """

@@ -191,11 +191,11 @@ def fit_light_curve(
 
 
 def _require_one_brightness(model: Model) -> Reading:
-    """Return the reading of the model's only sensor, a `Brightness`, without the axis of
-    recordings.
+    """Return the readings of the model's only sensor, a `Brightness`, without the leading axis of
+    length 1 that counts recordings.
 
-    Raise `TypeError` for traced numbers, and `ValueError` for a model with another sensor, several
-    sensors, recordings or bodies, or a torque.
+    Raise `TypeError` for traced numbers, as within `jax.jit`, and `ValueError` for a model with
+    another sensor, several sensors, recordings or bodies, or a torque.
     """
     require_one(model)
     if not _checks.is_known(model):
@@ -224,7 +224,8 @@ def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Arr
     middle moment.
 
     Here h is the angular momentum and T the kinetic energy. If the second result is below 1, the
-    motion is in the long-axis mode, else in the short-axis mode.
+    momentum circulates in the body about the axis of the smallest moment (long-axis mode), else
+    about that of the largest moment (short-axis mode).
 
     - `x`: (n,) the free numbers of the model, which determine the body and its initial state.
     - `model`: a model of one recording of a free body.
@@ -241,7 +242,8 @@ def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Arr
 @eqx.filter_jit
 def _period_derivatives(x: Float[Array, " n"], model: Model) -> Float[Array, "4 n"]:
     """Return the derivatives (4, n) of the logarithms of the rotation period, the precession period
-    and the two ratios of moments, with respect to the free numbers.
+    and the two ratios of moments (the two smaller moments divided by the largest), with respect to
+    the n free numbers.
 
     - `x`: (n,) the free numbers of the model, at which the derivatives are taken.
     - `model`: a model of one recording of a free body.
@@ -250,12 +252,14 @@ def _period_derivatives(x: Float[Array, " n"], model: Model) -> Float[Array, "4 
 
 
 def _motion_of_free_numbers(model: Model, x: Array, cost: float) -> Alias:
-    """Return the motion with the free numbers `x` as an `Alias`, with its periods, mode and ratios
-    of moments.
+    """Return the motion with the free numbers `x` as an `Alias`, which also holds its periods, its
+    mode (the axis, of the smallest or of the largest moment, about which the momentum circulates in
+    the body) and the two smaller moments divided by the largest.
 
     - `model`: the model of the light curve.
     - `x`: (n,) the free numbers.
-    - `cost`: half of χ² of the motion.
+    - `cost`: half of χ² of the motion, where χ² is the sum over the readings of (error divided by
+      noise)².
     """
     numbers, middle = (np.asarray(v) for v in _periods_and_ratios(x, model))
     rotation, precession, *ratios = np.exp(numbers)
@@ -265,14 +269,14 @@ def _motion_of_free_numbers(model: Model, x: Array, cost: float) -> Alias:
 
 
 def _distinct_motions(model: Model, ends: list[Attempt]) -> list[Alias]:
-    """Return one `Alias` for each different motion among the results of searches, in the order of
-    their misfits.
+    """Return one `Alias` (a motion with its free numbers, misfit and periods) for each different
+    motion among the results of searches, the smallest misfit first.
 
-    Results whose misfit is not finite are left out; it is an error if no result is left.
+    Results whose misfit is not finite are left out; `ValueError` is raised if no result is left.
 
     - `model`: the model of the light curve.
-    - `ends`: the results of the searches, each with its free numbers `x` and its `cost`, half of
-      χ².
+    - `ends`: the results of the searches, each with its free numbers `x` and its `cost`, half of χ²
+      (the sum over the readings of (error divided by noise)²), which is the misfit.
     """
     out: list[Alias] = []
     for end in sorted(ends, key=lambda one: float(one.cost)):
@@ -290,8 +294,9 @@ def _distinct_motions(model: Model, ends: list[Attempt]) -> list[Alias]:
 
 
 def _is_same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
-    """Return whether the motions `a` and `b` have the same mode, and nearly the same periods and
-    ratios of moments.
+    """Return whether the motions `a` and `b` have the same mode (the axis about which the momentum
+    circulates in the body), and nearly the same periods and ratios of moments (the two smaller
+    moments divided by the largest).
 
     `tolerance` (4,) has the largest differences of the logarithms of the rotation period, the
     precession period and the two ratios of moments.
@@ -302,7 +307,7 @@ def _is_same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
 
 @eqx.filter_jit
 def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
-    """Return the unit vectors (T, 3) half way between the directions to sun and observer, at the
+    """Return the unit vectors (T, 3) half way between the directions to sun and observer, at the T
     times of the readings, in the axes of the moving body.
 
     - `x`: (n,) the free numbers of the model, which determine the body and its motion.
@@ -324,10 +329,10 @@ def _allow_for_shape(best: Fit) -> Fit:
     """Return the fit `best` of a light curve with a larger covariance, which allows for a body that
     is not an ellipsoid.
 
-    The errors of the shape are consider parameters: the brightness is multiplied by 1 + n·S n,
-    where n (3,) is the direction half way between sun and observer in the body frame, and the
-    entries of S (3, 3) are independent with the standard deviation `SHAPE`. All quantities of the
-    fit get new intervals.
+    The errors of the shape are not estimated, but their uncertainty is added to the covariance: the
+    brightness is multiplied by 1 + n·S n, where n (3,) is the direction half way between sun and
+    observer in the body frame, and the entries of S (3, 3) are independent with the standard
+    deviation `SHAPE`. All quantities of the fit get new, wider intervals.
     """
     linear: Any = best.linear
     reading, weight = stacking.pick_records(best.model.records.readings[0], 0), linear.weights[0][0]
@@ -357,13 +362,15 @@ def _allow_for_shape(best: Fit) -> Fit:
 def _light_curve_of_fit(
     best: Fit, aliases: list[Alias], pairs: TwoFrequencies, is_incomplete: bool
 ) -> LightCurve:
-    """Return the `LightCurve` that holds the best fit and all motions, after a comparison of their
-    misfits.
+    """Return the `LightCurve` that holds the best fit and all motions, each marked whether it
+    explains the readings nearly as well as the best motion.
 
     - `best`: the fit of the motion with the smallest misfit.
     - `aliases`: all motions that the search found, the best first.
-    - `pairs`: the pairs of frequencies that were tried.
-    - `is_incomplete`: whether some pairs of frequencies that fit were not tried.
+    - `pairs`: the pairs of frequencies that fit the light curve; the search started from the best
+      of them.
+    - `is_incomplete`: whether as many pairs were tried as the user allowed (`count`), so that
+      further pairs may fit.
     """
     slopes, wider = (
         np.asarray(_period_derivatives(best.derivative_point, best.model)),

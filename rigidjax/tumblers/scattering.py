@@ -173,7 +173,7 @@ def _numbers_of_lit_lune(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar
 
 
 def _artanh_excess(w: Array, complement: Array) -> Array:
-    """Return `(artanh(√w)/√w − 1)/w` of an array of numbers `w`, also where w is 0 and the value is
+    """Return `(artanh(√w)/√w − 1)/w` of an array of numbers `w`, also at w = 0, where the value is
     1/3.
 
     `complement` is 1 − w, given separately since a subtraction would lose its digits near w = 1.
@@ -207,7 +207,8 @@ def _lambert_integral(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
     `sun·T observer`, where `T = π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 to ∞ (the
     integrals over n and over τ are two forms of one Gaussian integral). Therefore `B(sun, observer)
     = sun·T observer + B(sun, −observer)`, where B is the integral over the lit and visible part,
-    and only the integral over the smaller of the two lunes is computed.
+    and only the smaller of these two B is computed as an integral over normals, those of a lune of
+    the unit sphere.
     """
     minors = cofactors(shape)
     total, of_sun = shape[0, 0] + shape[1, 1] + shape[2, 2], apply(minors, sun)
@@ -287,7 +288,7 @@ def _root_or_zero(x: Scalar) -> Scalar:
     """Return √x of a number x ≥ 0, with the derivative 0 at x = 0, where that of the root would be
     infinite.
 
-    The argument is zero if an ellipsoid without thickness is seen edge on.
+    The number x is zero if an ellipsoid without thickness is seen edge on.
     """
     is_positive = x > 0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)

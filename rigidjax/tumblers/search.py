@@ -99,8 +99,8 @@ def starts_of(
 def _free_numbers_of_candidate(
     model: Model, candidate: starts.Candidate, turn: np.ndarray
 ) -> Array:
-    """Return the free numbers (n,) of the `model` for a `candidate` motion, from which a search
-    starts.
+    """Return the n free numbers (n,) of the `model` for a `candidate` motion; a search starts from
+    them.
 
     - `candidate`: principal moments, initial attitude and initial rate, all in principal axes.
     - `turn`: (3, 3) the rotation matrix from principal axes to body axes.
@@ -186,17 +186,19 @@ def _search_from_starts(
     settings: Settings,
     count: np.ndarray | np.generic | Array,
 ) -> Attempt:
-    """Return the results of least-squares searches from the first `count` of the starts, with a
-    leading axis, computed one after another.
+    """Return the results of least-squares searches as one `Attempt` with a leading axis of length
+    `FIRST`, one entry for each start; only the first `count` starts are searched from.
 
-    The derivatives are finite differences, because exact derivatives of the closed-form motion take
-    a hundred times as long.
+    The searches run one after another within one compiled program. The derivatives are finite
+    differences, because exact derivatives of the closed-form motion take a hundred times as long.
 
-    - `starts`: (`FIRST`, n) the free numbers of each start; starts after the first `count` only
-      fill the array.
+    - `starts`: (`FIRST`, n) the n free numbers of each start; starts after the first `count` fill
+      the array, and are returned as they are.
     - `model`: the model of the light curve.
-    - `noise`: the noise of the readings, as `noise_of` returns it.
+    - `noise`: the standard deviation of the readings, in the unit of the sensor, as a tuple of one
+      array (1, 1).
     - `settings`: the tolerance and the number of steps of a search.
+    - `count`: the number of starts that are searched from, at most `FIRST`.
     """
 
     def search_from_start(numbered_start: tuple[Array, Array]) -> Attempt:
@@ -225,8 +227,9 @@ def _with_best_level(starts: Float[Array, "starts n"], model: Model) -> Float[Ar
     """Return the `starts` of searches, each with the level of brightness that fits the readings
     best.
 
-    They are unchanged if the level (the flux or magnitude of a sphere of the same volume at zero
-    phase) is not a free number of the `model`. A start is a vector (n,) of free numbers.
+    The starts are unchanged if the level (the flux or magnitude of a sphere of the same volume at
+    zero phase) is not a free number of the `model`, so that it must keep its value. A start is a
+    vector (n,) of free numbers.
     """
     scene = scene_template(model, model.records)
     path = leaf_at(lambda s: s.sensors[0].level, scene, "level", "the sensor")[0]

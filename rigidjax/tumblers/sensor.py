@@ -184,10 +184,11 @@ def _checked_direction(source: NumbersLike | Callable[..., Any], name: str) -> A
     """Return the direction of a sensor after a check: a vector (3,) as its unit vector, or a
     function of time unchanged.
 
-    Raise an error for other objects; `name` is the name of the argument in the message.
+    Raise an error for other objects.
 
     - `source`: a vector (3,) of any length, world frame; or a function that returns one at a time
       t, s.
+    - `name`: the name of the argument in the message.
     """
     if callable(source):
         return _checks.require_function(source, name, "of time to (3,)")

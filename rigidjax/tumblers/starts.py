@@ -99,11 +99,12 @@ def _momentum_frame_to_world(side: np.ndarray, bisector: np.ndarray) -> list[tup
     """Return the quaternions (4,), one for each angle of `ABOUT`, that rotate the frame of the
     angular momentum (its z axis is along the momentum) to the world frame.
 
-    The rotation takes the direction n, half way between sun and observer, from one frame to the
-    other; the angle about n is not determined, and `ABOUT` has the angles that are tried.
+    Each of these rotations takes the direction n, half way between sun and observer, from the first
+    frame to the second. They differ in the angle of a further rotation about n in the world, which
+    `side` does not determine: `ABOUT` has three such angles, rad.
 
     - `side`: (6,) the entries xx, yy, zz, xy, xz, yz of the fitted matrix n nᵀ in the frame of the
-      momentum, where n is its leading eigenvector.
+      momentum, whose eigenvector of the largest eigenvalue is taken as n.
     - `bisector`: (3,) the unit vector n in the world frame.
     """
     xx, yy, zz, xy, xz, yz = side
@@ -127,8 +128,8 @@ def _shortest_rotation(u: Any, v: Any, xp: ModuleType) -> Any:
 
 def _rate_of_energy(moments: Array, d: Array) -> Float[Array, "3"]:
     """Return the body rate (3,), in principal axes, of a motion with the angular momentum h = 1 and
-    `h²/2T = d`, where T is the kinetic energy, at the time at which its component along the middle
-    axis is zero.
+    `h²/2T = d`, where T is the kinetic energy, at the time at which the component of the rate along
+    the axis of the middle moment is zero.
 
     - `moments`: (3,) the principal moments, ascending.
     - `d`: a number between the smallest and the largest moment.
@@ -144,7 +145,8 @@ def _rate_with_period_ratio(
     """Return three things: the body rate (3,) of a free motion whose precession period divided by
     its rotation period is `ratio`; its precession period; and whether there is such a motion.
 
-    The angular momentum is 1; bisection finds the energy.
+    The angular momentum is 1, and the energy is found by bisection. The first two results have no
+    meaning if the third is false.
 
     - `moments`: (3,) the principal moments, ascending.
     - `ratio`: the wanted quotient of the two periods.
@@ -182,18 +184,20 @@ def _motions_on_grid_of_phases(
     squares: Array,
     weights: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Return four arrays for the motions of S bodies at all P = `PHASES` phases of their rotation:
-    the misfits χ² (S, P); the six fitted numbers of n nᵀ times the level (S, P, 6); the initial
-    attitudes (S, P, 4); and the initial rates (S, P, 3), rad/s.
+    """Return four arrays for the motions of S bodies that start at P = `PHASES` phases of half a
+    rotation: the misfits χ² (S, P); the six fitted entries xx, yy, zz, xy, xz, yz of n nᵀ times the
+    level (S, P, 6); the initial attitudes (S, P, 4), principal axes → frame of the angular
+    momentum; and the initial rates (S, P, 3), rad/s, principal axes.
 
-    Here n is the direction half way between sun and observer in the frame of the angular momentum,
-    and the level is the factor between the model and the squared fluxes. All motions have the same
-    `pair` of frequencies. A body that has no such motion has the misfit infinity.
+    Here n is the direction half way between sun and observer in a frame whose z axis is along the
+    angular momentum, and the level is the factor by which the model Σ_k M_k (n·r_k)² is multiplied
+    to give the squared fluxes, where r_k are the principal axes in that frame. All motions have the
+    same `pair` of frequencies. A body that has no such motion has the misfit infinity.
 
     - `long_axis`: true for motions in the long-axis mode, false for the short-axis mode.
     - `moments`: (S, 3) the principal moments of each body, ascending.
-    - `forms`: (S, 3) the numbers M = (bc)², (ca)², (ab)² of each body with the semi-axes a, b, c
-      (see the module).
+    - `forms`: (S, 3) the numbers M = (bc)², (ca)², (ab)² of each body with the semi-axes a, b, c,
+      divided by a common factor.
     - `pair`: (2,) the frequencies of the mean precession and of twice the rotation, 1/s.
     - `t`: (T,) the times of the readings since the first, s.
     - `squares`: (T,) the squared fluxes.

@@ -194,11 +194,11 @@ def strongest_lines(light: tuple[Array, Array, Array], highest: float, count: in
 @jax.jit
 def _best_sinusoid(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Array, Array]:
     """Return two things: the frequency of `grid` whose sinusoid plus a constant fits the readings
-    best; and the fitted sinusoid plus constant (T,) at the times of the readings.
+    of a light curve best; and the fitted sinusoid plus constant (T,) at the times of the readings.
 
-    - `grid`: (F,) the frequencies that are tried, 1/span, where the span is the time from the first
-      to the last reading.
-    - `x`: (T,) the times divided by the span.
+    - `grid`: (F,) the F frequencies that are tried, 1/span, where the span is the time from the
+      first to the last reading.
+    - `x`: (T,) the times of the T readings divided by the span.
     - `z`: (T,) the values divided by their noise.
     - `w`: (T,) one over the noise.
     """
@@ -219,11 +219,12 @@ def _pairs_and_chi2_with_strong_line(
     table: Sums, lines: np.ndarray, order: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return two things: the pairs of frequencies (P, 2), on a grid, for which one of the strongest
-    lines of the spectrum is a combination of the two frequencies; and χ² (P,) of the Fourier series
-    of each pair.
+    lines (peaks of the spectrum of the light curve) is a sum or a difference of small multiples of
+    the two frequencies; and χ² (P,) of the best Fourier series in each of the P pairs.
 
-    - `table`: the sums over the readings, as `sum_table` returns them.
-    - `lines`: the frequencies of the strongest lines, 1/span, the strongest first.
+    - `table`: sums over the readings at evenly spaced frequencies, from which χ² is computed.
+    - `lines`: the frequencies of the strongest lines, the strongest first, in 1/span, where the
+      span is the time from the first to the last reading.
     - `order`: the largest multiple of the second frequency in the series.
     """
     highest = float(lines[:LINES].max())

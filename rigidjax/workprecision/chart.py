@@ -69,8 +69,9 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
 
 
 def _errors_and_times(records: list[Measurement]) -> tuple[list[float], list[float]]:
-    """Return two lists, one entry for each of the `records` of measurements: the errors, at least
-    1e-16; and the times of a run, ms.
+    """Return two lists, one entry for each of the `records` of measurements: the errors, where an
+    error below 1e-16 becomes 1e-16, since it is drawn on a logarithmic axis; and the median times
+    of a run, ms.
     """
     return [max(r.error, 1e-16) for r in records], [1e3 * r.time for r in records]
 
@@ -78,10 +79,11 @@ def _errors_and_times(records: list[Measurement]) -> tuple[list[float], list[flo
 def _curves_of_methods(
     records: list[Measurement], labels: list[tuple[str, str]]
 ) -> Iterator[tuple[list, dict]]:
-    """Yield, for each method, two things: its records in the order of their settings; and the style
-    of its curve, as arguments of matplotlib.
+    """Yield, for each method that was measured, two things: its measurements in the order of their
+    settings; and the style of its curve, as arguments of matplotlib.
 
-    - `records`: measurements on one scene.
+    - `records`: measurements on one scene, each with the error and the time of one method at one
+      setting.
     - `labels`: the label and the group (`ours`, `jax` or `peer`) of each method, in the order of
       the charts.
     """
@@ -110,8 +112,9 @@ def _draw_reached_errors(
     on matplotlib axes.
 
     - `axis`: the axes.
-    - `records`: measurements on one scene.
-    - `labels`: the label and the group of each method.
+    - `records`: measurements on one scene, each with the error and the time of one method at one
+      setting.
+    - `labels`: the label and the group (`ours`, `jax` or `peer`) of each method.
     """
     for of, how in _curves_of_methods(records, labels):
         axis.plot([r.setting for r in of], [max(r.error, 1e-16) for r in of], **how)
@@ -122,12 +125,13 @@ def _draw_reached_errors(
 
 
 def _draw_times(axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]) -> None:
-    """Draw the time of a run against the error for each method, with the Pareto fronts, on
-    matplotlib axes.
+    """Draw the time of a run against the error for each method, on matplotlib axes, with the Pareto
+    fronts (measurements that no other one beats in both error and time).
 
     - `axis`: the axes.
-    - `records`: measurements on one scene, either of values or of gradients.
-    - `labels`: the label and the group of each method.
+    - `records`: measurements on one scene, each with the error and the time of one method at one
+      setting; all are of values, or all of gradients.
+    - `labels`: the label and the group (`ours`, `jax` or `peer`) of each method.
     """
     for of, how in _curves_of_methods(records, labels):
         bars = [

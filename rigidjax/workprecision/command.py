@@ -116,8 +116,8 @@ def run_subcommand(options: argparse.Namespace) -> int:
 
 
 def _measure_scenes(options: argparse.Namespace) -> list[Measurement]:
-    """Measure the methods on the scenes that the options of the command line name, and return the
-    records.
+    """Measure the methods on the scenes (the motions to run) that the options of the command line
+    name, and return the measurements.
     """
     quick = options.quick or options.check is not None or options.keep is not None
     names = options.scene or (QUICK if quick else [n for n, m in scenes().items() if not m().slow])
@@ -175,8 +175,11 @@ def summary(records: Iterable[Measurement]) -> str:
 
 
 def _drift_lines(scene: str, records: list[Measurement]) -> list[str]:
-    """Return the lines of text that show the drifts of energy and momentum of each method in the
-    long run `scene`, from its `records`.
+    """Return the lines of text that show the largest drifts, in a long run, of the energy and of
+    the momentum along gravity for each method.
+
+    - `scene`: the name of the long run, for the heading.
+    - `records`: the measurements of this run, one for each method.
     """
     head = f"\n{scene}: largest drift of energy, of momentum along gravity; s"
     return [head] + [

@@ -18,6 +18,9 @@ from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.workprecision.scene import BenchmarkScene, PreparedMethod, TimedMethod
 
+# TOLERANCES are the settings of adaptive methods. EIGHT and FOUR are numbers of equal steps, for a
+# turn of 50 rad: FOUR for Runge–Kutta of order 4, which needs more steps than the other methods.
+# MOST is the largest number of steps of an adaptive run. MODES has the two ways to take a gradient.
 TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 EIGHT = (40, 60, 80, 120, 170, 240, 340, 480, 680, 1000)
 FOUR = (200, 500, 1200, 3000, 8000, 20000, 60000)
@@ -69,11 +72,12 @@ def flow_of(scene: BenchmarkScene, run: Callable[[Any, Any, Any, Any], tuple[Any
 
 
 def _closed_form_flow(scene: BenchmarkScene) -> Flow | None:
-    """Return the flow of the closed form of the free body, or `None` for a scene with a torque or
-    without a body.
+    """Return the flow of the closed form of the free body, or `None` for a `scene` (a motion to
+    run) with a torque or without a body, for which there is no closed form.
 
-    A flow is a function of the scene's numbers and of a setting, which the closed form does not
-    need; it returns two things: the last state as a vector; and the number of steps, here 0.
+    A flow is a function of the scene's numbers (inertia, initial rate and attitude; or position and
+    velocity of a point) and of a setting, which the closed form does not need; it returns two
+    things: the last state as a vector; and the number of steps, here 0.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -84,12 +88,14 @@ def _closed_form_flow(scene: BenchmarkScene) -> Flow | None:
 
 
 def _simulate_flow(scene: BenchmarkScene, accuracy: bool = False) -> Flow | None:
-    """Return the flow of `simulate` with its defaults, or `None` for a scene without a torque.
+    """Return the flow of `simulate` with its defaults, or `None` for a `scene` (a motion to run)
+    without a torque, to which `simulate` applies the closed form.
 
-    A flow is a function of the scene's numbers and of a setting, here the tolerance; it returns two
-    things: the last state as a vector; and the number of steps. The tolerance is traced, so that
-    one compiled program serves all settings. With `accuracy` the setting is the argument `accuracy`
-    of `simulate` instead.
+    A flow is a function of the scene's numbers (inertia, initial rate and attitude; or position and
+    velocity of a point) and of a setting, here the tolerance; it returns two things: the last state
+    as a vector; and the number of steps. The tolerance is traced, so that one compiled program
+    serves all settings. If `accuracy` is true, the setting is not the tolerance but the argument
+    `accuracy` of `simulate`, the wanted error of the result.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -102,11 +108,12 @@ def _simulate_flow(scene: BenchmarkScene, accuracy: bool = False) -> Flow | None
 
 
 def _adaptive_flow(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
-    """Return the flow of `solver` in the adaptive loop of `simulate`, differentiable in forward and
-    reverse mode.
+    """Return the flow of the Runge–Kutta method `solver` in the loop of `simulate` with adaptive
+    steps, differentiable in forward and reverse mode.
 
-    A flow is a function of the numbers of the `scene` and of a setting, here the relative
-    tolerance; it returns two things: the last state as a vector; and the number of steps.
+    A flow is a function of the numbers of the `scene` (inertia, initial rate and attitude; or
+    position and velocity of a point) and of a setting, here the relative tolerance; it returns two
+    things: the last state as a vector; and the number of steps.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -134,11 +141,13 @@ def fixed_steps_flow(scene: BenchmarkScene, solver: AbstractExplicit | AbstractS
 def _diffrax_flow(
     scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
-    """Return the flow of our vector field and state, solved by `solver` in diffrax's own loop.
+    """Return the flow of our equations of motion and our state, solved by diffrax's `solver` in
+    diffrax's own loop.
 
-    A flow is a function of the numbers of the `scene` and of a setting, here the relative
-    tolerance; it returns two things: the last state as a vector; and the number of steps. `adjoint`
-    is diffrax's way to differentiate; `None` takes its default.
+    A flow is a function of the numbers of the `scene` (inertia, initial rate and attitude; or
+    position and velocity of a point) and of a setting, here the relative tolerance; it returns two
+    things: the last state as a vector; and the number of steps. `adjoint` is an object of diffrax
+    that differentiates the solution; `None` takes diffrax's default.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -152,12 +161,13 @@ def _handwritten_flow(
     scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
     """Return the flow of the equations that a user would write by hand, solved by `solver` in
-    diffrax; a scene without such equations takes our vector field.
+    diffrax; for a scene (a motion to run) without such equations our own equations are solved.
 
-    A flow is a function of the numbers of the `scene` and of a setting, here the relative
-    tolerance; it returns two things: the last state as a vector; and the number of steps. The state
-    is one array, and the constants are computed once, before the run. `adjoint` is diffrax's way to
-    differentiate; `None` takes its default.
+    A flow is a function of the numbers of the `scene` (inertia, initial rate and attitude; or
+    position and velocity of a point) and of a setting, here the relative tolerance; it returns two
+    things: the last state as a vector; and the number of steps. The state is one array, and the
+    constants are computed once, before the run. `adjoint` is an object of diffrax that
+    differentiates the solution; `None` takes diffrax's default.
     """
     plain = scene.plain
     if plain is None:
@@ -191,11 +201,12 @@ def _diffrax_solve(
     state, with a leading axis of length 1; and the number of steps.
 
     - `field`: the vector field, a function (t, y, args).
-    - `args`: its last argument.
+    - `args`: the value of the last argument of `field`.
     - `start`: the state at t = 0.
     - `solver`: a solver of diffrax with an error estimate.
-    - `adjoint`: diffrax's way to differentiate; `None` takes its default.
-    - `setting`: the relative tolerance.
+    - `adjoint`: an object of diffrax that differentiates the solution; `None` takes diffrax's
+      default.
+    - `setting`: the relative tolerance of a step; the absolute tolerance is a thousandth of it.
     - `end`: the last time, s.
     """
     out = dfx.diffeqsolve(
@@ -214,10 +225,12 @@ def _compile_for_scene(
     cannot do the scene.
 
     - `make`: a function of the scene that returns the flow of the method (a function of the scene's
-      numbers and of a setting that returns the last state and the number of steps), or `None`.
-    - `take`: `jax.grad` or `jax.jacfwd` for the gradient of the scene's scalar (`loss`) with
-      respect to the scene's numbers; `None` for the value.
-    - `scene`: the scene.
+      numbers and of a setting that returns the last state and the number of steps), or `None` if
+      the method cannot do the scene.
+    - `take`: `jax.grad` or `jax.jacfwd` for the gradient of `scene.loss`, a scalar function of the
+      last state, with respect to the scene's numbers; `None` for the value, which is the last
+      state.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     """
     flow = make(scene)
     if flow is None:
@@ -278,13 +291,14 @@ def _own_method(
     modes: Iterable[str] = (),
     equal: bool = False,
 ) -> TimedMethod:
-    """Return a method of this library in the form that `measure` takes, for its value and its
-    gradients.
+    """Return a method of this library in the form that `measure` takes, for its value (the last
+    state of a motion) and its gradients.
 
     - `name`: the name of the method.
     - `settings`: the tolerances, or the numbers of equal steps.
-    - `make`: a function of a scene that returns the flow of the method (a function of the scene's
-      numbers and of a setting that returns the last state and the number of steps), or `None`.
+    - `make`: a function of a scene (a motion to run) that returns the flow of the method (a
+      function of the scene's numbers and of a setting that returns the last state and the number of
+      steps), or `None` if the method cannot do the scene.
     - `modes`: the modes of differentiation that are measured, of `"forward"` and `"reverse"`.
     - `equal`: whether the settings are numbers of equal steps.
     """

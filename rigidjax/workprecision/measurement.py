@@ -36,6 +36,7 @@ from rigidjax.workprecision.scene import (
 LONG, SHORT = 0.5, 0.02
 # One timing of a short run repeats the run for about BURST seconds, and takes the mean.
 BURST = 3e-3
+# Runs with an error of WRONG or more, rad or relative, are left out.
 WRONG = 0.5
 # The run of `long_drift`: STEPS is the number of steps, BODY the principal moments, LOOKS the
 # number of states that are saved, and RUNS has, by name, the length of a step, s, and the solver.
@@ -53,10 +54,12 @@ _PARTS = ("body", "state0", "torque")
 
 
 class _TimedRun(NamedTuple):
-    """Hold a run that is timed: one method at one setting on one scene.
+    """Hold a run that is timed: one method at one setting (tolerance or number of steps) on one
+    scene (a motion to run).
 
     **Fields:** `record` the measurement, still without its times; `ready` the compiled method;
-    `times` the measured times, s, the first of them from the run that found the errors.
+    `times` the measured times, s, the first of them from the run that found the errors, which does
+    not enter the median.
     """
 
     record: Measurement
@@ -167,20 +170,20 @@ def _turned_angle(scene: BenchmarkScene) -> float:
     """Return a rough estimate of the angle by which the body turns in the `scene`, rad, at least
     50.
 
-    For a point, which has no attitude, the result is 50: the numbers of equal steps are stated for
-    a turn of 50 rad.
+    For a point, which has no attitude, the result is 50: methods state their numbers of equal steps
+    for a turn of 50 rad, so that these numbers are then used unchanged.
     """
     return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
 
 
 def _settings_for_scene(scene: BenchmarkScene, method: TimedMethod, stride: int) -> list[float]:
-    """Return the settings, tolerances or numbers of steps, at which a method is measured on a
+    """Return the settings, tolerances or numbers of equal steps, at which a method is measured on a
     scene.
 
-    Numbers of equal steps are scaled to the angle by which the body turns; tolerances that the
-    precision cannot reach are left out.
+    Numbers of equal steps, which are stated for a turn of 50 rad, are scaled to the angle by which
+    the body turns; tolerances that the precision cannot reach are left out.
 
-    - `scene`: the scene.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `method`: the method with its settings, from coarse to fine.
     - `stride`: every `stride`-th setting is used, counted from the finest.
     """
@@ -201,11 +204,12 @@ def _inspect_run(
     reference: Reference,
 ) -> list[_TimedRun]:
     """Run a prepared method once for its errors. Return a list with the run, or an empty list if
-    its error is `WRONG` or more.
+    its error is 0.5 (`WRONG`) or more, in rad or relative, or NaN, so that the run is not timed.
 
-    - `scene`: the scene.
-    - `method`: the method.
-    - `adjoint`: the way the gradient is computed, or an empty text for a value.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
+    - `method`: the method, for its name and group.
+    - `adjoint`: the name of the way in which the gradient is computed, or an empty text for a value
+      (the last state).
     - `setting`: the tolerance or the number of steps.
     - `prepared`: the method, compiled for the scene.
     - `reference`: the correct last state and gradient of the scene.
@@ -227,10 +231,11 @@ def _inspect_run(
 def _relative_errors(
     scene: BenchmarkScene, final_state: np.ndarray | Array, reference: Reference
 ) -> dict[str, float]:
-    """Return, by the names of fields of `Measurement`, the errors of the last state of a run and
-    the drifts of its conserved quantities.
+    """Return, by the names of fields of `Measurement`, the errors of the last state of a run, and
+    the drifts of its energy and momentum. The error of an attitude is an angle, rad; all others are
+    relative.
 
-    - `scene`: the scene.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `final_state`: the last state as one vector, (7,) for a body or (6,) for a point.
     - `reference`: the correct last state.
     """
@@ -243,10 +248,12 @@ def _gradient_errors(
     scene: BenchmarkScene, slope: np.ndarray | Array, reference: Reference
 ) -> dict[str, float]:
     """Return, by the names of fields of `Measurement`, the relative errors of a gradient: of the
-    whole, and of its parts with respect to inertia, initial rate and initial attitude.
+    whole, and of its parts with respect to inertia, initial rate and initial attitude (for a point:
+    velocity and position).
 
-    - `scene`: the scene.
-    - `slope`: the gradient of the scene's scalar (`loss`) with respect to the scene's numbers.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
+    - `slope`: the gradient of `scene.loss`, a scalar function of the last state, with respect to
+      the scene's numbers.
     - `reference`: the correct gradient.
     """
     gradient, wanted = np.asarray(slope, float), np.asarray(reference.gradient)
@@ -285,7 +292,8 @@ def drifts(scene: BenchmarkScene, end: np.ndarray | Array) -> tuple[float, float
 def _time_runs(jobs: list[_TimedRun], rounds: int) -> None:
     """Measure the times of the runs `jobs` in turn, and append them, s, to each run.
 
-    A run is timed in `rounds` rounds; a short run in three times as many, and a long run in three.
+    A run is timed in `rounds` rounds; a run shorter than `SHORT`, s, in three times as many rounds,
+    and a run longer than `LONG`, s, in three rounds.
     """
     for turn in range(3 * rounds):
         for job in jobs:

@@ -115,8 +115,9 @@ def choose(records: Iterable[Measurement], wanted: Sequence[float] = WANTED) -> 
 
 
 def _choose_for_scene(records: list[Measurement], scene: str, error: float) -> Choice:
-    """Return our quickest methods for one scene and one wanted error, and any quicker method of
-    others.
+    """Return our quickest methods (for the value, and for the gradient) for one scene and one
+    wanted error, and the quickest method of other packages for the value if it is quicker than
+    ours. The times of our default method (the closed form, else `simulate`) are included.
 
     - `records`: the measurements on this scene.
     - `scene`: the name of the scene.

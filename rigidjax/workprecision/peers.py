@@ -19,6 +19,8 @@ from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.workprecision.jax_methods import methods_in_jax
 from rigidjax.workprecision.scene import BenchmarkScene, PreparedMethod, TimedMethod
 
+# The settings of the packages: TAYLOR has the tolerances of heyoka, STEPS the lengths of MuJoCo's
+# steps, s, and TOLERANCES the tolerances of all others.
 TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
 TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
@@ -28,31 +30,34 @@ def _python_vector_field(scene: BenchmarkScene, numbers: np.ndarray, **options: 
     """Return the vector field of the handwritten equations of a scene, a function (t, y) that works
     on Python's floats.
 
-    - `scene`: the scene, whose `plain` makes the equations.
+    - `scene`: the motion to run; its `plain` makes the equations from its numbers and from
+      functions such as the sine.
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
       position and velocity of a point).
-    - `options`: further arguments of `plain`.
+    - `options`: further arguments of `plain`, such as `wrap`, a function that compiles a function.
     """
     plain: Any = scene.plain
     return plain(tuple(map(float, numbers)), math.sin, math.cos, math.sqrt, **options)
 
 
 def _has_plain_equations(scene: BenchmarkScene) -> bool:
-    """Return whether the `scene` has handwritten equations without JAX, which other packages
-    need.
+    """Return whether the `scene` (a motion to run) has handwritten equations without JAX, which
+    other packages need.
     """
     return scene.plain is not None
 
 
 def _has_weight(scene: BenchmarkScene) -> bool:
-    """Return whether the `scene` is a body for which MuJoCo's data are known: mass, centre of mass
-    and gravity.
+    """Return whether the `scene` (a motion to run) is of a body, and has the data that MuJoCo
+    needs: mass, centre of mass and gravity.
     """
     return scene.notes is not None and "com" in scene.notes and scene.body is not None
 
 
 def _is_plain_and_double(scene: BenchmarkScene) -> bool:
-    """Return whether the `scene` has handwritten equations and is in double precision."""
+    """Return whether the `scene` (a motion to run) has handwritten equations and is in double
+    precision.
+    """
     # Importing gradsolve sets JAX to float64: gradsolve is not used for scenes of another
     # precision.
     return scene.plain is not None and scene.numbers.dtype == jnp.float64
@@ -62,13 +67,15 @@ def _make_peer_value(
     module: str, can: Callable[[BenchmarkScene], bool] = _has_plain_equations
 ) -> Callable[[Any], Any]:
     """Return a decorator that turns a function `make` into the `value` of a `TimedMethod`: a
-    function of a scene that returns the prepared method, or `None` for a scene that it cannot do.
+    function of a scene (a motion to run) that returns the `PreparedMethod`, or `None` for a scene
+    that the package cannot do.
 
-    `make(scene, numbers, start, module)` returns a function of the setting; its time counts as
-    compilation, but the time to import `module` does not.
+    `make(scene, numbers, start, module)` gets the imported module, and returns a function of the
+    setting. The time that `make` takes is recorded as compile time; the time to import the module
+    is not.
 
     - `module`: the name of the package that is imported.
-    - `can`: a function of a scene: whether the package can do the scene.
+    - `can`: a function of a scene that returns whether the package can do the scene.
     """
 
     def decorate(make: Callable[[BenchmarkScene, np.ndarray, np.ndarray, Any], Any]) -> Any:
@@ -94,7 +101,7 @@ def _make_scipy_run(
 
     - `end`: the last time, s; the first is 0.
     - `start`: the initial state as one vector.
-    - `f`: the vector field, a function (t, y).
+    - `f`: the vector field, a function (t, y) that returns dy/dt.
     """
     from scipy.integrate import DOP853
 
@@ -117,10 +124,11 @@ def _prepare_scipy(
     """Return a function of the tolerance that runs the scene by SciPy's DOP853 on Python's floats,
     and returns the last state and the number of steps.
 
-    - `scene`: the scene.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
       position and velocity of a point).
     - `start`: the initial state as one vector.
+    - `_`: the module `scipy.integrate`, which is not used.
     """
     rates = _python_vector_field(scene, numbers)
     return _make_scipy_run(scene.end, start, lambda t, y: np.array(rates(t, y)))
@@ -133,11 +141,11 @@ def _prepare_numba(
     """Return a function of the tolerance that runs the scene by SciPy's DOP853 with a vector field
     compiled by numba, and returns the last state and the number of steps.
 
-    - `scene`: the scene.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
       position and velocity of a point).
     - `start`: the initial state as one vector.
-    - `numba`: the module.
+    - `numba`: the module numba.
     """
     rates = _python_vector_field(scene, numbers, wrap=numba.njit)
 
@@ -156,13 +164,14 @@ def _prepare_mujoco(
     """Return a function of the step, s, that runs a body on a ball joint by MuJoCo's own
     Runge–Kutta 4, and returns the last state and the number of steps.
 
-    Only heavy tops and free bodies have the `notes` that this needs.
+    The scene needs `notes` of mass, centre of mass and gravity, which only heavy tops and free
+    bodies have.
 
-    - `scene`: the scene.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
       position and velocity of a point).
     - `start`: the initial state as one vector.
-    - `mujoco`: the module.
+    - `mujoco`: the module mujoco.
     """
     notes, body = scene.notes, scene.body
     assert notes is not None and body is not None
@@ -196,9 +205,10 @@ def _heyoka_equations(scene: BenchmarkScene, hy: ModuleType, numbers: Sequence[A
     """Return the equations of a scene in heyoka's form: a list of pairs, a variable and its time
     derivative.
 
-    - `scene`: the scene.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `hy`: the module heyoka.
-    - `numbers`: the numbers of the scene, as floats or as parameters of heyoka.
+    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or position and
+      velocity of a point), as floats or as parameters of heyoka.
     """
     names = "abcdxyz" if scene.body is not None else ("px", "py", "pz", "vx", "vy", "vz")
     variables = hy.make_vars(*names)
@@ -243,7 +253,7 @@ def _prepare_taylor(
     """Return a function of the tolerance that runs the scene by heyoka's Taylor method, and returns
     the last state and the number of steps.
 
-    - `scene`: the scene.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
       position and velocity of a point).
     - `start`: the initial state as one vector.
@@ -257,13 +267,15 @@ def _prepare_taylor(
 def _prepare_taylor_gradient(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, hy: ModuleType
 ) -> Any:
-    """Return a function of the tolerance that computes the gradient of the scene's scalar (`loss`)
-    by heyoka's variational equations, and returns the gradient and the number of steps.
+    """Return a function of the tolerance that computes the gradient of `scene.loss`, a scalar
+    function of the last state, by heyoka's variational equations, and returns the gradient and the
+    number of steps.
 
-    The equations are those with respect to the initial state and the inertia; their solution is
-    multiplied by the gradient of the scalar with respect to the last state.
+    The variational equations give the derivatives of the last state with respect to the initial
+    state and the inertia; these derivatives are multiplied by the gradient of the scalar with
+    respect to the last state.
 
-    - `scene`: the scene.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
       position and velocity of a point).
     - `start`: the initial state as one vector.
@@ -292,10 +304,11 @@ def _prepare_taylor_gradient(
 
 
 class _GradsolveEnsemble:
-    """Present a scene to the package gradsolve, which solves ensembles of equations, as an ensemble
-    of one member.
+    """Present a scene (a motion to run) to the package gradsolve, which solves ensembles of
+    equations, as an ensemble of one member.
 
-    The parameters of the member are the numbers of the scene.
+    The parameters of the member are the numbers of the scene (inertia, initial rate and attitude;
+    or position and velocity of a point).
     """
 
     is_stiff, t0 = False, 0.0
@@ -326,7 +339,7 @@ def _prepare_gradsolve(
     """Return a function of the tolerance that runs the scene by gradsolve's method of order 7, and
     returns the last state and the number of steps.
 
-    - `scene`: the scene.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
       position and velocity of a point).
     - `start`: the initial state as one vector.
@@ -351,13 +364,13 @@ def _prepare_gradsolve(
 def _prepare_gradsolve_gradient(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
 ) -> Any:
-    """Return a function of the tolerance that computes the gradient of the scene's scalar (`loss`)
-    by gradsolve, through steps that were recorded before, and returns the gradient and the number
-    of steps.
+    """Return a function of the tolerance that computes the gradient of `scene.loss`, a scalar
+    function of the last state, by gradsolve, through steps that were recorded before, and returns
+    the gradient and the number of steps.
 
     The recording is made once for each tolerance, and is not timed.
 
-    - `scene`: the scene.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
       position and velocity of a point).
     - `start`: the initial state as one vector.

@@ -13,6 +13,9 @@ from rigidjax import _checks
 
 # Errors of the size of round-off vary between machines: an error below FLOOR is compared as FLOOR.
 FLOOR = 1e-13
+# A change is reported if an error changes by more than the factor WORSE, a number of steps by more
+# than the share STEPS, or a time by more than the factor SLOWER. Times are divided by those of the
+# method BASE on the same machine, since they differ between machines.
 WORSE, STEPS, SLOWER = 3.0, 0.02, 2.0
 BASE = "diffrax Dopri8"
 
@@ -158,20 +161,22 @@ def records_to_store(records: Iterable[Measurement]) -> list[Measurement]:
 
 
 def _run_key(record: Measurement) -> tuple[str, ...]:
-    """Return the scene, kind, label and setting of a record, which identify one line in two tables
-    of measurements.
+    """Return the scene, the kind (`value` or `gradient`), the label (method and adjoint) and the
+    setting of a measurement, by which it is found in another table of measurements.
     """
     return (record.scene, record.kind, record.label, f"{record.setting:.6g}")
 
 
 def _scene_and_label(record: Measurement) -> str:
-    """Return the scene, kind, label and setting of a record as text for a message."""
+    """Return the scene, the kind (`value` or `gradient`), the label (method and adjoint) and the
+    setting of a measurement as text for a message.
+    """
     return f"{record.scene}, {record.kind}, {record.label} at {record.setting:g}"
 
 
 def _median_times(records: Iterable[Measurement]) -> dict[tuple[str, str, str], float]:
     """Return the median time of a run, s, of each (scene, kind, label), over the settings in the
-    `records`.
+    `records` (measurements); measurements without a time are left out.
 
     The kind is `value` or `gradient`; the label names the method and the adjoint.
     """
@@ -183,11 +188,13 @@ def _median_times(records: Iterable[Measurement]) -> dict[tuple[str, str, str], 
 
 
 def _time_ratios(table: dict, common: set) -> dict[tuple[str, str, str], float]:
-    """Return, by (scene, kind, label), the median time of a method divided by the median time of
-    the method `BASE` on the same scene.
+    """Return, by (scene, kind, label), the median time of a method divided by the median time in
+    which the method `BASE` (Dopri8 of diffrax) computes the value on the same scene.
 
-    - `table`: records of measurements, by their keys (`_run_key`).
-    - `common`: the keys of the records over which the medians are taken.
+    - `table`: measurements by their keys (`_run_key`: scene, kind, label and setting).
+    - `common`: the keys of the measurements over which the medians are taken.
+
+    Here the kind is `value` or `gradient`, and the label names the method and the adjoint.
     """
     middle = _median_times(record for key, record in table.items() if key in common)
     return {

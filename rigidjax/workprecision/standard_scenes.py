@@ -104,7 +104,7 @@ def _scene_of_body(
     kind: Callable[..., Any] | None,
     constants: Sequence[float],
 ) -> BenchmarkScene:
-    """Return the standard scene of a rigid body.
+    """Return a standard scene, a motion to compare methods on, of a rigid body.
 
     - `name`: the name of the scene, by which its stored answer is found.
     - `title`: the name in words.
@@ -151,13 +151,13 @@ def _scene_of_point(
     kind: Callable[..., Any],
     constants: Sequence[float],
 ) -> BenchmarkScene:
-    """Return the standard scene of a particle.
+    """Return a standard scene, a motion to compare methods on, of a particle.
 
     - `name`: the name of the scene, by which its stored answer is found.
     - `title`: the name in words.
-    - `start`: the initial state.
-    - `end`: the last time.
-    - `law`: the scene of this library with the equations of motion.
+    - `start`: the initial position and velocity.
+    - `end`: the last time, s, or in the unit of time of the equations.
+    - `law`: the object of this library that has the equations of motion.
     - `kind`: a function of `workprecision.equations` that makes the same equations by hand.
     - `constants`: the constants of these equations.
     """
@@ -176,8 +176,8 @@ def _scene_of_point(
 
 
 def _foucault_scene() -> BenchmarkScene:
-    """Return the standard scene of Foucault's pendulum, released at rest and followed for ten
-    minutes.
+    """Return the standard scene (a motion to compare methods on) of Foucault's pendulum, released
+    at rest and followed for ten minutes.
     """
     law = places.foucault(0.85, 67.0)
     _, north, up = (float(w) for w in law.place.angular_velocity())
@@ -188,8 +188,8 @@ def _foucault_scene() -> BenchmarkScene:
 
 
 def _arenstorf_scene() -> BenchmarkScene:
-    """Return the standard scene of Arenstorf's orbit about Earth and Moon, followed for one
-    period.
+    """Return the standard scene (a motion to compare methods on) of Arenstorf's orbit about Earth
+    and Moon, followed for one period.
     """
     mu, x, v, period = ARENSTORF
     return _scene_of_point(
