@@ -193,8 +193,8 @@ def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
 def _copy_to_host(tree: PyTree, name: str) -> PyTree:
     """Return a tree whose arrays are copied to host memory, as NumPy arrays.
 
-    Raise `TypeError` if an array is traced; the message begins with `name`, that of the public
-    function that was called.
+    Raise `TypeError` if an array is traced. The message begins with `name`, the name of the public
+    function that the user called.
     """
     if not _checks.is_known(tree):
         raise TypeError(
@@ -216,9 +216,11 @@ def _exchange_arrays(
     - `send`: a function that sends an array of this process to all processes, and returns the
       joined rows, or the sum, of the arrays of all processes.
     - `tree`: the arrays of this process. If there is one process only, `tree` is returned as it is.
-    - `checkpoint`: a folder to which `tree` is written before, or `None`.
+    - `checkpoint`: a folder to which `tree` is written before it is sent, so that it is not lost if
+      another process has ended; `None` writes nothing. If the folder cannot be written, a warning
+      says so, and `tree` is sent nevertheless.
 
-    Raise `RuntimeError` if another process does not answer.
+    Raise `RuntimeError` if sending fails, as it does if another process does not answer.
     """
     if checkpoint is not None:
         try:

@@ -192,17 +192,22 @@ def _take_steps_of_bodies(
 ) -> PyTree:
     """Take fixed steps of many bodies, and return what `rollout` returns.
 
+    **Returns** the last states if `reduce` is `None` and no states are saved; the saved states,
+    with their times along a second axis, if they are saved; with `reduce` a pair of the last states
+    and the last carried values. The first axis of every array is the bodies.
+
     **Arguments:**
 
     - `steps`: four things: the solver; the number of steps; the number of steps between two saved
       states; and whether these states are saved (otherwise only the last states are returned).
     - `division`: three things: the number of bodies that a device computes at a time; the mesh of
       devices, or `None` for the default device; and the progress meter.
-    - `reduce`: a function `(carried, t, state) → carried` of one body, called at each saved state,
-      or `None`.
-    - `constants`: the leaves of bodies, states and torque that are no arrays.
-    - `numbers`: five things: the arrays that all bodies share; the arrays with a row for each body,
-      with the inputs; the first carried value; the step size, s; and the time of the first step, s.
+    - `reduce`: a function `(carried, t, state) → carried` of one body, called at the time of each
+      saved state, even if only the last states are returned; or `None`.
+    - `constants`: what bodies, initial states and torque hold besides arrays.
+    - `numbers`: five things: the arrays that all bodies share; a pair of the arrays of bodies,
+      states and torque with a row for each body, and of the inputs of the torque; the first carried
+      value; the step size, s; and the time at which the first step begins, s.
     """
     (solver, count, every, keep), (shared, per_body, initial, h, t0) = steps, numbers
 

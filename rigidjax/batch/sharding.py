@@ -57,7 +57,10 @@ class CompiledFunction:
 
     @functools.cached_property
     def _with_options(self) -> Callable[..., Any]:
-        """Return the function under `jit` with `compiler_options`, if the backend has any."""
+        """Return the function under `jit`, with the options of `compiler_options` if there are any.
+
+        On CPU they enable vectors of 512 bits; other backends have none, and get a plain `jit`.
+        """
         # This is made at the first call and not at import: `compiler_options` starts JAX's backend.
         options, jit = compiler_options(), cast(Any, eqx.filter_jit)
         return jit(self.function, compiler_options=options) if options else self._without_options

@@ -167,19 +167,20 @@ def _simulate_bodies(
     constants: PyTree,
     numbers: tuple[PyTree, PyTree, Array],
 ) -> tuple[Any, ...]:
-    """Simulate many bodies, each by `rigidjax.simulate`, and return the fields of a `Batch`.
+    """Simulate many bodies, each by `rigidjax.simulate`, and return the results as four trees.
 
     **Arguments:**
 
     - `options`: keyword arguments of `rigidjax.simulate`, for every body.
     - `division`: three things: the number of bodies that a device computes at a time; the mesh of
       devices, or `None` for the default device; and the progress meter.
-    - `constants`: the leaves of bodies, states and torque that are no arrays.
+    - `constants`: what bodies, initial states and torque hold besides arrays.
     - `numbers`: three things: the arrays that all bodies share; the arrays with a row for each
-      body; and the times (T,), s.
+      body; and the T times (T,), s, at which states are saved.
 
-    **Returns** four things, each with a leading axis of bodies: the states `ys`; the `result` of
-    diffrax; the numbers of steps; and the states `own` of the torques, or `None`.
+    **Returns** four things, each with a leading axis of bodies: the states at the saved times; the
+    `diffrax.RESULTS` that say how each run ended; the numbers of steps; and the states that the
+    torques have of their own (such as a filtered signal), or `None`.
     """
     shared, per_body, ts = numbers
 
@@ -215,9 +216,9 @@ _compiled = CompiledFunction(_simulate_bodies)
 def _results_after_fixed_steps(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
     """Return how the run of each of N bodies under fixed steps ended, a `diffrax.RESULTS` (N,).
 
-    It is `successful`, or `nonfinite` if a state of the body is not finite, or `nonfinite_input` if
-    no real body has its inertia. `batch` holds the bodies and their initial states; `ys` are the
-    saved states, with a leading axis N.
+    The result of a body is `nonfinite_input` if no real body can have its inertia, else `nonfinite`
+    if one of its saved states is not finite, else `successful`. `batch` holds the bodies and their
+    initial states; `ys` are the saved states, with a leading axis N.
     """
 
     def status(row: PyTree, ys: PyTree) -> dfx.RESULTS:

@@ -185,8 +185,10 @@ def inputs_of_bodies(
 def _has_row_for_each_body(torque: Torque | None, axes: TorqueAxes, count: int) -> PyTree:
     """Return which arrays of a torque have a row for each of `count` bodies, as a tree of booleans.
 
-    The tree has the structure of `torque`, or of its upper part. `axes` is the argument
-    `torque_axes` of `rollout`. Raise `ValueError` if a selected array has another number of rows.
+    The tree has the structure of `torque`, except that one boolean may stand for all arrays of a
+    part of the torque. `axes` says which arrays have such rows: it is a function that picks these
+    arrays from a torque, or a tree with 0 for them and `None` for arrays that all bodies share.
+    Raise `ValueError` if an array that is said to have such rows has not `count` of them.
     """
     if callable(axes) and not isinstance(axes, eqx.Module):
         prefix = _is_selected(torque, axes)
@@ -212,8 +214,9 @@ def _has_row_for_each_body(torque: Torque | None, axes: TorqueAxes, count: int) 
 def _is_selected(torque: Torque | None, pick: Callable[[Any], Any]) -> PyTree:
     """Return which arrays of a torque a function selects, as a tree of booleans like the torque.
 
-    `pick(torque)` returns one array, a tuple of arrays, or a part of the torque, which means all
-    arrays of this part.
+    `pick` is that function: `pick(torque)` returns one array, a tuple of arrays, or a member of the
+    torque that holds arrays, all of which are then selected. Raise `ValueError` if it selects no
+    array.
     """
     leaves, structure = jax.tree.flatten(torque)
     numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
@@ -232,9 +235,10 @@ def _is_selected(torque: Torque | None, pick: Callable[[Any], Any]) -> PyTree:
 def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
     """Return the bodies, and the check that a real body can have the inertia of each of them.
 
-    **Returns** two things: the bodies; and a list with one check, a pair of the index of the first
-    wrong body (−1 for none) and of the function that raises the error for this body. For traced
-    bodies the list is empty, and a body with an impossible inertia becomes NaN.
+    **Returns** two things: the bodies; and a list with one check. The check is a pair: the index of
+    the first body whose inertia is impossible (−1 if there is none), and a function that raises the
+    error for the body whose index it is given. If the bodies are traced, nothing can be raised: the
+    list is empty, and a body with an impossible inertia is replaced by NaN.
     """
     tensor = tensor_of(bodies)
     if not _checks.is_known(tensor):
@@ -255,8 +259,9 @@ def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
 def _check_unit_quaternions(q: Array) -> list[Check]:
     """Return the check that each of N quaternions `q` (N, 4) is a unit quaternion.
 
-    It is a list with one pair: the index of the first wrong body (−1 for none), and the function
-    that raises the error for this body. If `q` is traced, the list is empty.
+    The check is a list with one pair: the index of the first body whose quaternion has another
+    length than 1 (−1 if there is none), and a function that raises the error for the body whose
+    index it is given. If `q` is traced, nothing can be raised, and the list is empty.
     """
     if not _checks.is_known(q):
         return []
@@ -272,9 +277,10 @@ def _check_unit_quaternions(q: Array) -> list[Check]:
 
 
 def _is_not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
-    """Return for each quaternion of `q` (…, 4) whether its length differs from 1, (…).
+    """Return for each quaternion of `q` (…, 4) whether its length differs from 1, as (…) booleans.
 
-    `xp` is the module that computes: NumPy or `jax.numpy`.
+    A difference of at most 1e-6 in float64, or 1e-3 in float32, is not counted. `xp` is the module
+    that computes: NumPy or `jax.numpy`.
     """
     return xp.abs(xp.sqrt(xp.sum(xp.square(q), axis=-1)) - 1) > tolerance(q.dtype)
 

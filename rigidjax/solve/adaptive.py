@@ -62,12 +62,18 @@ class _VectorFieldOnTree(eqx.Module):
     tree: Any = eqx.field(static=True)
 
     def __call__(self, t: Any, y: Any, args: object = None) -> Any:
-        """Return dy/dt at the time t, s, and the state y, with the structure of y."""
+        """Return dy/dt at the time `t`, s, and the state `y`, with the structure of `y`.
+
+        `args`, which diffrax gives to every field, is not used.
+        """
         return self.tree(self.field(self.constants, t, ravel_pytree(y)[0]))
 
 
 def _state_as_vector(t: Any, y: Any, args: object) -> Array:
-    """Return the numbers of the state `y` as one vector (n,), for diffrax to save."""
+    """Return the n numbers of the state `y` as one vector (n,), for diffrax to save.
+
+    Diffrax also gives the time `t`, s, and the argument `args` of the field; neither is used.
+    """
     return ravel_pytree(y)[0]
 
 

@@ -135,7 +135,11 @@ def unpack(arrays: Arrays, like: LoopState) -> LoopState:
 
 
 def _stored_dtype(a: Array) -> Any:
-    """Return the dtype in which `pack` stores an array: int32 for booleans, else its own dtype."""
+    """Return the dtype in which an array is stored beside others: int32 for booleans, else its own.
+
+    Booleans are stored as integers so that they need no array of their own: the arrays of the loop
+    over steps are joined, with one array for each dtype.
+    """
     return jnp.dtype(jnp.int32) if a.dtype == bool else a.dtype
 
 
@@ -372,8 +376,9 @@ def states_of_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Arr
 def _states_before_the_run(run: Run) -> Array:
     """Return the array (K, n, *bodies) into which the states at the K saved times will be written.
 
-    Its values are NaN. They are the state at the start for a body whose run ends where it starts.
-    `*bodies` is one last axis for the bodies of a batch, or no axis for one body.
+    Here n is the number of numbers of a state, and `*bodies` is one last axis for the bodies of a
+    batch, or no axis for one body. All values are NaN, except for a body whose run ends where it
+    starts: this run has no step, so that its values are the state at the start.
 
     - `run`: holds the start, the end, and the saved times `run.between`.
     """
@@ -433,11 +438,14 @@ def _attempt_step(
     - `until`: if recorded steps are repeated for derivatives, the time at which the repeated part
       of the run ends, s; else `None`. Only repeated steps have derivatives with respect to the
       times of the run.
-    - `dense`: whether the stages of dense output are evaluated, too.
+    - `dense`: whether the stages of dense output, which gives states within a step, are evaluated,
+      too.
 
-    **Returns** three things: the loop state after the attempt; the row (4 + n, *bodies) that
-    records the attempt; and a pair of the step and the slopes (n, s, *bodies) of its s stages.
-    `*bodies` is one last axis for the bodies of a batch, or no axis for one body.
+    **Returns** three things: the loop state after the attempt; an array (4 + n, *bodies) that
+    records the attempt (the start time, the length and the kind of the step, the index of the next
+    stop, and the n numbers of the state before it); and a pair of the step and the slopes dy/dt
+    (n, s, *bodies) at its s stages. `*bodies` is one last axis for the bodies of a batch, or no
+    axis for one body.
     """
     # The loop that calls this function goes on while any body has a step to take; other bodies may
     # have none.

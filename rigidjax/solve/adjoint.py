@@ -223,8 +223,8 @@ def cotangents(
 def _zero_unless(condition: Array, a: Array) -> Array:
     """Return `a` (…, *bodies) for the bodies for which `condition` is true, and 0 for the others.
 
-    `*bodies` is one last axis for the bodies of a batch, or no axis for one body. `condition` has
-    one truth value for each body.
+    `*bodies` is one last axis for the bodies of a batch, or no axis for one body. `condition`
+    (*bodies) has one truth value for each body.
     """
     return jnp.where(lift(condition, a), a, jnp.zeros_like(a))
 
@@ -232,15 +232,18 @@ def _zero_unless(condition: Array, a: Array) -> Array:
 def _segment_of_record(
     method: Method, constants: Arrays, run: Run, record: Record, number: Array
 ) -> Segment:
-    """Return one segment (a part of a run) of a record, with its rows of recorded steps.
+    """Return one segment of a recorded run, with one row of numbers for each of its steps.
 
-    The rows of the last segment are read from the record. Any other segment is run once more. If it
-    takes more steps than there are rows, its states are set to NaN.
+    A segment is a part of the run of a fixed largest number of steps. The record holds the rows of
+    the last segment alone, and they are read from it. Any other segment is run once more to get its
+    rows. If it then takes more steps than there are rows, the states in its rows are set to NaN, so
+    that no wrong derivative is computed.
 
     - `method`: the explicit method and the field.
     - `constants`: the arrays on which the field depends.
     - `run`: the start of the run, and the times at which steps end.
-    - `record`: the loop state at the start of each segment, and the rows of the last segment.
+    - `record`: the state of the loop over steps at the start of each segment, and the rows of the
+      last segment.
     - `number`: the index of the segment.
     """
     like = initial_loop_state(run)

@@ -151,7 +151,8 @@ def _program_and_tangent(
 ) -> tuple[Arrays, Arrays]:
     """Return the result of a program and its tangent, computed together in one call of `in_lanes`.
 
-    This is the rule for the derivatives of `in_lanes`.
+    `in_lanes` runs a program with the bodies of any `jax.vmap` in the last axis of all arrays; this
+    is the rule for its derivatives in forward mode.
 
     - `program`: a function `program(layout, constants, each)` that returns a list of arrays.
     - `layout`: says which arrays have a last axis of bodies.
@@ -186,9 +187,10 @@ def _program_and_tangent(
 
 
 def _in_blocks(program: Program, layout: Layout, number: int, *args: Any) -> Arrays:
-    """Return the result of a program, computed on CPU for at most `BLOCK` bodies at a time.
+    """Return the result of a program, computed on CPU for at most `BLOCK` (16) bodies at a time.
 
-    The arrays of a small block of bodies stay in the first-level cache.
+    The arrays of so few bodies stay in the first-level cache of the processor. On other backends
+    all bodies are computed at once.
 
     - `program`: a function `program(layout, constants, each)` that returns a list of arrays.
     - `layout`: says which arrays have a last axis of bodies.

@@ -127,7 +127,8 @@ class _IntervalEnd(NamedTuple):
 class _SearchState(NamedTuple):
     """Hold the state of the search for zeros of g for one body, or for many in the last axis.
 
-    A pass of the search is one attempted step, or a part of a step that ends at a guess for a zero.
+    The condition g is a function of the time and the state of a body. A pass of the search is one
+    attempted step, or a part of a step that ends at a guess for a zero.
     """
 
     t: Array  # the time that is reached
@@ -197,12 +198,13 @@ def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
 
 
 def _is_running(search: Search, run: Path, body: _SearchState) -> Array:
-    """Return for each body whether its search for a zero goes on.
+    """Return for each body whether its search for a zero of a condition g goes on.
 
-    A search stops if a zero was found, at the end of the run, after the largest number of passes,
-    and if no step is left that is long enough or the run met NaN.
+    The search of a body ends in any of four cases: a zero was found; the end of the run is reached;
+    the largest number of passes is used up; or the length of the next step is not above 0, because
+    the step would be shorter than the time can resolve (0) or the run met NaN (NaN).
 
-    - `search`: holds the largest number of passes.
+    - `search`: holds the largest number of passes; a pass is one attempted step, or a part of one.
     - `run`: holds the stops, the times at which steps end; the last stop is the end of the run.
     - `body`: the state of the search.
     """
@@ -215,12 +217,14 @@ def _next_search_state(
 ) -> _SearchState:
     """Return the state of the search after one more attempted step, or part of a step.
 
-    - `motion`: takes a step, and evaluates the condition g and its round-off.
-    - `search`: the direction of the zeros that are wanted, and the largest number of passes.
+    The search is for zeros of a condition g along a motion. A body whose search has ended keeps its
+    state of the search.
+
+    - `motion`: takes a step, and evaluates g and the size that g may have from round-off alone.
+    - `search`: the direction of the zeros that are wanted, and the largest number of passes (of
+      attempted steps and parts of steps).
     - `run`: holds the stops, which are the times at which steps end.
     - `body`: the state of the search before this pass; its arrays may have a last axis of bodies.
-
-    A body whose search has ended keeps its state.
     """
     on = _is_running(search, run, body)
     t, h, y, side = body.t, body.h, body.y, body.side
@@ -301,7 +305,7 @@ def _newton_step(
 
     - `body`: the state of the search; only the time and length of the step and the number of
       guesses so far are used.
-    - `low`, `high`: the ends of the interval, at which g is on opposite sides of zero.
+    - `low`, `high`: the ends of the interval, at which the condition g has opposite signs.
     - `here`: the guess, with g and dg/dt there.
 
     **Returns** four things: whether this step reaches the zero; whether the search has to end at
@@ -327,7 +331,8 @@ def _choose_end(condition: Array, if_true: _IntervalEnd, if_false: _IntervalEnd)
     """Return `if_true` for the bodies for which `condition` is true, and `if_false` for the others.
 
     - `condition`: one truth value for each body.
-    - `if_true`, `if_false`: two ends of the interval in which a zero is searched for.
+    - `if_true`, `if_false`: two times with the values there of g, the function whose zero is
+      searched for, and of dg/dt.
     """
     pairs = zip(if_true, if_false, strict=True)
     return _IntervalEnd(*(jnp.where(condition, x, y) for x, y in pairs))
@@ -336,11 +341,14 @@ def _choose_end(condition: Array, if_true: _IntervalEnd, if_false: _IntervalEnd)
 def _may_hide_zeros(
     side: Array, low: _IntervalEnd, high: _IntervalEnd, blur: Array
 ) -> tuple[Array, Array]:
-    """Return whether g may have zeros in an interval that its signs at the ends do not show.
+    """Return whether g may have two zeros in an interval that its signs at the ends do not show.
 
-    The cubic polynomial with the values and slopes of g at both ends is examined. There may be such
-    zeros if the extremum of this polynomial is beyond zero by more than `blur`, or if the tangents
-    at both ends do not exclude a zero.
+    Two zeros more leave the signs at the ends as they are. The cubic polynomial is examined that
+    has the values and slopes of g at both ends. There may be such zeros if this polynomial has an
+    extremum within the interval at which its sign is not that of g at `low`, and at which it is
+    farther from zero than `blur`; or if the tangents at both ends meet on that side of zero. If the
+    signs at the ends differ, only the extremum counts, and only if the polynomial then comes back
+    to the sign of g at `low`.
 
     - `side`: the sign of g at `low`, 1 or −1.
     - `low`, `high`: the ends of the interval: their times after the start of the step, s, with g
@@ -377,7 +385,9 @@ def _may_hide_zeros(
 
 
 def _guess_zero(side: Array, low: _IntervalEnd, high: _IntervalEnd) -> Array:
-    """Return a first guess for the time, s, of a zero of g, counted from the start of the step.
+    """Return a first guess for the time of a zero of a condition g, counted from the step's start.
+
+    The guess is in seconds. The condition g is a function of the time and the state of a body.
 
     - `side`: the sign of g at `low`, 1 or −1; at `high` the sign is the opposite one.
     - `low`, `high`: the ends of the interval: their times x after the start of the step, s, with g

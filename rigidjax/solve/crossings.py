@@ -323,8 +323,8 @@ def solve_until(
 def _set_unknown_derivatives_to_nan(crossing: Any, jumps: Array, inputs: Any) -> Any:
     """Return the arrays of `crossing` with their values, and with NaN for unknown derivatives.
 
-    - `crossing`: a tree of arrays: the times and states of crossings, which are the zeros of the
-      condition g.
+    - `crossing`: a tree of arrays: the times and states of crossings, which are the zeros of a
+      condition g along a motion.
     - `jumps`: whether g jumps over zero at each crossing. Its axes are the first axes of each array
       in `crossing`.
     - `inputs`: a tree of all numbers with respect to which derivatives are taken.
@@ -350,8 +350,9 @@ def _crossings_of_run(
 ) -> Crossings:  # fmt: skip
     """Return the crossings of a run, with their derivatives.
 
-    - `setup`: how the run is computed: in closed form or by diffrax.
-    - `event`: an `Event`, which holds the condition that is zero at a crossing, and the direction.
+    - `setup`: the body, the torque, and how the motion is computed: in closed form or by diffrax.
+    - `event`: an `Event`, which holds the condition that is zero at a crossing, and the direction
+      in which the condition has to pass zero.
     - `max_crossings`: K, the largest number of crossings; the run ends at crossing number K.
     - `max_steps`: the largest number of steps, parts of steps included.
     - `state0`: the state at `ts[0]`.
@@ -377,22 +378,27 @@ def _with_derivatives_of_scene(
 ) -> tuple[Array, Array]:
     """Return `times` and `states` as they are; their derivatives come from a second run.
 
-    The second run is that of `_crossings_of_scene`. It is computed only if derivatives are taken.
+    In the second run the motion is computed up to the fixed times, and each crossing is found by
+    one step from nearby. It is computed only if derivatives are taken.
 
-    - `times`, `states`: the K crossings found, shapes (K,) and (K, n). The times are s = σt, where
-      σ is 1 for a run forwards in time t and −1 for a run backwards.
-    - `jumps`: (K,), whether the condition jumps over zero at each crossing.
-    - `scene`: the arguments `setup`, `event`, `state0` and `ts` of `_crossings_of_scene`.
+    - `times`, `states`: the K crossings found, shapes (K,) and (K, n) for states of n numbers. The
+      times are s = σt, where σ is 1 for a run forwards in time t and −1 for a run backwards.
+    - `jumps`: (K,), whether the condition, which is zero at a crossing, jumps over zero there.
+    - `scene`: four things: the set-up of the run, which holds the body and the torque; the `Event`,
+      which holds the condition; the state at the start; and the times at which the run begins and
+      ends, s.
     """
     return times, states
 
 
 @_with_derivatives_of_scene.def_jvp
 def _jvp_of_crossings(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-    """Return the crossings found before, and their tangents from a second run of the scene.
+    """Return the crossings found before, and their tangents from a second run.
 
-    - `primals`: the arguments of `_with_derivatives_of_scene`: times, states, jumps and the scene.
-    - `tangents`: the tangents of these arguments; only those of the scene are used.
+    - `primals`: the times and states of the crossings; whether the condition jumps over zero at
+      each of them; then the four inputs of the second run: its set-up, its `Event`, the state at
+      the start, and the times at which it begins and ends.
+    - `tangents`: the tangents of all these; only the tangents of the four inputs are used.
     """
     found, jumps, scene = primals[:2], primals[2], primals[3:]
     moved, along = eqx.filter_jvp(
@@ -408,18 +414,18 @@ def _crossings_of_scene(
     """Return the times and states of known crossings, computed once more to be differentiated.
 
     The motion is computed up to the fixed `times`, and each crossing near such a time is found by
-    one step of Chebyshev's method.
+    one step of Chebyshev's method (Newton's method with the second derivative).
 
     - `times`: (K,) the times of the crossings, s = σt, where σ is 1 for a run forwards in time t
       and −1 for a run backwards; NaN after the last crossing.
     - `jumps`: (K,), whether the condition jumps over zero at each crossing.
-    - `setup`: how the run is computed: in closed form or by diffrax.
+    - `setup`: the body, the torque, and how the motion is computed: in closed form or by diffrax.
     - `event`: an `Event`, which holds the condition that is zero at a crossing.
-    - `state0`: the state at `ts[0]`.
+    - `state0`: the state at `ts[0]`, of n numbers.
     - `ts`: (T,) s, of which the first and the last are the times at which the run begins and ends.
 
-    **Returns** the times (K,), again s = σt, and the states (K, n). They have derivatives with
-    respect to all numbers of `setup`, `event`, `state0` and `ts`.
+    **Returns** the times (K,), again s = σt, and the states (K, n). Times and states have
+    derivatives with respect to all numbers of `setup`, `event`, `state0` and `ts`.
     """
     crossed, (constants, *_) = section(setup, event, state0, ts)
     there = jnp.isfinite(times)
@@ -546,11 +552,12 @@ def section(
 
 
 def _sampling_interval(body: Any, state0: Any, length: Array) -> Array:
-    """Return the interval between samples of a free body's condition, in which zeros are sought, s.
+    """Return the interval between two samples, s, of a condition along the motion of a free body.
 
-    The interval is the period of one turn at the largest rate that energy and momentum allow,
-    divided by 16. If the run is so short that the body turns by less than a radian at this rate,
-    the interval is the length of the run divided by 16.
+    Zeros of the condition are searched for within such intervals. The interval is the period of one
+    turn at the largest rate that energy and momentum allow, divided by 16. If the run is so short
+    that the body turns by less than a radian at this rate, the interval is the length of the run
+    divided by 16.
 
     - `body`: an `Inertia`, or a body with an `inertia`.
     - `state0`: the state at the start, with the body rate `omega`, rad/s.
@@ -584,16 +591,20 @@ def _locate_in_lanes(
 ) -> Arrays:
     """Return the fields of `Located` in a list: the crossings of one body, or of many at once.
 
-    `in_lanes` calls this function, and puts the bodies of a batch into the last axis of every
-    array.
+    They are the times of the crossings, their states, and whether the condition jumps over zero at
+    each; the number of crossings; and at the end of the search the time, the length of the next
+    step, and the number of steps. `in_lanes` calls this function, and puts the bodies of a batch
+    into the last axis of every array.
 
-    - `section`: the condition and the motion as functions of s = σt (see `Section`).
+    - `section`: the condition, which is zero at a crossing, and the motion, as functions of the
+      time s = σt: σ is 1 for a run forwards in time t, and −1 for a run backwards.
     - `search`: the direction of the crossings, their largest number, and the largest number of
       steps.
     - `layout`: which arrays have a last axis of bodies.
     - `constants`: the arrays on which the functions of the section depend.
-    - `each`: the fields of a `Path`, which is the run that is searched, followed by its longest
-      step.
+    - `each`: a list of arrays with values of each body: those of the run that is searched (its
+      start, the times at which steps end, the tolerances and the first step), then the length of
+      its longest step, s.
     """
     run, longest = Path(*each[:-1]), each[-1]
     solver, motion = section.solver, layout.over(section.motion)
@@ -653,9 +664,11 @@ def _condition_and_round_off(
 ) -> tuple[Array, ...]:
     """Return the condition g at a state, its rate, the slope of the state, and the round-off of g.
 
-    - `section`: holds g, which is zero at a crossing, and the motion (see `Section`).
+    - `section`: holds g, a condition that is zero at a crossing, and the motion, as functions of
+      the time s (not t) and of the n numbers of a state.
     - `constants`: the arrays on which the functions of the section depend.
-    - `s`, `y`: the time s = σt and the numbers (n,) of the state.
+    - `s`, `y`: the time s = σt, where σ is 1 for a run forwards in time t and −1 for a run
+      backwards, and the numbers (n,) of the state.
 
     **Returns** four things: g; dg/ds along the motion; dy/ds (n,); and the size that g may have
     from round-off alone.
@@ -672,9 +685,11 @@ def _rate_relative_to_round_off(section: Section, constants: Arrays, s: Array, y
 
     At a true crossing this ratio is large. If g is zero only by round-off, the ratio is about 1.
 
-    - `section`: holds g and the motion (see `Section`).
+    - `section`: holds g and the motion, as functions of the time s (not t) and of the n numbers of
+      a state.
     - `constants`: the arrays on which the functions of the section depend.
-    - `s`, `y`: the time s = σt and the numbers (n,) of the state at the zero.
+    - `s`, `y`: the time s = σt of the zero, where σ is 1 for a run forwards in time t and −1 for a
+      run backwards, and the numbers (n,) of the state there.
     """
     rates, sizes = partial(section.rates, constants, s), section.sizes
     _, rate, slope = rates(y)

@@ -196,7 +196,8 @@ def warn_of_slopes(slopes: Slopes) -> None:
 def _change_along(derivative: Any, way: Any) -> Array:
     """Return the change of a function's value for the change `way` of its argument x: df/dx · way.
 
-    - `derivative`: df/dx, a tree of arrays whose axes are those of the value and then those of x.
+    - `derivative`: df/dx of the function f, a tree with one array for each array of x. The axes of
+      an array are those of the value f(x), then those of this array of x.
     - `way`: a tree of the structure of x.
 
     **Returns** an array of the shape of the value.

@@ -106,7 +106,8 @@ def _weighted_sum(h: Array, row: Row, slopes: list[Any]) -> Any:
     """Return `h` times the sum of the slopes of some stages, each multiplied by its weight.
 
     - `h`: the length of the step, s.
-    - `row`: a dict of the weights, whose keys are the indices of the stages.
+    - `row`: a dict of the weights of one row of a Butcher tableau. Its keys are the indices of the
+      stages whose weights are not zero.
     - `slopes`: dy/dt at each stage so far, trees of arrays.
 
     **Returns** a tree of the structure of one slope.
@@ -124,9 +125,9 @@ def _change_by_looped_stages(
 ) -> Any:
     """Return the change of a state in one step of an explicit method whose stages are a loop.
 
-    The loop carries the slopes of the last few stages, as many as the rows of the tableau need.
+    The loop carries the slopes dy/dt of the last few stages, as many as any later stage reads.
 
-    - `tableau`: the weights of the method.
+    - `tableau`: the Butcher tableau, which holds the times and the weights of the stages.
     - `field`: a function `field(t, y)` that returns dy/dt.
     - `t`, `end`: the times at the start and at the end of the step, s.
     - `h`: the length of the step, s.

@@ -222,7 +222,7 @@ def estimate_error_of_run(
 
 
 def _without_derivatives(tree: Any) -> Any:
-    """Return a tree with the same numbers, whose arrays are held constant in derivatives."""
+    """Return a tree with the same numbers as `tree`, whose arrays are constants for derivatives."""
     return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_array(a) else a, tree)
 
 
@@ -248,7 +248,9 @@ def _error_with_round_off(
     - `steps`: the known error of the steps, one array (T,) for each array of a state, by its name
       (`q`, `omega`, …).
     - `rtol`: the relative tolerance of the run.
-    - `search`: `None`, or two runs of a search for a tolerance, at larger tolerances.
+    - `search`: `None`, or two runs of the search that found the tolerance of the run: the first one
+      and the one before the last. They have larger tolerances, and one of them stands for the run
+      when its round-off is measured, so that no new run is needed for that.
     """
     sizes, start = _scales_by_name(ys), jax.tree.map(lambda leaf: leaf[0], ys)
     reached = jnp.isfinite(_largest_relative_distance(_distances_of_states(ys, ys), sizes))
@@ -311,8 +313,8 @@ def _run_at_larger_tolerance(
     The returned factor, the fourth root of k, is between the two. Round-off from both sources grows
     along the motion in the same way at any tolerance at which the states stay near `ys`.
 
-    A run in float32 takes few steps anyway: its set-up and states are returned unchanged, with the
-    factor 1, and so are those of a run in closed form or without `ReplayAdjoint`.
+    No new run is made for a run in float32, which takes few steps anyway, or for a run in closed
+    form or without `ReplayAdjoint`: the given set-up and states are returned, with the factor 1.
 
     **Arguments:**
 
@@ -320,8 +322,8 @@ def _run_at_larger_tolerance(
     - `start`: the state at the start of the run.
     - `ts`, `ys`: the saved times (T,), s, and the states of the given run at these times.
     - `count`: the number of steps of the given run.
-    - `search`: two finished runs at larger tolerances, one of which is returned; with `None` a new
-      run is made.
+    - `search`: two finished runs at larger tolerances: the first is returned if its states are near
+      `ys`, else the second. With `None` a new run is made.
     """
     replayed = isinstance(setup, DiffraxRun) and setup.is_replayed
     if not replayed or ts.dtype == jnp.float32:
@@ -366,9 +368,9 @@ def _run_at_tolerance(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) ->
 def _run_without_steps(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) -> TriedRun:
     """Return a `TriedRun` that stands for no run: no step was taken, and its states are NaN.
 
-    Its arrays have the shapes and dtypes of a run of the set-up `setup` from the state `state0`,
-    saved at the times `ts` (T,), s. A loop over runs can therefore begin with it. `rtol` is stored
-    as its tolerance.
+    Its arrays have the shapes and dtypes of a run of `setup` (the body, the torque and the solver)
+    from the state `state0`, saved at the times `ts` (T,), s. A loop that tries runs at smaller and
+    smaller tolerances can therefore begin with it. `rtol` is stored as its relative tolerance.
     """
     run = eqx.filter_eval_shape(_run_at_tolerance, setup, state0, ts, rtol)
 
@@ -382,9 +384,10 @@ def _run_without_steps(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) -
 def _distances_of_states(others: Any, ys: Any) -> dict[str, Array]:
     """Return how far the states of two runs are apart, at each of the T saved times.
 
-    `others` and `ys` are the states of the two runs, with a leading time axis. **Returns** a dict
-    with one array (T,) for each array of a state, by its name (`q`, `omega`, …): for a quaternion
-    the angle of the turn from one state to the other, rad, else the length of the difference.
+    `others` and `ys` are the states of the two runs at equal times, with a leading time axis.
+    **Returns** a dict with one array (T,) for each array of a state, by its name (`q`, `omega`, …):
+    for a quaternion the angle of the turn from one state to the other, rad, else the length of the
+    difference.
     """
     return _lengths_by_name(jax.tree.map(lambda leaf: leaf[0], ys), jax.vmap(minus)(others, ys))
 
@@ -392,9 +395,10 @@ def _distances_of_states(others: Any, ys: Any) -> dict[str, Array]:
 def _lengths_by_name(state: Any, changes: Array) -> dict[str, Array]:
     """Return the length of the change of each array of a state, by the name of the array.
 
-    `changes` (…, n) are the n numbers of changes of the `state` on its tangent space, in which a
-    quaternion changes by a rotation vector, rad. **Returns** a dict with an array (…,) for each
-    name, such as `q` or `omega`.
+    `state` gives the names and the kinds of the arrays. `changes` (…, n) are the n numbers of each
+    change: all arrays of the state joined, where three numbers, a rotation vector, rad, stand for
+    the change of a quaternion. **Returns** a dict with an array (…,) for each name, such as `q` or
+    `omega`.
     """
     named = parts_by_name(state, changes).items()
     return {name.removeprefix("motion."): jnp.linalg.norm(part, axis=-1) for name, part in named}
@@ -508,8 +512,9 @@ def solve_to(
 def _with_derivatives_of_solve(setup: DiffraxRun, state0: Any, ts: Array, ys: Any) -> Any:
     """Return the known states `ys` of a run, with the derivatives that `solve` would give them.
 
-    `setup`, `state0` and `ts` are the arguments with which `solve` computed `ys`. Only a derivative
-    runs `solve` once more.
+    `setup` (the body, the torque and the solver), `state0` (the state at the start) and `ts` (the
+    saved times, s) are the arguments with which `solve` computed `ys`. The motion is solved once
+    more only if a derivative is taken.
     """
     return ys
 
@@ -524,8 +529,9 @@ def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
 def _with_tolerance(setup: DiffraxRun, rtol: Any) -> DiffraxRun:
     """Return the set-up of a run with another relative tolerance `rtol`.
 
-    The absolute tolerance becomes 1e-3 times `rtol`, and a run of the new set-up raises no error
-    if it fails.
+    `setup` holds the body, the torque, the solver and the tolerances. The absolute tolerance
+    becomes 1e-3 times `rtol`. A run of the new set-up raises no error if it fails: its
+    states are NaN from there on.
     """
     return dataclasses.replace(setup, rtol=rtol, atol=_SMALL * rtol, throw=False)
 
@@ -546,8 +552,8 @@ def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
       states may be fewer: then the last of them stands for all later times.
 
     **Returns** (32,) s: for each part the time of its most sudden sample, or the start of the run
-    if no sample is sudden. If the torque does not depend on the time except by tables, the array
-    has no times.
+    if no sample is sudden. If the torque depends on the time only by tables of numbers over time,
+    or not at all, the array has no times: steps end at the rows of tables in any case.
     """
     state0 = jax.tree.map(lambda leaf: leaf[0], ys)
     # Steps end at each row of a table, between which the table is a straight line.
@@ -592,11 +598,12 @@ def _more_accurate_run(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, 
     - `setup`: the body, the torque, the solver and the tolerances (or the fixed step) of the given
       run.
     - `ts`: (T,) s, the times of its saved states.
-    - `sudden`: (m,) s, times at which steps of the more accurate run end, besides others.
+    - `sudden`: (m,) s, times at which steps of the more accurate run are to end, such as the times
+      at which the torque changes suddenly. Under fixed steps they are not used.
 
     **Returns** three things: the set-up of the more accurate run; the relative tolerance of the
-    given run, 0 under fixed steps; and a factor. The error of the given run is its distance to the
-    more accurate run times the factor.
+    given run, 0 under fixed steps; and a factor, 1, or 4/3 under fixed steps, which are halved. The
+    error of the given run is its distance to the more accurate run times the factor.
     """
     eps = float(jnp.finfo(ts.dtype).eps)
     most = None if setup.max_steps is None else 4 * setup.max_steps
@@ -766,9 +773,9 @@ def error_of(
 def _variance_over_neighbours(changes: Array) -> Array:
     """Return the variance of each number over a run and its neighbouring runs.
 
-    The neighbours are runs with slightly changed inputs. `changes` (m, …) are the differences of
-    their results from the result of the run, one row for each of the m neighbours; the run itself
-    counts as one more, with the difference 0. **Returns** an array (…) without the first axis.
+    The neighbours are m runs with slightly changed inputs. `changes` (m, …) are the differences of
+    their results from the result of the run. The variance is that of m + 1 results, because the run
+    itself is one of them, with the difference 0. **Returns** an array (…) without the first axis.
     """
     mean = jnp.sum(changes, 0, keepdims=True) / (_NEIGHBOURS + 1)
     return (jnp.sum((changes - mean) ** 2, 0) + mean[0] ** 2) / _NEIGHBOURS

@@ -138,9 +138,9 @@ def lyapunov_exponents(
 
 
 def _small_product(a: Array, b: Array) -> Array:
-    """Return the product `a @ b` of small matrices, which XLA fuses with the code around it.
+    """Return the product `a @ b` of small matrices, in a form that XLA fuses with other code.
 
-    - `a`: (n, m) and `b`: (m, k). The result is (n, k).
+    - `a`, `b`: two matrices, (n, m) and (m, k), of any sizes n, m and k. The result is (n, k).
     """
     return jnp.sum(a[:, :, None] * b[None], 1)
 
@@ -157,10 +157,12 @@ def _exponents_of_run(
 ) -> Exponents:
     """Return the Lyapunov exponents along a motion, without a check of the arguments.
 
+    The exponents are the mean rates, 1/s, at which small changes of the state grow.
+
     - `options`: a tuple of the solver and of four integers: the number of exponents, the number of
-      intervals of the run, the number of intervals at the beginning that are not counted, and the
-      largest number of steps in one interval.
-    - `field`: a vector field `f(t, y, args)`.
+      intervals into which the run is divided, the number of intervals at the beginning whose growth
+      is left out of the means, and the largest number of steps in one interval.
+    - `field`: a vector field `f(t, y, args)` that returns dy/dt.
     - `state0`: the state at `t0`.
     - `t0`, `length`: the start and the length of the run, s.
     - `rtol`, `atol`: the relative and the absolute tolerance of each step.

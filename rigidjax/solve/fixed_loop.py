@@ -183,7 +183,7 @@ def inputs_at_start(law: Any, h: Array, inputs: Any) -> Any:
 
 
 def _row_at(a: Array, i: Any) -> Array:
-    """Return row `i` of an array `a`, the first axis of which is the rows.
+    """Return the element `i` (a row) of an array `a` along its first axis.
 
     If `i` lies before the first or after the last row, the first or the last row is returned.
     """

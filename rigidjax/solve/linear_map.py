@@ -85,9 +85,10 @@ def nan_derivatives(tree: Any, inputs: Any) -> Any:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _with_nan_derivatives(count: int, *numbers: Array) -> Arrays:
-    """Return the first `count` of the arrays, with NaN derivatives where they are not finite.
+    """Return the first `count` of the arrays `numbers`, with NaN derivatives where not finite.
 
-    The other arrays in `numbers` are the inputs with respect to which the derivatives are NaN.
+    The values are returned as they are. The other arrays in `numbers` are the inputs: a number that
+    is NaN or infinite gets NaN as its derivative with respect to all of them.
     """
     return batch_as(list(numbers[:count]), numbers)
 

@@ -30,9 +30,10 @@ from rigidjax.rotation.linalg3 import apply, solve
 class _EquationsUnderChangingInertia(eqx.Module):
     """Compute the time derivative of the state of a body whose inertia changes with the time.
 
-    It is called with the time t, s, and a state with the body rate Ω. In the derivative the rate is
-    that of Ω̃ = I₀⁻¹ p, rad/s, where p = I(t) Ω is the momentum: unlike Ω it does not jump where the
-    inertia jumps.
+    It is called with the time t, s, and a state with the body rate Ω. In the returned derivative
+    dΩ̃/dt stands in the place of dΩ/dt. Here Ω̃ = I₀⁻¹ p, rad/s, is a multiple of the momentum
+    p = I(t) Ω, where I(t) is the inertia at the time t and I₀ that of the body: where the inertia
+    jumps, Ω jumps and Ω̃ does not.
     """
 
     body: Any  # the body with the inertia I₀, an `Inertia` or `MassProperties`

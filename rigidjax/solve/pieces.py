@@ -45,8 +45,9 @@ def piece_length(count: int) -> int:
 class _StepsInPieces:
     """Run many equal steps of a function in forward direction, and in reverse mode.
 
-    The steps are divided into pieces of about √count steps. Constants and states are lists of
-    arrays.
+    The steps are divided into pieces of about √N steps, where N is the number of all steps: only
+    the states at the starts of the pieces are stored, and reverse mode computes the states within a
+    piece once more. Constants and states are lists of arrays.
     """
 
     # call(constants, y, i) → the state after step number i, which begins with the state y.
@@ -98,7 +99,8 @@ class _StepsInPieces:
         - `constants`: the arrays that the function of a step holds.
         - `moving`: for each constant, whether it has a derivative.
         - `first`: the number of the first step.
-        - `starts`: the states that `forward` returned for this function.
+        - `starts`: the states that the method `forward`, which takes the steps, returned as its
+          second result for this purpose.
         - `bar`: the cotangent of the state at the end.
 
         **Returns** two lists: the cotangents of the constants with a derivative, and the cotangent
@@ -134,8 +136,9 @@ class _StepsInPieces:
     def pieces(self, first: Array) -> tuple[Array, int, int]:
         """Return how the steps, the first of which has the number `first`, are divided into pieces.
 
+        A piece is a group of steps that follow one another; all pieces have equally many.
         **Returns** three things: the number of the first step of each piece, an array; how many
-        steps are in a piece; and how many steps remain after the last piece.
+        steps are in a piece; and how many steps, too few for a piece, remain after the last piece.
         """
         length = piece_length(self.count)
         many, left = divmod(self.count, length)
@@ -201,7 +204,7 @@ def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: An
 def _replace_selected(
     arrays: Sequence[Any], selected: Sequence[bool], replacements: Sequence[Any]
 ) -> list[Any]:
-    """Return a copy of a list in which some arrays are replaced.
+    """Return a copy of the list `arrays` in which some of its arrays are replaced.
 
     `selected` has a truth value for each array of the list `arrays`: whether it is replaced.
     `replacements` are the new arrays, in order, one for each true value.

@@ -30,8 +30,8 @@ class GroupInterpolation(dfx.AbstractLocalInterpolation):
 class _MakeGroupInterpolation(eqx.Module):
     """Make the object that interpolates within a step, and keeps the quaternion a unit quaternion.
 
-    Diffrax calls it with the times `t0` and `t1` at which the step begins and ends, and with what
-    the solver has stored for dense output; it returns a `GroupInterpolation`.
+    Diffrax calls it with the times `t0` and `t1` at which the step begins and ends, s, and with
+    what the solver has stored for dense output, which gives the states within a step.
     """
 
     inner_cls: Any = eqx.field(static=True)  # the class of the solver's own interpolation
@@ -41,7 +41,11 @@ class _MakeGroupInterpolation(eqx.Module):
 
 
 def _attribute_of_member(part: str, name: str) -> Any:
-    """Define a property that reads the attribute `name` of the member `part` of an object."""
+    """Define a property that reads an attribute of a member of an object.
+
+    `part` is the name of the member, and `name` that of its attribute: the property of an object x
+    has the value `x.part.name`.
+    """
     return property(lambda self: getattr(getattr(self, part), name))
 
 

@@ -60,11 +60,12 @@ def states_of_run(
     recorded: Any = jax.custom_jvp(partial(mapped, partial(_run_bodies, True), 0))
 
     def tangents_of(primals: Any, tangents: Any, pull: Any = None) -> tuple[Arrays, Arrays]:
-        """Return the arrays of a run with its record, and the tangents of those that hold states.
+        """Return the results and the record of a run, and the tangents of those that hold states.
 
-        `primals` are the arrays of the run, and `tangents` their tangents (symbolic zeros where
-        there is none). `pull` is the function that computes the cotangents in reverse mode; if it
-        is `None`, reverse mode raises an error.
+        Results and record are one list of arrays. `primals` are the inputs of the run, its
+        constants first, and `tangents` their tangents (symbolic zeros where there is none). `pull`
+        is the function that computes the cotangents of the inputs in reverse mode; if it is `None`,
+        reverse mode raises an error.
         """
         # A number without a tangent needs no derivative.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
@@ -105,11 +106,15 @@ def _method_over_bodies(
 ) -> tuple[Method, Run, Layout, Arrays]:
     """Convert a method for one body to a method for arrays whose last axis is the bodies.
 
+    A method holds the functions of a run: the field, the condition that ends the run, and the step
+    control. If there is one body, the arrays have no such axis.
+
     **Arguments:**
 
-    - `method`: the method of one body. Its functions `halt(constants, t, y)` and `control(again,
-      constants, …)` take the constants as an argument.
-    - `trees`: the structure of a `Run`, and that of the states of controller and progress meter.
+    - `method`: the method of one body. Its functions `halt(constants, t, y)`, the condition, and
+      `control(again, constants, …)`, the step control, take the constants as an argument.
+    - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
+      progress meter.
     - `layout`: which arrays have a last axis of bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
@@ -146,8 +151,9 @@ def _run_bodies(
     **Arguments:**
 
     - `record`: whether the record of the steps is returned, too.
-    - `method`: the method of one body.
-    - `trees`: the structure of a `Run`, and that of the states of controller and progress meter.
+    - `method`: the explicit method of one body, with the field and the step control.
+    - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
+      progress meter.
     - `layout`: which arrays have a last axis of bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
@@ -175,18 +181,19 @@ Moving = tuple[list[bool], list[bool]]
 def _parts_of_recorded_run(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> tuple[Method, Arrays, Run, Record, Arrays]:
-    """Return what is needed to differentiate a recorded run of all bodies.
+    """Return what is needed to differentiate the run of all bodies whose steps were recorded.
 
     **Arguments:**
 
     - `moving`: which constants, and which arrays of the run, have a tangent.
-    - `method`: the method of one body.
-    - `trees`: the structure of a `Run`, and that of the states of controller and progress meter.
+    - `method`: the explicit method of one body, with the field and the step control.
+    - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
+      progress meter.
     - `layout`: which arrays have a last axis of bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
-    - `each`: a list of the arrays of the run, then those of its record, then the tangents or
-      cotangents.
+    - `each`: a list of the arrays of the run, then those of its record, then, in forward mode, the
+      tangents of the inputs or, in reverse mode, the cotangents of the results.
 
     **Returns** five things: the method for bodies; the constants; the run; its record; and the
     tangents or cotangents. The returned constants are only the constants that have a tangent, with
@@ -216,14 +223,19 @@ def _parts_of_recorded_run(
 def _tangents_of_states(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    """Return the tangents of the states of a recorded run, in forward mode.
+    """Return the tangents of the states of a run whose steps were recorded, in forward mode.
 
-    The states are those at the saved times and the one at the end of the run. `moving` says which
-    constants, and which arrays of the run, have a tangent. `each` is a list of the arrays of the
-    run, then those of its record, then the tangents of the constants and arrays that `moving`
-    selects. `method`, `trees`, `layout` and `constants` are the method of one body, the structures
-    of a `Run` and of the states of its controller, the axes of bodies, and the arrays that the
-    functions of the method hold.
+    The states are those at the saved times and the one at the end of the run.
+
+    - `moving`: two lists of truth values: which constants, and which arrays of the run, have a
+      tangent.
+    - `method`: the explicit method of one body, with the field and the step control.
+    - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
+      progress meter.
+    - `layout`: which arrays have a last axis of bodies.
+    - `constants`: the arrays that the functions of the method hold.
+    - `each`: the arrays of the run, then those of its record, then the tangents of the constants
+      and arrays that `moving` selects.
     """
     method, chosen, run, record, along = _parts_of_recorded_run(
         moving, method, trees, layout, constants, each
@@ -243,14 +255,19 @@ def _tangents_of_states(
 def _cotangents_of_inputs(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    """Return the cotangents of the inputs of a recorded run, in reverse mode.
+    """Return the cotangents of the inputs of a run whose steps were recorded, in reverse mode.
 
-    The inputs are the constants and the arrays of the run; `moving` says which of them have a
-    cotangent. `each` is a list of the arrays of the run, then those of its record, then two
-    cotangents: that of the states at the saved times, and that of the state at the end of the run.
-    `method`, `trees`, `layout` and `constants` are the method of one body, the structures of a
-    `Run` and of the states of its controller, the axes of bodies, and the arrays that the functions
-    of the method hold.
+    The inputs are the constants and the arrays of the run.
+
+    - `moving`: two lists of truth values: which constants, and which arrays of the run, get a
+      cotangent.
+    - `method`: the explicit method of one body, with the field and the step control.
+    - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
+      progress meter.
+    - `layout`: which arrays have a last axis of bodies.
+    - `constants`: the arrays that the functions of the method hold.
+    - `each`: the arrays of the run, then those of its record, then two cotangents: that of the
+      states at the saved times, and that of the state at the end of the run.
     """
     method, chosen, run, record, bars = _parts_of_recorded_run(
         moving, method, trees, layout, constants, each

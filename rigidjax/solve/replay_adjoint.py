@@ -184,9 +184,13 @@ class _Control(NamedTuple):
 def _can_be_replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: Any) -> bool:
     """Return whether `ReplayAdjoint` itself can do a run; if not, its `otherwise` does the run.
 
+    It can do a run of an explicit method of this package with a largest number of steps, on a state
+    of one floating-point dtype. It cannot save dense output or every step, and an event must be one
+    condition with truth values that is not refined by a root finder.
+
     The arguments are those of `diffrax.diffeqsolve`: the `solver`, what is saved (`saveat`), the
-    `event` or `None`, and the largest number of steps. `state` is the state of `diffeqsolve` at the
-    start.
+    `event` or `None`, and the largest number of steps (`max_steps`) or `None`. `state` is the state
+    of `diffeqsolve` at the start.
     """
     kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(state.y)}
     plain = isinstance(solver, AbstractExplicit) and max_steps is not None and not saveat.dense
@@ -217,11 +221,12 @@ def _nested_controllers(controller: Any) -> list[Any]:
 
 
 def _times_where_steps_end(controllers: list[Any], t0: Array, t1: Array) -> Array:
-    """Return in increasing order the times at which steps end, s: those of jumps, and the last t1.
+    """Return in increasing order the times at which steps end, s: those of jumps, and then t1.
 
     The times at which the field jumps are held by the step `controllers`. `t0` and `t1` are the
-    times at which the run begins and ends. A jump at a time that the run does not reach is replaced
-    by t0, so that the array keeps its length.
+    times at which the run begins and ends. If a `diffrax.ClipStepSizeController` holds a jump that
+    is not after t0, or that is after t1, no step has to end there: the jump is replaced by t0, so
+    that the array keeps its length.
     """
     jumps = [c.stops for c in controllers if type(c) is Stopping]
     for c in controllers:
@@ -246,9 +251,10 @@ def _final_state(
     - `state`: the state of `diffeqsolve` at the start.
     - `saveat`, `event`, `args`: the arguments of `diffeqsolve` with these names.
     - `tree`: a function that makes a state of the motion from its n numbers.
-    - `run`: the start, the stops and the saved times of the run.
-    - `asked`: (K,) the saved times, those of all `diffrax.SubSaveAt`s joined.
-    - `ys`: (K, n) the states at the saved times, NaN where the run did not come.
+    - `run`: the start of the run, and its stops: the times at which the field jumps, and the end.
+    - `asked`: (K,) s, the K saved times, those of all `diffrax.SubSaveAt`s joined.
+    - `ys`: (K, n) the states, of n numbers each, at the saved times; NaN at times that the run did
+      not reach.
     - `end`: the state of the loop at the end of the run.
     """
     t1 = run.stops[-1]

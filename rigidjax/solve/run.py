@@ -236,8 +236,8 @@ def _integrate(
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
     """Integrate the motion step by step from the state `state0`, saved at the times `ts` (T,), s.
 
-    `setup` holds the body, the torque, the solver and its tolerances; `watch` is the condition that
-    ends the run, or `None`.
+    `setup` holds the body, the torque, the solver and its tolerances. `watch` is a condition that
+    ends the run when it becomes true; with `None` the run goes to the last time.
 
     **Returns** four things: the states at `ts`, with a leading time axis; a dict with the numbers
     of steps; the result of diffrax, which says why the run ended; and the end of the run, a tuple
@@ -296,9 +296,9 @@ _NONFINITE_WORDS = (
 
 
 def _shortest_step_words(dtype: Any) -> str:
-    """Return the message of the error for a run in which no step was short enough.
+    """Return the message of the error for a run that wanted a step shorter than time resolves.
 
-    `dtype` is the dtype of the times, whose resolution the message names.
+    `dtype` is the dtype of the times, which sets the shortest step; the message names it.
     """
     gap = np.spacing(np.asarray(1e9, dtype))
     return (
@@ -353,7 +353,7 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
 
 @eqx.filter_jit
 def _end_of_run(setup: DiffraxRun, state0: Any, ts: Array) -> Any:
-    """Run once more and return where the run ended.
+    """Run a motion once more, and return the time and the state at which the run ended.
 
     `setup` holds the body, the torque and the solver; the run begins with the state `state0` and
     has the saved times `ts` (T,), s. **Returns** four things: the time at the end, s; the state at

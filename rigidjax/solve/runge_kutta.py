@@ -77,10 +77,10 @@ def weights(tableau: Tableau, dtype: Any) -> Weights:
 
 
 def _weighted_sum(row: Array, slopes: Array) -> Array:
-    """Return the weighted sum of the slopes of a step over its stages, Σ row_i k_i, (n, …).
+    """Return the weighted sum Σ w_i k_i of the slopes of a step over its s stages i, (n, …).
 
-    `slopes` (n, s, …) are the slopes k_i, the values of the field at the s stages i of the step;
-    `row` holds the weights. If there are fewer slopes than weights, the last weights are left out.
+    `slopes` (n, s, …) are the slopes k_i = dy/dt, the n values of the field at each stage; `row`
+    holds the weights w_i. If there are fewer slopes than weights, the last weights are left out.
     """
     row = row[: slopes.shape[1]]
     return jnp.sum(row.reshape(1, -1, *[1] * (slopes.ndim - 2)) * slopes, 1)
@@ -129,9 +129,14 @@ def _stage(
 ) -> tuple[Array, Array, Array]:
     """Return the time, the state (n, *bodies) and the slope (n, *bodies) of one stage of a step.
 
-    `w` are the weights of the method; `field` is the vector field `(constants, t, y)`; `step` holds
-    the times, the length and the state at the start of the step; `i` is the index of the stage; and
-    `slopes` (n, s, *bodies) are the slopes of all stages, of which those before `i` are used.
+    - `w`: the weights and the times of the stages of the method.
+    - `field`: the vector field `field(constants, t, y)`, which returns dy/dt, the slope.
+    - `constants`: the arrays on which the field depends.
+    - `step`: holds the times, the length and the state at the start of the step.
+    - `i`: the index of the stage.
+    - `slopes`: (n, s, *bodies) the slopes of all s stages, of which those before `i` are used.
+
+    A state has n numbers; `*bodies` is one last axis for the bodies of a batch, or no axis.
     """
     # The dtype of the time may differ from that of the state.
     y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _weighted_sum(w.a[i], slopes)

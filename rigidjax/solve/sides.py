@@ -113,10 +113,11 @@ def with_constant_tables(field: Any, time: Array) -> Any:
 
 
 def _declares_jumps(node: Any) -> bool:
-    """Return whether a part of a vector field is a law that jumps in time, by its own declaration.
+    """Return whether a part of a vector field is a law that declares that it jumps in time.
 
-    `node` is any part of the tree of the field. A law of this package declares jumps if it has
-    some; a law of a user does if it has the member `jump_times`, even if that is empty.
+    A law is a torque, or a function of time, in the field. `node` is any part of the tree of the
+    field. A law of this package declares jumps if its class can jump by itself and it has at least
+    one jump time; a law of a user does if it has the member `jump_times`, even if that is empty.
     """
     if isinstance(node, type) or not hasattr(node, "jump_times"):
         return False

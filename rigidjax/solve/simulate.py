@@ -203,9 +203,10 @@ def _solver_of_run(
 ) -> dfx.AbstractSolver:
     """Return the solver that a run uses, one that keeps attitudes unit quaternions.
 
-    The arguments are those of `simulate` with the same names. If `solver` is `None`, the fastest
-    solver that allows the `adjoint`, the `event` and the largest number of steps `max_steps` is
-    returned. A solver of diffrax is wrapped, so that each step scales its quaternion to length 1.
+    If `solver` is `None`, the fastest solver is returned that works with the other three arguments:
+    `adjoint`, how derivatives are taken, or `None` for the default; `event`, a condition at whose
+    first zero the run ends, or `None`; and `max_steps`, the largest number of steps, or `None` for
+    no limit. A solver of diffrax is wrapped, so that each step scales its quaternion to length 1.
     """
     if solver is None:
         # If the user asks for forward mode alone, diffrax computes the tangents together with the
@@ -221,10 +222,11 @@ def _solver_of_run(
 def _adjoint_of_run(setup: DiffraxRun) -> dfx.AbstractAdjoint:
     """Return the adjoint that a run uses, that is how its derivatives are taken.
 
-    It is `ReplayAdjoint` if the solver is an explicit method of this package and `ReplayAdjoint`
-    can do all that the adjoint in `setup` can. Otherwise it is the adjoint in `setup` or, if this
-    is `None`, an adjoint of diffrax for reverse mode. `setup` also holds the solver and the
-    tolerances of the run.
+    `setup` holds the adjoint that the user gave or `None`, the solver, the tolerances, and the
+    largest number of steps or `None`. The result is `ReplayAdjoint` if the solver is an explicit
+    method of this package, the number of steps is limited, and `ReplayAdjoint` can do all that the
+    given adjoint can. Otherwise it is the given adjoint or, if none was given, an adjoint of
+    diffrax for reverse mode.
     """
     explicit = isinstance(setup.solver, AbstractExplicit) and setup.max_steps is not None
     if explicit and isinstance(setup.adjoint, _EITHER_MODE):
@@ -248,11 +250,12 @@ def _solve_to_accuracy(
     **Arguments:**
 
     - `setup`: the body, the torque and the solver of the run.
-    - `event`: an `Event` or a condition that ends the run, or `None`.
+    - `event`: a condition `(t, state, body) → scalar` at whose first zero the run ends, an `Event`
+      of one, or `None`.
     - `state0`: the state at the time `times[0]`.
     - `times`: (T,) s, the times at which states are saved.
-    - `accuracy`: the wanted error, rad for rotations, else relative to the largest value in the
-      run.
+    - `accuracy`: the largest error that is allowed at the saved times: rad for rotations; for any
+      other array of the state, a part of its largest length in the run.
     """
     found, run, search = solve_to(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
@@ -267,7 +270,8 @@ def _solve_run(setup: Any, event: Any, state0: Any, times: Array, run: Any = Non
     **Arguments:**
 
     - `setup`: the body, the torque and how the motion is solved, a `ClosedFormRun` or `DiffraxRun`.
-    - `event`: an `Event` or a condition that ends the run, or `None`.
+    - `event`: a condition `(t, state, body) → scalar` at whose first zero the run ends, an `Event`
+      of one, or `None`.
     - `state0`: the state at the time `times[0]`.
     - `times`: (T,) s, the times at which states are saved.
     - `run`: what `solve` returned for this run, if it is already known; else `None`.

@@ -191,7 +191,10 @@ class Solution(eqx.Module, Generic[State]):
 
     @property
     def _states(self) -> Any:
-        """Return the states at `ts`, joined with the states of the torque if it has some."""
+        """Return the states at the saved times, with those of the torque if it has some.
+
+        A torque with states of its own is, for example, one that follows a filtered signal.
+        """
         return self.ys if self.own is None else Coupled(self.ys, self.own)
 
 
@@ -207,8 +210,8 @@ def with_error(sol: Solution, error: Error, accuracy: Any) -> Solution:
 def _warn_of_error(error: Error, most: Any, words: str) -> None:
     """Warn if the error of a run exceeds a limit, and name the first time at which it does.
 
-    `most` is the limit of the relative error (rad for rotations), and `words` is the beginning of
-    the message.
+    `most` is the limit: rad for rotations, and for any other array of the state a part of its
+    largest length in the run. `words` is the beginning of the message.
     """
     if not _checks.is_known((error, most)) or not np.any(np.asarray(error.relative) > most):
         return
@@ -229,7 +232,10 @@ def _warn_of_error(error: Error, most: Any, words: str) -> None:
 def _drift(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> dict[str, Array]:
     """Return the relative drift of each quantity that the motion conserves, by its name.
 
-    `setup` holds the body and the torque; `ys` are the states at the times `ts` (T,), s.
+    The drift is the largest distance of the quantity, such as the energy of a free body, from its
+    value at the start, divided by a size of the quantity in the run. `setup` holds the body and the
+    torque; `ys` are the states at the T times `ts` (T,), s. **Returns** a dict with one number for
+    each quantity.
     """
     return drift(ts, ys, setup.body, setup.torque)  # pyright: ignore[reportArgumentType]
 
@@ -240,8 +246,10 @@ def _transition_matrix(
 ) -> Float[Array, "times n n"]:
     """Return the derivatives (T, n, n) of the states at all times with respect to the first state.
 
-    `setup` holds the body, the torque and the solver; `ys` are the states at the times `ts` (T,),
-    s. Rows and columns are the n numbers of a small change of a state on its tangent space.
+    `setup` holds the body, the torque and the solver; `ys` are the states at the T times `ts` (T,),
+    s. A small change of a state has n numbers: all its arrays joined, where a rotation vector, rad,
+    stands for the change of a quaternion. A row is one of these numbers at a time, and a column one
+    of them at the start.
     """
     # The run must not raise an error, and it must be differentiable in forward mode.
     plain = isinstance(setup, DiffraxRun) and not setup.is_replayed
@@ -257,11 +265,12 @@ def _transition_matrix(
 
 @eqx.filter_jit
 def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, " times"]:
-    """Return by which factor a small error at the start has grown at each saved time, (T,).
+    """Return by which factor a small error at the start can have grown at each saved time, (T,).
 
-    The factor is the largest singular value of ∂y(t)/∂y(t₀), after each array of the state y is
-    divided by its largest length in the run. `setup` holds the body, the torque and the solver;
-    `ys` are the states at the times `ts` (T,), s.
+    The factor is the largest singular value of ∂y(t)/∂y(t₀), where t₀ is the start and each array
+    of the state y is divided by its largest length in the run: the growth of the worst error.
+    `setup` holds the body, the torque and the solver; `ys` are the states at the times `ts` (T,),
+    s.
     """
     start = jax.tree.map(lambda leaf: leaf[0], ys)
     each = parts_by_name(start, jnp.ones(dimension(start), ts.dtype)).values()

@@ -56,10 +56,11 @@ def _symmetric_composition(
 ) -> Composition:
     """Return a symmetric splitting method of the given `order`, from the first of its weights.
 
-    A step of the method alternates between exact free motions, each during a part of the step, and
-    kicks, each of which adds a part of the torque's impulse to the momentum. `flows` are the first
-    of these parts for the free motions, and `kicks` for the kicks. The middle weights follow
-    because the weights of each kind sum up to 1; the last weights follow from the symmetry.
+    A step of the method alternates between exact free motions and kicks. A free motion lasts for a
+    weight times the length of the step. A kick adds, at a fixed time and attitude, a weight times
+    the torque times the length of the step to the momentum. `flows` are the first weights of the
+    free motions, and `kicks` those of the kicks. The middle weights follow because the weights of
+    each kind sum up to 1; the last weights follow because the step is symmetric.
     """
     if len(flows) < len(kicks):
         middle = 1 - 2 * sum(kicks)
@@ -338,12 +339,14 @@ def _quintic_coefficients(
 
     **Arguments:**
 
-    - `terms`, `args`: the `diffrax.ODETerm` of the vector field, and the argument of its calls.
-    - `t0`, `t1`: the times of diffrax at which the step begins and ends, s.
-    - `y0`, `y1`: the states at the two ends of the step.
+    - `terms`, `args`: the `diffrax.ODETerm` of the vector field, and the argument `args` with which
+      diffrax calls the field.
+    - `t0`, `t1`: the times at which the step begins and ends, s; diffrax uses −t for the time t in
+      a run backwards.
+    - `y0`, `y1`: the states at the start and at the end of the step.
 
     **Returns** a tree like the state, whose arrays (5, …) have the five coefficients in the form
-    that `runge_kutta.nested` evaluates.
+    that `runge_kutta.nested`, which evaluates the polynomial, takes.
     """
     way, length = direction_and_length(terms, t0, t1)
     h = way * length

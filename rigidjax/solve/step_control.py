@@ -27,7 +27,7 @@ NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
 
 
 def _attribute_of_controller(name: str) -> Any:
-    """Define a property that reads the attribute `name` of the wrapped `controller`."""
+    """Define a property that reads the attribute `name` of the step controller that is wrapped."""
     return property(lambda self: getattr(self.controller, name))
 
 
@@ -73,7 +73,7 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
         return t0 + self._limited_length(dt0), ()
 
     def _limited_length(self, length: Any) -> Any:
-        """Return the `length` of a step, s, or the longest allowed step if this is shorter."""
+        """Return the `length` of a step, s, but not more than the longest step that is allowed."""
         return length if self.dtmax is None else jnp.minimum(length, self.dtmax)
 
     def adapt_step_size(
@@ -173,7 +173,8 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         """Choose the length of the first step of a run, s, by the sizes of the state and its slope.
 
         `y` is the state at the start, `slope` its time derivative, and `order` the order of the
-        error of a step. The length is 0 or NaN if the state or its derivative is not finite.
+        error estimate: the error of a step grows as this power of its length. The length is 0 or
+        NaN if the state or its derivative is not finite.
         """
         y, tree = ravel_pytree(y)
         scale = self.atol + self.rtol * jnp.abs(y)
@@ -271,7 +272,7 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         )
 
     def _stop_and_moment_before(self, index: Any) -> tuple[Any, Any]:
-        """Return two times: that of the stop number `index`, and the last number before this time.
+        """Return the time of the stop number `index`, and the last floating-point time before it.
 
         A stop is a time at which steps end because the field jumps. The last floating-point number
         before a stop is the time at which the step before the stop ends. If `index` is beyond the

@@ -120,9 +120,10 @@ def cheapest(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
 
 
 def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
-    """Return the stepper of a vector field under a method, without its delayed inputs.
+    """Return the object that takes fixed steps of a vector field by a method, without delays.
 
-    `solver` is a method of `rigidjax.solvers` (`None`: the cheapest one), `field` the vector field
+    The caller adds the inputs of the torque that are delayed. `solver` is a method of
+    `rigidjax.solvers` (`None`: the one whose steps cost least), `field` the vector field
     `f(t, y, args)`, and `y0` the state at the start. Raise `TypeError` if the method cannot take
     fixed steps of this field.
     """
@@ -151,7 +152,10 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
 
 
 class _InertiaAndTorque(NamedTuple):
-    """Hold the inertia and the torque of a body that only turns, in the precision of its state."""
+    """Hold the inertia and the torque of a body that only turns, and does not move in space.
+
+    The inertia has the dtype of the body rate in the state of the body.
+    """
 
     inertia: Inertia
     weights: Six  # the six different entries of the inverse of the inertia, 1/(kg m²)
@@ -161,7 +165,9 @@ class _InertiaAndTorque(NamedTuple):
 def _inertia_and_torque(field: Any, y0: Any) -> _InertiaAndTorque | None:
     """Return the inertia and the torque of a body that only turns, or `None` for other motions.
 
-    `field` is the vector field of the body, and `y0` its state at the start.
+    `field` is the vector field of the body, dy/dt as a function of time and state, and `y0` its
+    state at the start. Another motion is, for example, that of a body that also moves in space, or
+    of one whose torque has states of its own.
     """
     euler = field.euler if isinstance(field, AttitudeEquations) else field
     if not isinstance(euler, EulerEquations) or not isinstance(y0, Spin | Attitude):
@@ -176,10 +182,11 @@ def _inertia_and_torque(field: Any, y0: Any) -> _InertiaAndTorque | None:
 def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
     """Return the object that takes fixed steps of a free body by Magnus' method of order 4.
 
-    `body` is the inertia, and `state0` the state at the start. The numbers that it carries are the
-    quaternion of the turn since the start and the momentum Π, both along the principal axes of the
-    body. Derivatives hold the principal axes fixed. The off-diagonal entries of the inertia along
-    these axes are zero, but they have tangents that are not zero.
+    `body` is the inertia, and `state0` the state at the start. The numbers that the object carries
+    from step to step are the quaternion of the turn since the start and the angular momentum Π,
+    quaternion and momentum along the principal axes of the body. Derivatives hold these axes fixed:
+    when the inertia changes, its entries off the diagonal, which are zero, have tangents that are
+    not zero.
     """
     frame = splitting.frame_of_tensor(body.tensor)
     weights, axes = frame.weights, frame.axes
@@ -207,9 +214,10 @@ def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
 def _free_momentum_derivative(inverse: Six, differences: Triple, momentum: Triple) -> Triple:
     """Return the time derivative of the momentum of a free body, dΠ/dt = Π × Ω, N m.
 
-    `momentum` is Π, three numbers along the principal axes, N m s; Ω is the body rate. `inverse`
-    has the six entries (11, 22, 33, 12, 13, 23) of the inverse of the inertia along these axes, and
-    `differences` are those of its diagonal entries a, b and c: (c − b, a − c, b − a).
+    `momentum` is the angular momentum Π, three numbers along the principal axes, N m s; Ω is the
+    body rate. `inverse` has the six entries (11, 22, 33, 12, 13, 23) of the inverse of the inertia
+    along these axes, 1/(kg m²). `differences` (c − b, a − c, b − a) are the differences of its
+    first three entries a, b and c.
     """
     d, p = differences, momentum
     return d[0] * (p[1] * p[2]), d[1] * (p[2] * p[0]), d[2] * (p[0] * p[1])
@@ -223,7 +231,10 @@ def _free_momentum_derivative_jvp(primals, tangents):
 
 
 def _entries_of_symmetric_matrix(a: Array) -> Six:
-    """Return the six entries (11, 22, 33, 12, 13, 23) of the symmetric matrix `a` (3, 3)."""
+    """Return the six different entries of a symmetric matrix, in the order 11, 22, 33, 12, 13, 23.
+
+    `a` (3, 3) is the matrix. Each of the last three is the mean of two equal entries.
+    """
     # Both halves of the matrix are used, so that the derivative is symmetric as the matrix is.
     off = [0.5 * (a[i, j] + a[j, i]) for i, j in ((0, 1), (0, 2), (1, 2))]
     return a[0, 0], a[1, 1], a[2, 2], *off
@@ -233,8 +244,8 @@ def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
     """Return the object that takes fixed steps by Magnus' method, under a torque.
 
     The torque may read the time and the body rate, not the attitude. `turning` holds the inertia
-    and the torque of the body, and `state0` is the state at the start. The numbers carried are the
-    quaternion and the momentum in body axes.
+    and the torque of the body, and `state0` is the state at the start. The numbers that the object
+    carries from step to step are the quaternion and the angular momentum in body axes.
     """
     body, weights, torque = turning
     start, rate = split(state0), partial(matvec, weights)
@@ -265,8 +276,9 @@ def _stepper_of_explicit_method(
     """Return the object that takes fixed steps of an explicit method for a body that only turns.
 
     `solver` is the Runge–Kutta method, `turning` holds the inertia and the torque of the body, and
-    `state0` is the state at the start, a `Spin` or an `Attitude`. The numbers carried are the
-    quaternion, if there is one, and the momentum in body axes.
+    `state0` is the state at the start, a `Spin` or an `Attitude`. The numbers that the object
+    carries from step to step are the quaternion, if the state has one, and the angular momentum in
+    body axes.
     """
     body, weights, torque = turning
     start = split(state0)
@@ -307,11 +319,12 @@ def _stepper_of_slope(
     **Arguments:**
 
     - `solver`: the Runge–Kutta method.
-    - `slope_under`: `slope_under(inputs)` returns, for the values of the torque's inputs, the
-      function `(t, y)` that gives dy/dt.
+    - `slope_under`: a function: `slope_under(inputs)` returns, for the values of the inputs that
+      the torque reads in this step, the function of `(t, y)` that gives dy/dt.
     - `start`: the numbers y at the start, a tuple of scalars that stand for the state.
     - `state`: a function that returns the state for the numbers y.
-    - `like`: a state with the structure, the shapes and the dtypes into which y can be joined.
+    - `like`: a state with the structure, shapes and dtypes of the state for which the numbers y
+      stand one by one. By it the quaternion among these numbers is found and scaled to length 1.
     """
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
@@ -321,11 +334,11 @@ def _stepper_of_slope(
 
 
 def _change_to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
-    """Return the change of a state in a step, corrected so that the quaternion after it is unit.
+    """Return the change of a state in a step, after which the quaternion has the length 1.
 
     `y` are the numbers of the state before the step, a tuple of scalars, and `change` the changes
-    of these numbers. `like` is a state with the structure that the numbers have. If this state has
-    no attitude, `change` is returned as it is.
+    of these numbers, of which those of the quaternion are corrected. `like` is a state whose
+    arrays the numbers form, in order. If it has no quaternion, `change` is returned as it is.
     """
     if not isinstance(motion_of(like), HasAttitude):
         return change
@@ -350,9 +363,10 @@ def _change_to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
 def _stepper_of_splitting(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
     """Return the object that takes fixed steps of a splitting: free motions and kicks in turn.
 
-    `solver` is the splitting, `field` the equations of an attitude under a torque of time and
-    attitude, and `state0` the state at the start. The numbers carried are the quaternion and the
-    momentum along the principal axes.
+    A kick adds the torque times a part of the step to the momentum, at a fixed attitude. `solver`
+    is the splitting method, `field` the equations of motion of a body under a torque that reads
+    the time and the attitude, and `state0` the state at the start. The numbers that the object
+    carries from step to step are the quaternion and the angular momentum along the principal axes.
     """
     # No step converts the momentum Π to Ω = I⁻¹Π and back, so that |Π| drifts only by the round-off
     # of the free motion.

@@ -145,8 +145,9 @@ def program_with_stops(
 
 
 def _split_like(whole: Array, like: list[Array]) -> list[Array]:
-    """Return the parts of an array along its first axis, as long as the arrays in `like`.
+    """Return an array cut along its first axis into parts that are as long as other arrays.
 
-    `whole` is the array; the lengths of the parts add up to its length.
+    `whole` is the array that is cut. `like` are the other arrays: part number i has as many rows as
+    `like[i]`, and together the parts are the whole array.
     """
     return list(jnp.split(whole, np.cumsum([a.shape[0] for a in like])[:-1]))

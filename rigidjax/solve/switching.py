@@ -163,7 +163,7 @@ class Analysis(NamedTuple):
 
 
 def _inner_programs(params: dict[str, Any]) -> Iterator[tuple[Any, Any]]:
-    """Yield each program (a `Jaxpr`) among the parameters of an equation, with its constants.
+    """Yield each program (a `Jaxpr`) among the parameters of an equation, and its constants.
 
     - `params`: the parameters of an equation of a `Jaxpr`; a `cond`, for example, has one program
       for each branch.
@@ -177,9 +177,9 @@ def _inner_programs(params: dict[str, Any]) -> Iterator[tuple[Any, Any]]:
 
 
 def _primitive_name(eqn: Any) -> str:
-    """Return the name of a primitive, or "searchsorted" for a call of `jnp.searchsorted`.
+    """Return the name of an equation's primitive, or "searchsorted" for `jnp.searchsorted`.
 
-    - `eqn`: an equation of a `Jaxpr`, or a `Node`.
+    - `eqn`: an equation of a `Jaxpr`, or a `Node`, which holds one.
     """
     called = eqn.params.get("name")
     return "searchsorted" if called == "searchsorted" else eqn.primitive.name
@@ -199,7 +199,10 @@ def _is_float(dtype: Any) -> bool:
 
 
 def _may_jump(name: str, params: dict[str, Any], dtypes: list[Any]) -> bool:
-    """Return whether the result of an equation may jump when its real operands do not jump.
+    """Return whether the result of an equation may jump while its operands change continuously.
+
+    The answer is no if the first operand is a boolean or a whole number, because such an operand
+    never changes continuously.
 
     - `name`, `params`: the name and the parameters of its primitive, such as "lt" for `t < 1`.
     - `dtypes`: the dtypes of its operands.
@@ -212,7 +215,9 @@ def _may_jump(name: str, params: dict[str, Any], dtypes: list[Any]) -> bool:
 
 
 def _may_bend(name: str, dtypes: list[Any]) -> bool:
-    """Return whether the result of an equation may have a kink when its operands have none.
+    """Return whether the result of an equation may have a kink while its operands have none.
+
+    At a kink, such as that of `abs` at 0, the slope jumps and the value does not.
 
     - `name`: the name of its primitive, such as "abs".
     - `dtypes`: the dtypes of its operands.
@@ -226,7 +231,8 @@ def _contains_switch(jaxpr: Jaxpr, with_kinks: bool = False) -> bool:
     The answer is also yes for an equation whose content cannot be read, such as a callback.
 
     - `jaxpr`: the program.
-    - `with_kinks`: whether an equation whose result may have a kink counts, too.
+    - `with_kinks`: whether the answer is also yes for an equation whose result may have a kink, at
+      which its slope jumps.
     """
     for eqn in jaxpr.eqns:
         name, dtypes = _primitive_name(eqn), _dtypes_of_inputs(eqn)
@@ -369,15 +375,17 @@ def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
 def _is_of_this_package(node: Node) -> bool:
     """Return whether this package, and not the user's code, wrote the equation `node`.
 
-    The laws of this package declare their jumps, so that their equations need no search.
+    The torque laws of this package state the times of their jumps themselves, so that these times
+    need not be searched for in their equations.
     """
     return summarize(node.source).startswith(_PACKAGE)
 
 
 def _may_switch(node: Node) -> bool:
-    """Return whether the equation `node` may jump or have a kink, or contains a program.
+    """Return whether the result of the equation `node` may jump or have a kink.
 
-    The result of an equation that contains a program, such as `cond`, may jump inside this program.
+    At a kink the slope jumps and the value does not. The answer is yes for each equation that
+    contains a program, such as `cond`, because there may be a jump inside this program.
     The answer is also yes for an equation whose content cannot be read, such as a callback.
     """
     name = node.name
@@ -386,9 +394,10 @@ def _may_switch(node: Node) -> bool:
 
 
 def _may_hide_switches(node: Node) -> bool:
-    """Return whether the equation `node` may switch at times that cannot be searched for.
+    """Return whether the result of `node` may jump at times that cannot be searched for.
 
-    Examples are `argmax` of an array, a callback, and a loop that contains a comparison.
+    `node` is an equation. Examples are `argmax` of an array, a callback, and a loop that contains a
+    comparison.
     """
     if node.name in _CHOICES | {"atan2"}:
         return True
@@ -404,9 +413,10 @@ def _switch_of(program: Program, node: Node, operands: list[int], jumps: bool) -
 
     - `program`: the program that contains the equation.
     - `node`: the equation, whose result depends on the time but not on the state.
-    - `operands`: how each operand depends on the time: `CONSTANT`, `PIECES`, `STRAIGHT`, `MONOTONE`
-      or `BENT`.
-    - `jumps`: whether the result jumps; else it has a kink.
+    - `operands`: how each operand depends on the time: `CONSTANT` (not at all), `PIECES` (constant
+      except for jumps), `STRAIGHT` (linear), `MONOTONE` (only rising or only falling) or `BENT` (in
+      any other way).
+    - `jumps`: whether the result jumps; else it has a kink, at which its slope jumps.
     """
     name = node.name
     compared = operands[: 1 if name in _LEVELS - {"rem"} else 3]

@@ -36,18 +36,20 @@ _GRID = 4096  # the number of points of the grid on which a bent switch is searc
 
 
 def _gap_of_operands(switch: Switch, x: Any, *rest: Any) -> Any:
-    """Return the gap of each element of a switch, a function of time that is zero where it changes.
+    """Return the gap of each element of a switch: a number that shows where the element changes.
 
     A switch is an equation, such as the comparison `t < 1`, whose result changes at certain times.
-    The gap is the difference of its two operands, here t − 1. For functions such as `floor` it is
-    the operand (for `rem` the quotient of the two operands), and the result changes where the gap
-    passes a whole number.
+    The gap is the difference of its two operands, here t − 1, and the result changes where the gap
+    is zero. `clamp` has two gaps, the differences of its number from the two bounds; the gap of
+    `abs` or `sign` is the operand. For functions such as `floor` the gap is the operand (for `rem`
+    the quotient of the two operands), and the result changes where the gap passes a whole number.
 
     - `switch`: the equation.
     - `x`: its first operand.
     - `rest`: its other operands, followed by its result.
 
-    **Returns** an array (m,), with one number for each of the m elements.
+    **Returns** an array (m,), with one number for each of the m elements, such as those of a
+    comparison of arrays.
     """
     name = switch.node.name
     if name == "clamp":
@@ -66,9 +68,11 @@ def _value_of_operands(switch: Switch, x: Any, *rest: Any) -> Any:
     - `x`: its first operand.
     - `rest`: its other operands, followed by its result.
 
-    **Returns** an array (m,), with one value for each of the m elements. It is a truth value,
-    whether the gap (the difference of the operands) is positive, for `searchsorted` and for
-    operations with a kink, such as `max`.
+    **Returns** an array (m,), with one value for each of the m elements, such as those of a
+    comparison of arrays. The value is the result of the equation, with three exceptions: for `rem`
+    it is the whole part of the quotient of the operands; for `searchsorted`, and for operations
+    with a kink, such as `max`, it is whether the gap (the difference of the operands, for `abs` the
+    operand) is positive.
     """
     name = switch.node.name
     if name in KINKS | {"searchsorted"}:
@@ -94,6 +98,9 @@ class Times(NamedTuple):
 class _TimedSwitch(NamedTuple):
     """Evaluate the elements of a switch at any time; a switch is an equation such as `t < 1`.
 
+    A comparison of arrays, for example, has several elements, each of which changes at times of its
+    own.
+
     - `program`: the program that contains the equation.
     - `switch`: the equation.
     - `constants`: the constants of the program.
@@ -115,19 +122,27 @@ class _TimedSwitch(NamedTuple):
         return evaluator(self.program, wanted)(self.constants, t)
 
     def value(self, t: Array) -> Array:
-        """Return the values (m,) of the elements at the time t (), s, as floating-point numbers."""
+        """Return the values (m,) of the elements at the time t (), s, as floating-point numbers.
+
+        The value of an element, such as 0 or 1 for a comparison, is constant except where the
+        element changes.
+        """
         return _value_of_operands(self.switch, *self.operands(t)).astype(t.dtype)
 
     def gap(self, t: Array) -> Array:
-        """Return the gaps (m,) of the elements at the time t (), s.
+        """Return the gaps (m,) of the m elements of the equation at the time t (), s.
 
-        The gap of a comparison is the difference of its operands; the element changes where it is
-        zero.
+        The gap of a comparison is the difference of its operands; the element changes where the gap
+        is zero. The gap of a function such as `floor` is its operand; there the element changes
+        where the gap passes a whole number.
         """
         return _gap_of_operands(self.switch, *self.operands(t)).astype(t.dtype)
 
     def values(self, t: Array, element: Any) -> Array:
         """Return the value of one element at each time: (k,) for the times t (k,), s.
+
+        The value of an element, such as 0 or 1 for a comparison, is constant except where the
+        element changes.
 
         - `element`: (k,) the index of the element, for each time.
         """
@@ -136,8 +151,9 @@ class _TimedSwitch(NamedTuple):
     def gaps(self, t: Array, element: Any) -> Array:
         """Return the gap of one element at each time: (k,) for the times t (k,), s.
 
-        The gap of a comparison is the difference of its operands; the element changes where it is
-        zero.
+        The gap of a comparison is the difference of its operands; the element changes where the gap
+        is zero. The gap of a function such as `floor` is its operand; there the element changes
+        where the gap passes a whole number.
 
         - `element`: (k,) the index of the element, for each time.
         """
@@ -154,8 +170,9 @@ class _TimedSwitch(NamedTuple):
         return jax.vmap(lambda t, i: function(t)[i])(t, element)
 
 
-# The times, elements and changes at the places of a switch, and whether the switch has more changes
-# than places.
+# Four arrays for one switch, which has k places to store changes: the times (k,) of the changes;
+# the elements (k,) that change; the changes (k,) of their values; and whether there are so many
+# changes that some are missing.
 _Places = tuple[Array, Array, Array, Array]
 
 
@@ -200,15 +217,16 @@ def _switchings_of_monotonic(
 ) -> list[_Places]:
     """Return the times at which switches change whose gap only rises or only falls in time.
 
-    A switch is an equation, such as the comparison `t < 1`. Its gap, here t − 1, is the function of
-    time whose sign the equation tests.
+    A switch is an equation, such as the comparison `t < 1`, with one or more elements. Its gap,
+    here t − 1, is the function of time that shows where the result changes: where the gap is zero
+    or, for functions such as `floor`, where it passes a whole number.
 
     - `timed_switches`: the switches.
     - `start`, `end`: the times between which changes are searched for, s.
 
-    **Returns** for each switch four things: the times (k,), s; the elements (k,) that change; the
-    changes (k,) of their values, 0 in a place where nothing changes; and whether there are more
-    changes than places.
+    **Returns** for each switch four things: k times (k,), s; the elements (k,) that change at them;
+    the changes (k,) of their values, 0 at a time at which nothing changes; and whether there are
+    more than these k changes, so that some are missing.
     """
     starts, rises, elements, levels = [], [], [], []
     for one in timed_switches:
@@ -238,16 +256,17 @@ def _switchings_of_bent(
 ) -> _Places:
     """Return the times, found on a grid, at which a switch changes whose gap may rise and fall.
 
-    A switch is an equation, such as the comparison `t < 1`. Its gap, here t − 1, is the function of
-    time whose sign the equation tests.
+    A switch is an equation, such as the comparison `t < 1`, with one or more elements. Its gap,
+    here t − 1, is the function of time that shows where the result changes: where the gap is zero
+    or, for functions such as `floor`, where it passes a whole number.
 
     - `timed_switch`: the switch.
     - `start`, `end`: the times between which changes are searched for, s.
     - `known`: arrays of times, s, at which other switches change. The grid includes these times.
 
-    **Returns** four things: the times (k,), s; the elements (k,) that change; the changes (k,) of
-    their values, 0 in a place where nothing changes; and whether there are more changes than
-    places.
+    **Returns** four things: k times (k,), s; the elements (k,) that change at them; the changes
+    (k,) of their values, 0 at a time at which nothing changes; and whether there are so many
+    changes (more than 64 on the grid) that some are missing.
     """
     before = jnp.concatenate(known) if known else jnp.zeros(0, start.dtype)
     low, high, element, over = _intervals_with_one_change(
@@ -278,7 +297,8 @@ def _intervals_with_one_change(
     - `known`: (j,) s, times at which other switches change. The grid includes these times.
 
     **Returns** four things: the starts (k,) of the intervals, s; their ends (k,), s; the index (k,)
-    of the element for each interval; and whether there are more changes than intervals.
+    of the element for each interval; and whether the grid shows more than 64 changes, so that some
+    of them are in no interval.
     """
     size, dtype = timed_switch.switch.size, start.dtype
     grid = start + (end - start) * jnp.linspace(0.0, 1.0, max(256, _GRID // size), dtype=dtype)
@@ -362,15 +382,17 @@ def _differentiable_times(
 ) -> tuple[Array, Array]:
     """Return the times at which elements of a switch change, with their derivatives.
 
-    A switch is an equation, such as the comparison `t < 1`. Its gap, here t − 1, is zero at these
-    times, which are therefore implicit functions of the constants of the field.
+    A switch is an equation, such as the comparison `t < 1`. Its gap, here t − 1, has a fixed value
+    at these times: zero or, for functions such as `floor`, a whole number. The times are therefore
+    implicit functions of the constants of the field.
 
     - `timed_switch`: the switch.
     - `t`: (k,) s, the times, without derivatives.
     - `element`: (k,) the index of the element that changes at each time.
     - `has_change`: (k,), whether the element does change at each time.
 
-    **Returns** two things: the times (k,), s; and for each time whether it has derivatives.
+    **Returns** two things: the times (k,), s; and for each time whether it has derivatives. It has
+    none if the gap stands still there, or jumps because an operand jumps.
     """
     degree = timed_switch.switch.degree
     still, moves, slope, here = (
@@ -399,10 +421,10 @@ def _differentiable_times(
 
 
 class _ResultFromStops(NamedTuple):
-    """Compute the result of a comparison from the stops that a step has passed.
+    """Compute the result of an equation that switches from the stops that the run has passed.
 
-    The stops are the times at which steps end because the comparison, such as `t < 1`, changes
-    there.
+    The equation is a comparison, such as `t < 1`, or a function such as `floor`. The stops are the
+    times at which steps end because the result of the equation changes there.
     """
 
     switch: Switch
@@ -415,11 +437,11 @@ class _ResultFromStops(NamedTuple):
         return [] if self.switch.exact else self.switch.node.inputs
 
     def value(self, read: Callable[[Any], Any], inputs: tuple[Any, ...]) -> Any:
-        """Return the result of the comparison at a time.
+        """Return the result of the equation at a time.
 
         - `read`: a function that returns the value of an input of the equation.
         - `inputs`: the arguments of the field. The first is the time, s; the last is a pair of the
-          stops, s, and the `Times`.
+          stops, s, and the `Times`, which hold by how much the result changes at each stop.
         """
         node, (stops, found) = self.switch.node, inputs[-1]
         past = inputs[0] >= stops[self.places]

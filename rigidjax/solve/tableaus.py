@@ -41,8 +41,9 @@ class Tableau(NamedTuple):
 def _parse_rows(text: str) -> tuple[Row, ...]:
     """Return the rows of a Butcher tableau that are written as a text of `stage:weight` pairs.
 
-    A semicolon separates two rows. Each row is a dict `{stage: weight}`, where stages are counted
-    from 0.
+    A row holds the weights of the slopes at the stages of a Runge–Kutta method in one sum, such as
+    the sum for the state at a later stage. A semicolon separates two rows. Each row is a dict
+    `{stage: weight}`, where stages are counted from 0.
     """
     rows = [row.split() for row in text.split(";")]
     return tuple({int(i): float(w) for i, w in (part.split(":") for part in row)} for row in rows)

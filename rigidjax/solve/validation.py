@@ -93,8 +93,9 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
 def _require_one_frame(torque: Any) -> None:
     """Raise `TypeError` if a torque that needs the absolute body rate is used in a moving frame.
 
-    In a moving frame the body rate of a state is relative to the frame. `torque` is a torque law,
-    which may consist of several laws.
+    In a moving frame of axes, such as that of an orbit, the body rate of a state is relative to the
+    frame. `torque` is a torque law, a function of time, state and body, which may consist of
+    several laws.
     """
 
     def within(law: Any) -> list[Any]:
@@ -143,8 +144,9 @@ def warn_of_scale(body: Any, torque: Any) -> None:
 def _advice_for_bare_numbers(numbers: Any, moves: bool = False) -> str:
     """Return the end of an error message, for a user who gave bare numbers in the place of a body.
 
-    It says how to make a body of the `numbers`. `moves` says whether the body moves as well as
-    turns. If `numbers` is not an array or list, the text is empty.
+    It says how to make a body of the `numbers`: an `Inertia` or, if `moves` is true because the
+    body also moves in space, a `MassProperties`. If `numbers` is not an array, a list or a tuple,
+    the text is empty.
     """
     if not isinstance(numbers, (list, tuple, np.ndarray, jax.Array)):
         return ""
@@ -299,10 +301,11 @@ def _error_or_nan_if_bad(value: Array, bad: Any, message: str, throw: bool) -> A
     **Arguments:**
 
     - `value`: the array that was checked.
-    - `bad`: whether it is bad, a truth value.
+    - `bad`: whether the array is bad, a truth value, which may be traced.
     - `message`: the message of the error.
-    - `throw`: whether a bad value raises an error. With `False` a traced bad value becomes NaN
-      instead, because one bad body in a batch must not end the runs of the other bodies.
+    - `throw`: whether a bad array raises an error even if `bad` is traced. With `False` it becomes
+      NaN in this case, because one bad body in a batch must not end the runs of the other bodies.
+      If `bad` is known, a bad array raises an error in any case.
     """
     if throw or _checks.is_known(bad):
         return _checks.error_if(value, bad, message)
