@@ -346,12 +346,14 @@ def _body_motion_and_derivatives(
 
 
 class MotionDerivatives(NamedTuple):
-    """Hold the derivatives of three vectors of a free motion with respect to the ten
-    `derivative_variables`: of the body momentum Π(t), of θ and of the body rate Ω(t), each as three
-    arrays (10,), one for each component.
+    """Hold the derivatives of three vectors of a free motion with respect to ten variables: of the
+    body momentum Π(t), of θ and of the body rate Ω(t), each as three arrays (10,), one for each
+    component.
 
-    θ is the small rotation vector that changes the rotation R of the body from time 0 to t: δR = R
-    hat(θ).
+    The ten variables are d12, d23, k12, k13, k23, the three components of Π(0), k33 and t, where
+    kij are the entries of the inverse of the inertia tensor, in principal axes, and dij = kii − kjj
+    (see `derivative_variables`). θ is the small rotation vector that changes the rotation R of the
+    body from time 0 to t: δR = R hat(θ), where hat(θ) is the matrix of the cross product with θ.
     """
 
     momentum: Rows
@@ -372,8 +374,10 @@ def motion_and_derivatives(
     - `momentum`: the three components of the body momentum Π(0).
     - `t`: the time.
 
-    In the pair, `rows` are the derivatives of Π(t) − Π(0) with respect to the ten
-    `derivative_variables`, as three arrays (10,), and G = ∫ Π Πᵀ dt from 0 to t, as six entries.
+    In the pair, `rows` are the derivatives of Π(t) − Π(0) with respect to ten variables, as three
+    arrays (10,), and G = ∫ Π Πᵀ dt from 0 to t, as six entries. The ten variables are d12, d23,
+    k12, k13, k23, the three components of Π(0), k33 and t, where kij are the entries of the inverse
+    of the inertia tensor and dij = kii − kjj (see `derivative_variables`).
     """
     (out, turn), rows, g = _flow_and_first_derivatives(
         orbit(moments[:3], momentum), moments, momentum, t
