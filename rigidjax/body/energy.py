@@ -177,8 +177,11 @@ def _body_rate_of(state: HasSpin | Vector) -> Vec3:
 
 
 def _checked_tensor(body: Inertia | MassProperties) -> Mat3:
-    """Return the inertia tensor (3, 3), kg m², of one `body`, checked; of `MassProperties`, the one
-    about the centre of mass.
+    """Return the inertia tensor (3, 3), kg m², of a body; of `MassProperties`, the one about the
+    centre of mass.
+
+    `body` is checked to be a single `Inertia` or `MassProperties` with a mass and moments that a
+    real body can have.
     """
     return tensor_of(
         validation.require_single_body(body, (Inertia, MassProperties), "body", hint=_HINT)

@@ -337,12 +337,14 @@ def with_tensor(body: OneBody, tensor: Mat3) -> OneBody:
 def _add_mass(
     body: MassProperties, mass: Array, com: Array, second_moment: Array
 ) -> MassProperties:
-    """Return a body with more mass, or with less if `mass` and `second_moment` are negative.
+    """Return the body that consists of a given body and of an added mass; with a negative `mass`
+    and `second_moment`, the body from which this mass is taken away.
 
-    - `body`: the body to start from
-    - `mass`: kg, of what is added
-    - `com`: (3,) m, its centre of mass, in the frame of `body`
-    - `second_moment`: (3, 3) kg m², its 𝔖 = ∫ r rᵀ dm about its own centre of mass
+    - `body`: the given body
+    - `mass`: kg, the added mass
+    - `com`: (3,) m, the centre of mass of the added mass, in the frame of `body`
+    - `second_moment`: (3, 3) kg m², the second moment 𝔖 = ∫ r rᵀ dm of the added mass about its own
+      centre of mass
     """
     total = body.mass + mass
     d = com - body.com

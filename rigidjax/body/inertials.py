@@ -58,8 +58,8 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     return bodies
 
 
-# With these values an attribute of `<compiler>` leaves the masses of the file unchanged;
-# `_CHANGES` says what MuJoCo does with other values.
+# For each attribute of `<compiler>` in a MuJoCo file: the values with which MuJoCo takes the masses
+# as they are written (`_UNCHANGED`), and what it does with any other value (`_CHANGES`).
 _UNCHANGED = {
     "inertiafromgeom": ("false", "auto"), "settotalmass": ("-1", "0"), "balanceinertia": ("false",),
     "boundmass": ("0",), "boundinertia": ("0",), "coordinate": ("local",),
@@ -75,10 +75,11 @@ _CHANGES = {
 
 
 def _settings_warnings(root: Tree.Element) -> list[str]:
-    """Return a list of warnings, one for each setting in a file by which MuJoCo would use other
-    masses than the file's inertials.
+    """Return a list of warnings, one for each setting in an XML file with which MuJoCo would not
+    use the `<inertial>` elements of the file as they are written, and one if the file includes
+    other files.
 
-    - `root`: the root element of the XML file
+    - `root`: the root element of the file
     """
     words = []
     for compiler in root.iter("compiler"):
@@ -92,8 +93,11 @@ def _settings_warnings(root: Tree.Element) -> list[str]:
 
 
 def _is_among(value: str, words: Sequence[str]) -> bool:
-    """Return whether `value`, an attribute in an XML file, equals one of `words`: as a number if it
-    is one, else as a text.
+    """Return whether an attribute in an XML file equals one of several words; the attribute and the
+    words are compared as numbers if all of them are numbers.
+
+    - `value`: the text of the attribute
+    - `words`: the words
     """
     try:
         return float(value) in map(float, words)
@@ -159,7 +163,8 @@ def _read_bodies_by_name(path: Path) -> tuple[Tree.Element, dict[str, Tree.Eleme
 
 def _body_from_urdf(inertial: Tree.Element) -> MassProperties:
     """Return the body that an `<inertial>` element of a URDF file describes, in the frame of its
-    link. **Raises:** `ValueError` for numbers that are missing or that no body has.
+    link. **Raises:** `ValueError` for missing numbers, and for a mass or moments that no real body
+    can have.
     """
     origin, mass, inertia = (inertial.find(tag) for tag in ("origin", "mass", "inertia"))
     if mass is None or inertia is None:
@@ -174,8 +179,9 @@ def _body_from_urdf(inertial: Tree.Element) -> MassProperties:
 
 def _body_from_mujoco(inertial: Tree.Element) -> MassProperties:
     """Return the body that an `<inertial>` element of a MuJoCo file describes, in the frame of the
-    file's body. **Raises:** `ValueError` for numbers that are missing or that no body has, and for
-    an orientation that is no quaternion.
+    file's body. **Raises:** `ValueError` for missing numbers, for a mass or moments that no real
+    body can have, and for an orientation that is not given as a quaternion (`quat`), but as Euler
+    angles or axes.
     """
     other = [key for key in ("axisangle", "xyaxes", "zaxis", "euler") if key in inertial.attrib]
     if other:
@@ -195,13 +201,15 @@ def _body_from_parts(
     mass: float, place: np.ndarray, turn: ArrayLike, entries: Sequence[float] | np.ndarray
 ) -> MassProperties:
     """Return a body from the numbers of a robot description. **Raises:** `ValueError` for a mass
-    that is not positive or moments that no body has; a violation of the triangle inequality by
-    rounding (1e-6) is corrected.
+    that is not positive, and for moments that no real body can have. If the moments break the
+    triangle inequality I1 + I2 ≥ I3 only by rounding (about 1e-6 of I3), they are corrected.
 
     - `mass`: kg
     - `place`: (3,) m, the centre of mass in the body frame
-    - `turn`: (3, 3), the rotation matrix from the frame of the inertia to the body frame
-    - `entries`: six numbers of the inertia about the centre of mass, kg m²: xx, yy, zz, xy, xz, yz
+    - `turn`: (3, 3), the rotation matrix from the frame in which the inertia is given to the body
+      frame
+    - `entries`: six entries of the inertia tensor about the centre of mass, kg m²: xx, yy, zz, xy,
+      xz, yz
     """
     xx, yy, zz, xy, xz, yz = entries
     turn = np.asarray(turn, float)

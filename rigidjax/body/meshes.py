@@ -186,5 +186,7 @@ def faces_of(faces: Any, n: int) -> Array:
 
 
 def _ints(numbers: Iterable[Any]) -> tuple[int, ...]:
-    """Return the integers as a tuple of Python, for messages."""
+    """Return the integers `numbers` as a tuple of Python integers, which messages show without a
+    dtype.
+    """
     return tuple(int(k) for k in numbers)

@@ -189,8 +189,9 @@ def flat_bend(
 
 
 def _second_moment_from_shape(shape: Float[Array, "5"]) -> Mat3:
-    """Return the second moment (3, 3), scaled to trace 1, that five unconstrained numbers describe:
-    (1 + V)²/Tr (1 + V)² with a symmetric matrix V of trace zero.
+    """Return the second moment (3, 3) of a body, scaled to trace 1, that five unconstrained numbers
+    describe: (1 + V)²/Tr (1 + V)², where V is a symmetric matrix of trace zero, and 1 the unit
+    matrix.
 
     - `shape`: (5,), the entries V₁₁, V₂₂, V₁₂, V₂₃, V₁₃
     """
@@ -204,20 +205,22 @@ def _second_moment_from_shape(shape: Float[Array, "5"]) -> Mat3:
 
 def _root_from_shape(shape: Float[Array, "5"]) -> Mat3:
     """Return the symmetric matrix 1 + V (3, 3), of trace 3, whose square is proportional to a
-    second moment.
+    second moment; 1 is the unit matrix.
 
-    - `shape`: (5,), the entries V₁₁, V₂₂, V₁₂, V₂₃, V₁₃ of V, whose trace is zero
+    - `shape`: (5,), the entries V₁₁, V₂₂, V₁₂, V₂₃, V₁₃ of the symmetric matrix V, whose trace is
+      zero
     """
     d1, d2, s12, s23, s13 = shape
     return from_components(1.0 + d1, 1.0 + d2, 1.0 - d1 - d2, s12, s13, s23)
 
 
 def _pack_second_moment(s: Mat3) -> Float[Array, "6"]:
-    """Return six unconstrained numbers that describe a second moment: (ρ, V₁₁, V₂₂, V₁₂, V₂₃, V₁₃)
-    with s = 3 e^{2ρ} (1 + V)²/Tr (1 + V)², where V is symmetric and has the trace zero. **Raises:**
-    `ValueError` for a matrix that is zero, or not symmetric and positive semi-definite.
+    """Return six unconstrained numbers that describe a second moment s: (ρ, V₁₁, V₂₂, V₁₂, V₂₃,
+    V₁₃) with s = 3 e^{2ρ} (1 + V)²/Tr (1 + V)², where V is a symmetric matrix of trace zero, and 1
+    the unit matrix. **Raises:** `ValueError` for a matrix that is zero, or that is not symmetric
+    and positive semi-definite.
 
-    - `s`: (3, 3), kg m² or any other unit, the second moment 𝔖 = ∫ r rᵀ dm
+    - `s`: (3, 3), kg m² or any other unit, the second moment ∫ r rᵀ dm of a body
     """
     total = _require_positive_trace(s[0, 0] + s[1, 1] + s[2, 2])
     root = _square_root(_divide_large(require_real_second_moment(s), total))
@@ -228,9 +231,11 @@ def _pack_second_moment(s: Mat3) -> Float[Array, "6"]:
 
 @jax.custom_jvp
 def _square_root(s: Mat3) -> Mat3:
-    """Return the symmetric, positive semi-definite square root A of a second moment s (3, 3), any
-    unit: A A = s. Its derivative is finite also at equal eigenvalues, where the eigenvectors have
-    none.
+    """Return the symmetric, positive semi-definite square root A (3, 3) of a second moment s: A
+    A = s. The derivative of A is finite also if eigenvalues of s are equal, where the eigenvectors
+    of s have no derivative.
+
+    - `s`: (3, 3), any unit
     """
     values, axes = eigensystem(s)
     return product(axes * jnp.sqrt(jnp.maximum(values, 0.0))[None], axes.T)
@@ -255,21 +260,23 @@ def _require_positive_trace(trace: Scalar) -> Scalar:
 
 
 def _divide_large(numerator: Array, denominator: Scalar) -> Array:
-    """Return the quotient `numerator / denominator`, correct also for a large denominator: both are
-    divided by 4 first.
+    """Return the quotient `numerator / denominator`, correct also for a large denominator: before
+    the division both are multiplied by ¼.
 
-    XLA multiplies by the reciprocal of the denominator, and the reciprocal of the second moment of
-    the Earth is zero in float32.
+    XLA multiplies by the reciprocal of the denominator. Without the factor ¼, the reciprocal of the
+    second moment of the Earth would be zero in float32.
     """
     return (0.25 * numerator) / (0.25 * denominator)
 
 
 def _limit_exponent(exponent: Array, bend: Callable[[Array], Array] = jnp.log1p) -> Array:
-    """Return an exponent that `exp` can take without overflow: unchanged within the range of the
-    dtype (±330 in float64, ±31 in float32), and beyond it the limit plus `bend` of the excess.
+    """Return an exponent x that `exp` can take without overflow. If |x| is at most a limit (330 in
+    float64, 31 in float32), x is unchanged; beyond the limit the result is the limit plus
+    `bend`(|x| − limit), with the sign of x.
 
-    - `exponent`: any array of exponents
-    - `bend`: `log1p`, which compresses the excess to a logarithm; or `expm1`, which undoes this
+    - `exponent`: x, any array
+    - `bend`: `log1p`, which compresses what exceeds the limit to a logarithm; or `expm1`, which
+      undoes this
     """
     limit = 31.0 if exponent.dtype == jnp.float32 else 330.0
     beyond = jnp.maximum(jnp.abs(exponent) - limit, 0.0)

@@ -96,8 +96,9 @@ def quadrature(
     cube, weight = jnp.asarray(cube, dtype), jnp.asarray(weight, dtype)
 
     def mass_and_place_at(u: Array) -> tuple[Array, Array]:
-        """Return two things: the mass for each unit of volume of the cube at its point `u` (3,),
-        that is, density times |det ∂r/∂u|, kg; and the place r (3,), m, of this point in the body.
+        """Return two things at the point `u` (3,) of the unit cube, over which the mass of a body
+        is integrated: the mass for each unit of volume of the cube, that is, density times |det
+        ∂r/∂u|, kg; and the place r (3,), m, in the body to which u belongs.
         """
         r = _checks.array_of_shape(place(u), (3,), "place(u)")
         volume = determinant(jax.jacfwd(place)(u))

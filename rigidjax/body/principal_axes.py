@@ -92,9 +92,15 @@ def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
 def _eigensystem_jvp(
     primals: tuple[Mat3], tangents: tuple[Mat3]
 ) -> tuple[tuple[Vec3, Mat3], tuple[Vec3, Mat3]]:
-    """Return the eigenvalues (3,) and eigenvectors (3, 3) of a symmetric matrix, and their
-    derivatives along the change of the matrix in `tangents`, which are finite also at equal
-    eigenvalues: eigenvectors do not turn within a space of equal eigenvalues.
+    """Return two pairs: the eigenvalues (3,) and eigenvectors (3, 3), as columns, of a symmetric
+    matrix A; and their changes for a change dA of the matrix. By this rule JAX differentiates
+    `eigensystem`.
+
+    - `primals`: a tuple of one item, A (3, 3)
+    - `tangents`: a tuple of one item, dA (3, 3)
+
+    The changes are finite also if eigenvalues are equal: two eigenvectors with equal eigenvalues
+    are not turned towards each other.
     """
     (a,), (da,) = primals, tangents
     values, axes = eigensystem(a)
@@ -108,12 +114,12 @@ def _eigensystem_jvp(
 
 def _jacobi_sweep(_: Any, state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
     """Apply three Jacobi rotations to a symmetric 3×3 matrix, each of which makes one entry off the
-    diagonal zero, and return the new `state`: the three diagonal entries; the three entries off the
-    diagonal, number k in the row and the column other than k; and the three axes (the columns of
-    the rotation so far) as triples of scalars.
+    diagonal zero, and return the new state.
 
     - `_`: the number of the sweep, which the loop passes and which is not used
-    - `state`: the state before, in the same form as the new state
+    - `state`: three triples, of the same form as the result: the diagonal entries; the entries
+      (2, 3), (1, 3) and (1, 2) off the diagonal; and the axes, which are the columns of the
+      rotation so far, each as a triple of scalars
     """
     values, opposite, axes = map(list, state)
     for k in range(3):
@@ -198,7 +204,10 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     a = 0.5 * (a + a.T) / unit
 
     def scaled_function(value: Scalar) -> Scalar:
-        """Return f(λ) of one eigenvalue, given as `value` = λ/`unit`."""
+        """Return f(λ), where f is the user's function of one eigenvalue λ of the matrix.
+
+        `value` is λ divided by the number `unit`, by which the whole matrix was divided.
+        """
         return _checks.array_of_shape(function(unit * value), (), "function(λ)", hint="one number")
 
     values, axes = eigensystem(jax.lax.stop_gradient(a))

@@ -175,11 +175,11 @@ def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProper
 
 
 def _checked_lengths(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
-    """Return lengths, m, as an array of the given `shape`. **Raises:** `ValueError` for a known
-    length below zero or NaN.
+    """Return lengths, m, as an array of the given `shape`. **Raises:** `ValueError` for a length
+    that is below zero or NaN, unless JAX traces the lengths.
 
     - `value`: one number or several
-    - `shape`: () or (n,)
+    - `shape`: () for one length, or (n,) for n lengths
     - `name`: the name of the argument, for messages
     """
     lengths = _checks.finite_array(value, shape, name, unit="m")
@@ -190,9 +190,10 @@ def _checked_radii(
     inner: ScalarLike, outer: ScalarLike, names: tuple[str, str] = ("inner", "outer")
 ) -> tuple[Array, Array]:
     """Return two radii, m, as scalar arrays: the inner and the outer. **Raises:** `ValueError` for
-    a known radius below zero, and for a known inner radius above the outer.
+    a radius below zero and for an inner radius above the outer, unless JAX traces the radii.
 
-    - `names`: the names of the two arguments, for messages
+    - `inner`, `outer`: the two radii, m
+    - `names`: the names of these two arguments, for messages
     """
     r, R = _checked_lengths(inner, (), names[0]), _checked_lengths(outer, (), names[1])
     if _checks.is_known((r, R)):

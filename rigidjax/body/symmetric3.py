@@ -30,8 +30,11 @@ def inverse(a: Mat3) -> Mat3:
 
 @inverse.defjvp
 def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
-    """Return the inverse of a symmetric 3×3 matrix A, and its derivative −A⁻¹ dA A⁻¹ along the
-    change dA in `tangents`.
+    """Return the inverse (3, 3) of a symmetric matrix A, and its change −A⁻¹ dA A⁻¹ for a change dA
+    of the matrix. By this rule JAX differentiates `inverse`.
+
+    - `primals`: a tuple of one item, A (3, 3)
+    - `tangents`: a tuple of one item, dA (3, 3)
     """
     (a,), (da,) = primals, tangents
     out = inverse(a)

@@ -164,11 +164,11 @@ def first_impossible_row(tensors: Float[Array, "n 3 3"]) -> Any:
 
 
 def _are_not_of_a_body(xp: ModuleType, tensors: Array | np.ndarray) -> Any:
-    """Return, for each matrix of a stack, whether it is not the inertia tensor of a body without a
-    zero moment, (...), of truth values; false for a matrix with a NaN.
+    """Return a truth value for each matrix of a stack, (...): true if the matrix cannot be the
+    inertia tensor of a body, or if it has a principal moment of zero; false if it has an entry NaN.
 
     - `xp`: the module that computes, `numpy` or `jax.numpy`
-    - `tensors`: (..., 3, 3) kg m²
+    - `tensors`: (..., 3, 3) kg m², the matrices
     """
     flat, broken, skew = _faults(xp, tensors, allow_thin=False)
     return (flat | broken | skew) & ~xp.isnan(xp.asarray(tensors)).any(axis=(-1, -2))
@@ -191,14 +191,14 @@ _THIN = (
 
 def _faults(xp: ModuleType, tensor: Array | np.ndarray, allow_thin: bool) -> tuple[Any, Any, Any]:
     """Return three truth values (...) for each inertia tensor: whether a principal moment is zero
-    or NaN; whether no real body has its principal moments; and whether it is not symmetric.
+    or NaN; whether no real body can have its principal moments; and whether it is not symmetric.
 
-    The second answer comes from the minors (subdeterminants) of the second moment 𝔖 = ½ Tr(I) 1 − I
+    The second value comes from the minors (subdeterminants) of the second moment 𝔖 = ½ Tr(I) 1 − I
     divided by the trace of I: a real body has an 𝔖 that is positive semi-definite.
 
     - `xp`: the module that computes, `numpy` or `jax.numpy`
-    - `tensor`: (..., 3, 3) kg m²
-    - `allow_thin`: whether a moment may be zero; the first answer is then always false
+    - `tensor`: (..., 3, 3) kg m², the inertia tensors
+    - `allow_thin`: whether a moment may be zero; if true, the first value is always false
     """
     slack = _round_off_bound(tensor)
     # The nine entries are split by one operation: NumPy needs a tenth of the time of nine slices.
@@ -298,15 +298,15 @@ def _require_symmetric(a: Any, name: str) -> Any:
 
 
 def _without_derivatives(a: Any) -> Any:
-    """Return the array `a` as constants, whose derivatives are zero; as an array of NumPy if the
-    numbers are known, so that a check costs microseconds.
+    """Return the array `a` as constants, whose derivatives are zero: as an array of JAX if JAX
+    traces it, else as an array of NumPy, with which a check takes only microseconds.
     """
     return np.asarray(a) if _checks.is_known(a) else lax.stop_gradient(a)
 
 
 def _eigenvalues(a: Any) -> Any:
     """Return the eigenvalues (..., 3), ascending, of symmetric matrices `a` (..., 3, 3), as
-    constants in derivatives; by NumPy if the numbers are known.
+    constants whose derivatives are zero. NumPy computes them unless JAX traces the matrices.
     """
     if _checks.is_known(a):
         return np.linalg.eigvalsh(np.asarray(a))
@@ -323,8 +323,9 @@ def _round_off_bound(a: Any) -> float:
 
 
 def _moments_as_text(moments: Any) -> str:
-    """Return principal moments as a text for messages, such as "(1, 2, 3)"; of a batch (n, 3), the
-    first three rows.
+    """Return principal moments as a text for messages, such as "(1, 2, 3)".
+
+    - `moments`: (3,) kg m², or (n, 3) for n bodies, of which the first three are shown
     """
     return "; ".join(
         "(" + ", ".join(f"{float(x):.6g}" for x in row) + ")"

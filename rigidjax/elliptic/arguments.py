@@ -76,10 +76,11 @@ def exact_complement(value: RealOrArray, complement: RealOrArray) -> Any:
 def _exact_complement_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
-    """Return the value of `exact_complement` (`value` as a function of `complement` = 1 − `value`)
-    and its tangent.
+    """Return two things: a number x as a function of its complement 1 − x alone; and its tangent
+    (the change in a derivative), which is −1 times the tangent of the complement. By this rule JAX
+    differentiates `exact_complement`.
 
-    JAX differentiates `exact_complement` by this rule. The tangent of the value is −1 times the
-    tangent of `complement`. `primals` and `tangents` are two pairs: of `value` and of `complement`.
+    - `primals`: the pair of x and 1 − x, two numbers or arrays.
+    - `tangents`: the pair of their tangents; the tangent of x is not used.
     """
     return exact_complement(*primals), -tangents[1]

@@ -91,10 +91,12 @@ def rc(x: Real, y: Real) -> RealOrArray:
 
 @jax.custom_jvp
 def _rf(arguments: tuple[Array, ...]) -> Array:
-    """Return Carlson's integral of the first kind, R_F(x, y, z), by duplication (DLMF 19.36.1).
+    """Return Carlson's integral of the first kind, R_F(x, y, z) = ½ ∫₀^∞
+    dt/√((t + x)(t + y)(t + z)), by duplication (DLMF 19.36.1).
 
-    `arguments` are x, y and z: three arrays of one shape and dtype, ≥ 0, at most one of them 0. Two
-    zeros give infinity, a negative argument gives NaN.
+    - `arguments`: x, y and z, three arrays of one shape and dtype, ≥ 0, of which at most one is 0.
+
+    If two of them are 0, the result is infinite; if one of them is negative, the result is NaN.
     """
     scale = scale_of(arguments)
     x, y, z = (a / scale for a in arguments)
@@ -113,8 +115,13 @@ def _rf(arguments: tuple[Array, ...]) -> Array:
 
 @partial(_rf.defjvp, symbolic_zeros=True)
 def _rf_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
-    """Return R_F and its tangent, from ∂R_F/∂z = −R_D(x, y, z)/6 for each argument in the place of
-    z (DLMF 19.18.1): the rule by which JAX differentiates R_F.
+    """Return Carlson's integral R_F(x, y, z) and its tangent (its change for a change of the
+    arguments), from ∂R_F/∂z = −R_D(x, y, z)/6 and the same formula with x or y in the place of z
+    (DLMF 19.18.1). By this rule JAX differentiates R_F.
+
+    - `primals`: a tuple of one item, the three arguments x, y, z.
+    - `tangents`: a tuple of one item, the three changes of the arguments; a change that is known to
+      be zero is a `SymbolicZero`.
     """
     (a,), (directions,) = primals, tangents
     tangent = jnp.zeros_like(a[0])
@@ -126,10 +133,14 @@ def _rf_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[
 
 @jax.custom_jvp
 def _rd(arguments: tuple[Array, ...]) -> Array:
-    """Return Carlson's integral of the second kind, R_D(x, y, z), by duplication (DLMF 19.36.2).
+    """Return Carlson's integral of the second kind, R_D(x, y, z) = (3/2) ∫₀^∞ dt/((t + z)
+    √((t + x)(t + y)(t + z))), by duplication (DLMF 19.36.2).
 
-    `arguments` are x, y and z: three arrays of one shape and dtype, ≥ 0, at most one of x and y 0.
-    The result is infinite if z = 0 or x = y = 0, and NaN for a negative argument.
+    - `arguments`: x, y and z, three arrays of one shape and dtype, ≥ 0; z > 0, and at most one of x
+      and y is 0.
+
+    If z = 0 or x = y = 0, the result is infinite; if one of the three is negative, the result is
+    NaN.
     """
     scale = scale_of(arguments)
     x, y, z = (a / scale for a in arguments)
@@ -157,8 +168,14 @@ def _rd(arguments: tuple[Array, ...]) -> Array:
 
 @partial(_rd.defjvp, symbolic_zeros=True)
 def _rd_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
-    """Return R_D and its tangent, a sum of integrals of the same kind, each with one exponent
-    raised by 1: the rule by which JAX differentiates R_D.
+    """Return Carlson's integral R_D(x, y, z) and its tangent (its change for a change of the
+    arguments). With R_D = (3/2) ∫₀^∞ (t + x)^{−1/2} (t + y)^{−1/2} (t + z)^{−3/2} dt, the tangent
+    is a sum of integrals of this kind, in each of which the power of one factor is lower by 1. By
+    this rule JAX differentiates R_D.
+
+    - `primals`: a tuple of one item, the three arguments x, y, z.
+    - `tangents`: a tuple of one item, the three changes of the arguments; a change that is known to
+      be zero is a `SymbolicZero`.
     """
     (arguments,), (directions,) = primals, tangents
     return _rd(arguments), 1.5 * directional_derivative((0.5, 0.5, 1.5), arguments, directions)
@@ -173,10 +190,10 @@ def _duplication_shift(x: Array, y: Array, z: Array) -> Array:
 
 
 def _value_in_domain(value: Array, arguments: tuple[Array, ...]) -> Array:
-    """Return the value of a Carlson integral, but infinity where two of its arguments are 0, and
-    NaN where one is negative or NaN.
+    """Return the value of a Carlson integral, with infinity in place of it where two or three of
+    the arguments are 0, and NaN where an argument is negative or NaN.
 
-    - `value`: the value that was computed without a look at the domain.
+    - `value`: the array of values, computed without regard to these cases.
     - `arguments`: the three arguments of the integral, arrays of the shape of `value`.
     """
     x, y, z = (a == 0 for a in arguments)

@@ -75,8 +75,14 @@ def r_integral(powers: tuple[float, ...], arguments: tuple[RealOrArray, ...]) ->
 def _r_integral_jvp(
     powers: tuple[float, ...], primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
-    """Return the value of `r_integral` and its tangent, in which each power is raised by 1 in turn:
-    the rule by which JAX differentiates `r_integral`.
+    """Return the integral H = ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt and its tangent (its change for a change of
+    the arguments aᵢ), from ∂H/∂aᵢ = −bᵢ H, with bᵢ + 1 in place of bᵢ on the right. By this rule
+    JAX differentiates `r_integral`.
+
+    - `powers`: the numbers bᵢ, multiples of ½.
+    - `primals`: a tuple of one item, the arguments aᵢ, arrays of one shape.
+    - `tangents`: a tuple of one item, the changes of the aᵢ; a change that is known to be zero is a
+      `SymbolicZero`.
     """
     (arguments,), (directions,) = primals, tangents
     return r_integral(powers, arguments), directional_derivative(powers, arguments, directions)
@@ -121,11 +127,13 @@ def scale_of(arguments: tuple[Array, ...]) -> Array:
 
 
 def _divide_by_power(value: Array, base: Array, power: float) -> Array:
-    """Return `value` / `base`^`power`, where `value` and `base` are arrays and `power` is a
-    multiple of ½.
+    """Return `value` / `base`^`power`.
 
-    The value is divided by one factor `base` or √`base` after the other; if `power` is negative, it
-    is multiplied by these factors.
+    - `value`, `base`: two arrays.
+    - `power`: a multiple of ½, of either sign.
+
+    The power is taken as repeated factors: 1/`base` for a whole number, else 1/√`base`. If `power`
+    is negative, the factors are `base` and √`base`.
     """
     whole = math.floor(power)
     if power > whole:

@@ -79,14 +79,15 @@ def am(u: Real, m: Real, m1: Real | None = None) -> RealOrArray:
 
 
 def _functions_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array, Array]:
-    """Return four arrays: Jacobi's elliptic functions sn, cn and dn for any real parameter, and the
-    number of half turns in the amplitude.
+    """Return four arrays: Jacobi's elliptic functions sn(u|m), cn(u|m) and dn(u|m) for any real
+    parameter m; and the whole number n of half turns in the amplitude φ (the angle with sin φ = sn
+    and cos φ = cn), so that φ − nπ lies between −π/2 and π/2.
 
     - `u`: the argument.
-    - `m`: the parameter.
+    - `m`: the parameter, the square of the modulus.
     - `m1`: 1 − m.
 
-    For m > 1, where the amplitude oscillates, the number of half turns is 0.
+    For m > 1, where the amplitude oscillates about 0, n is 0.
     """
     # By DLMF 22.17.2–4, m > 1 becomes 1/m, and cn and dn change places.
     above = m1 < 0
@@ -103,11 +104,12 @@ def _functions_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Array, Arr
 
 @jax.custom_jvp
 def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
-    """Return Jacobi's elliptic functions sn, cn and dn for a parameter m ≤ 1, three arrays.
+    """Return Jacobi's elliptic functions sn(u|m), cn(u|m) and dn(u|m) for a parameter m ≤ 1, three
+    arrays.
 
     - `u`: the argument.
-    - `m`: the parameter, which must be 1 − m1. Derivatives are taken with respect to u and m1
-      alone.
+    - `m`: the parameter, the square of the modulus; it must equal 1 − m1. Derivatives are taken
+      with respect to u and m1 alone.
     - `m1`: 1 − m.
     """
     turns, angle, rows = _reduce_argument(u, m1)
@@ -143,8 +145,13 @@ def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
 
 @partial(_sncndn.defjvp, symbolic_zeros=True)
 def _sncndn_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
-    """Return sn, cn and dn and their tangents for changes of u and m1; the tangent of m is ignored
-    because m is 1 − m1. This is the rule by which JAX differentiates the three functions.
+    """Return two triples: Jacobi's elliptic functions sn, cn and dn; and their tangents (their
+    changes) for changes of the argument u and of 1 − m, where m is the parameter. By this rule JAX
+    differentiates the three functions.
+
+    - `primals`: u, m and 1 − m.
+    - `tangents`: the changes of these three; the change of m is not used, because m is determined
+      by 1 − m. A change that is known to be zero is a `SymbolicZero`.
     """
     (u, m, m1), (du, _, dm1) = primals, tangents
     s, c, d = _sncndn(u, m, m1)
@@ -160,10 +167,12 @@ def _sncndn_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tu
 
 @jax.custom_jvp
 def _derivatives_by_m(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
-    """Return the derivatives of Jacobi's functions sn, cn and dn with respect to the parameter m at
-    a fixed argument u, three arrays.
+    """Return the derivatives of Jacobi's functions sn(u|m), cn(u|m) and dn(u|m) with respect to the
+    parameter m at a fixed argument u, three arrays.
 
-    `m` ≤ 1 must be 1 − `m1`.
+    - `u`: the argument.
+    - `m`: the parameter, the square of the modulus, ≤ 1; it must equal 1 − m1.
+    - `m1`: 1 − m.
     """
     return _derivatives_from_integral(u, m, m1)
 
@@ -172,8 +181,13 @@ def _derivatives_by_m(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Arra
 def _derivatives_by_m_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
-    """Return the derivatives of sn, cn and dn with respect to m, and their tangents: the rule by
-    which JAX takes second derivatives of the three functions.
+    """Return two triples: the derivatives of Jacobi's functions sn, cn and dn with respect to the
+    parameter m; and the tangents (the changes) of these derivatives for changes of the argument u
+    and of 1 − m. By this rule JAX takes second derivatives of the three functions.
+
+    - `primals`: u, m and 1 − m.
+    - `tangents`: the changes of these three; the change of m is not used, because m is determined
+      by 1 − m. A change that is known to be zero is a `SymbolicZero`.
     """
     (u, m, m1), (du, _, dm1) = primals, tangents
     sm, cm, dm = slopes = _derivatives_by_m(u, m, m1)
@@ -202,13 +216,15 @@ def _derivatives_by_m_jvp(
 
 
 def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
-    """Return the derivatives of Jacobi's functions sn, cn and dn with respect to the parameter m at
-    a fixed argument u, from the derivative dn X of the amplitude φ with respect to m.
+    """Return the derivatives of Jacobi's functions sn(u|m), cn(u|m) and dn(u|m) with respect to the
+    parameter m at a fixed argument u, three arrays.
 
     - `u`: the argument.
-    - `m`, `m1`: the parameter m ≤ 1, and 1 − m.
+    - `m`, `m1`: the parameter m ≤ 1 (the square of the modulus), and 1 − m.
 
-    Here X = −½ ∫₀^u sd²(v) dv. Carlson's integral R_D gives X for u reduced by half periods.
+    They follow from ∂φ/∂m = X dn for the amplitude φ (the angle with sin φ = sn and cos φ = cn),
+    where X = −½ ∫₀^u sd²(v) dv and sd = sn/dn. Carlson's integral R_D gives X, after whole half
+    periods are taken off u.
     """
     s, c, d = _sncndn(u, m, m1)
     turns = _reduce_argument(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
@@ -226,11 +242,14 @@ def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Array, Ar
 
 
 def _reduce_argument(u: Array, m1: Array) -> tuple[Array, Array, list[tuple[Array, Array]]]:
-    """Return three things for the argument u = 2Kn + r of Jacobi's functions, where 2K is the half
-    period: the number n of half periods; the angle πr/(2K), rad; and the pairs of arithmetic and
-    geometric means of 1 and √m1, in the order of the iteration.
+    """Return three things about the argument u of Jacobi's functions of parameter m, written as
+    u = 2Kn + r with |r| ≤ K, where 2K is the half period: the whole number n; the angle πr/(2K),
+    rad; and the list of pairs of arithmetic and geometric means that starts from 1 and √m1 and ends
+    at their common limit π/(2K).
 
-    `m1` is 1 − m. For m1 = 0 the half period is infinite, and n is 0.
+    - `u`: the argument.
+    - `m1`: 1 − m. For m1 = 0 the half period is infinite, n is 0, and the other two results mean
+      nothing.
     """
     rows = mean_iterates(jnp.where(m1 == 0, 1, m1))
     turns, angle = split_half_turns(u * rows[-1][0])

@@ -72,10 +72,14 @@ def sncndn_near_one(
 
 @jax.custom_jvp
 def _power_times_exp(base: Array, exponent: Array, power: Array) -> Array:
-    """Return `base`^`power` e^`exponent`, with exact derivatives with respect to `base` > 0.
+    """Return p^n e^y, with exact derivatives with respect to p and y.
 
-    `power` is a whole number. For `power` = 1 the second derivative with respect to `base` is
-    exactly 0; if JAX differentiated exp(exponent + power ln base), round-off would be left.
+    - `base`: p > 0.
+    - `exponent`: y.
+    - `power`: n, a whole number.
+
+    For n = 1 the second derivative with respect to p is exactly 0; if JAX differentiated
+    e^(y + n ln p) instead, an error of round-off would be left.
     """
     return jnp.exp(exponent + jnp.where(power == 0, 0, power * jnp.log(base)))
 
@@ -84,8 +88,11 @@ def _power_times_exp(base: Array, exponent: Array, power: Array) -> Array:
 def _power_times_exp_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
-    """Return the value of `_power_times_exp` and its tangent for changes of `base` and `exponent`:
-    the rule by which JAX differentiates this function.
+    """Return p^n e^y and its tangent (its change) for changes of p and y: the rule by which JAX
+    differentiates `_power_times_exp`.
+
+    - `primals`: p > 0, y and the whole number n.
+    - `tangents`: the changes of these three; the change of n is not used.
     """
     (p, y, n), (dp, dy, _) = primals, tangents
     value = _power_times_exp(p, y, n)

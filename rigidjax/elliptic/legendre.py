@@ -169,8 +169,15 @@ def incomplete_integral(
 def _incomplete_integral_jvp(
     orders: tuple[int, int, int], primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
-    """Return the value of `incomplete_integral` and its tangent, from the formula for dI_jkl in the
-    head of this module: the rule by which JAX differentiates the integral.
+    """Return Legendre's incomplete integral I_jkl(φ, m, n) = ∫₀^φ sin^{2j}θ Δ^{−(2k+1)}
+    (1 − n sin²θ)^{−l} dθ, with Δ = √(1 − m sin²θ), and its tangent (its change). By this rule JAX
+    differentiates `incomplete_integral`.
+
+    - `orders`: the three whole numbers (j, k, l).
+    - `primals`: sin φ, cos φ, 1 − m and 1 − n.
+    - `tangents`: the changes of these four; a change that is known to be zero is a `SymbolicZero`.
+
+    The tangent is dI_jkl = [integrand at φ] dφ + (k + ½) I_{j+1,k+1,l} dm + l I_{j+1,k,l+1} dn.
     """
     j, k, last = orders
     s, c, m1, n1 = primals
@@ -219,8 +226,10 @@ def mean_iterates(m1: Array) -> list[tuple[Array, Array]]:
 
 @jax.custom_jvp
 def _complete_first_kind(m1: Array) -> Array:
-    """Return Legendre's complete integral of the first kind, K = π/(2 agm(1, √m1)), where m1 = 1 −
-    m and agm is the arithmetic–geometric mean; K is infinite for m1 = 0.
+    """Return Legendre's complete integral of the first kind, K(m) = ∫₀^{π/2}
+    dθ/√(1 − m sin²θ) = π/(2 agm(1, √m1)), where agm is the arithmetic–geometric mean.
+
+    - `m1`: 1 − m, where m is the parameter; K is infinite for m1 = 0.
     """
     a, b = mean_iterates(m1)[-1]
     return jnp.where(m1 == 0, jnp.inf, math.pi / (a + b))
@@ -230,7 +239,12 @@ def _complete_first_kind(m1: Array) -> Array:
 def _complete_first_kind_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
-    """Return K and its tangent for a change of m1: the rule by which JAX differentiates K."""
+    """Return Legendre's complete integral of the first kind K(m) and its tangent (its change) for a
+    change of 1 − m: the rule by which JAX differentiates K.
+
+    - `primals`: a tuple of one item, 1 − m.
+    - `tangents`: a tuple of one item, the change of 1 − m.
+    """
     (m1,), (dm1,) = primals, tangents
     return _complete_first_kind(m1), -0.5 * complete_integral((1, 1, 0), m1) * dm1
 
@@ -269,16 +283,16 @@ def _incomplete_second_kind(
 def _integral_at_any_amplitude(
     orders: tuple[int, int, int], phi: Array, m1: Array, n1: Array | None = None
 ) -> Array:
-    """Return Legendre's incomplete integral I_jkl(φ, m, n) = ∫₀^φ sin^{2j}θ Δ^{−(2k+1)} (1 − n
-    sin²θ)^{−l} dθ, with Δ = √(1 − m sin²θ), for an amplitude φ of any size.
+    """Return Legendre's incomplete integral I_jkl(φ, m, n) = ∫₀^φ sin^{2j}θ Δ^{−(2k+1)}
+    (1 − n sin²θ)^{−l} dθ, with Δ = √(1 − m sin²θ), for an amplitude φ of any size.
 
     - `orders`: the three whole numbers (j, k, l).
     - `phi`: the amplitude φ, rad.
     - `m1`: 1 − m.
     - `n1`: 1 − n, or None for n = 0.
 
-    Let φ be i π + r with a whole number i. The complete integral gives the part of i π, and the
-    sine and cosine of r give the part of r.
+    With φ = iπ + r, for a whole number i and |r| ≤ π/2, the integral is 2i times the complete
+    integral (that from 0 to π/2) plus the integral from 0 to r.
     """
     turns, remainder = split_half_turns(phi)
     n1 = jnp.ones_like(m1) if n1 is None else n1

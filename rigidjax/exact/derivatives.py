@@ -95,8 +95,13 @@ def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
 
 @flow.defjvp
 def _flow_jvp(primals, tangents):
-    """Return the value of `flow` and its change for a change of the inputs: the rule by which JAX
-    differentiates `flow`.
+    """Return two pairs: the body momentum Π(t) of a free body and the quaternion of its rotation
+    from time 0 to t, both along the principal axes, as `flow` gives them; and the changes of these
+    two for a change of the inputs. By this rule JAX differentiates `flow`.
+
+    - `primals`: the three inputs of `flow`: the six entries (11, 22, 33, 12, 13, 23) of the inertia
+      tensor in principal axes, the three components of Π(0), and the time t.
+    - `tangents`: the changes of these three inputs, in the same form.
     """
     motion, rows, _ = motion_and_derivatives(*primals)
     d_out, d_turn, _ = _change_of_motion(motion, rows, _variables_and_changes(primals, tangents)[3])
@@ -104,17 +109,19 @@ def _flow_jvp(primals, tangents):
 
 
 def _variables_and_changes(primals: tuple, tangents: tuple) -> tuple:
-    """Return four things that the derivative rules of a free motion share: the inverse inertia
-    tensor and energy; the change of these; the ten variables of all derivatives; and the change of
-    these.
+    """Return four things that the derivative rules of a free motion share: three values that follow
+    from the inputs, (differences, K, E₂); the changes of these three values; the ten variables
+    (10,) with respect to which all derivatives are taken; and the changes (10,) of the ten
+    variables.
 
-    - `primals`: the three values (entries of the inertia tensor, body momentum Π(0), time t), as
-      for `flow`.
-    - `tangents`: the changes of these three values.
+    - `primals`: the three inputs: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in
+      principal axes, the three components of the body momentum Π(0), and the time t.
+    - `tangents`: the changes of these three inputs, in the same form.
 
-    The first result is that of `inverse_inertia_and_energy`. The ten variables are d12, d23, k12,
-    k13, k23, Π(0), k33 and t, where kij are the entries of the inverse inertia tensor,
-    dij = kii − kjj, and Π(0) (3,) is the body momentum at the start.
+    K is the inverse of the inertia tensor, given by six entries; `differences` are the differences
+    d12, d13, d23 of its diagonal entries (dij = kii − kjj) with its off-diagonal entries; and
+    E₂ = Π·KΠ is twice the energy. The ten variables are d12, d23, k12, k13, k23, the three of Π(0),
+    k33 and t.
     """
     reciprocals, changes = jax.jvp(inverse_inertia_and_energy, primals[:2], tangents[:2])
     return (
@@ -128,14 +135,17 @@ def _variables_and_changes(primals: tuple, tangents: tuple) -> tuple:
 def _change_of_motion(
     motion: Motion, derivative_rows: "MotionDerivatives", change: Float[Array, "10"]
 ) -> Motion:
-    """Return three changes, of the body momentum Π(t), of the quaternion of the rotation from time
-    0 to t, and of the body rate Ω(t), for a change of the ten `derivative_variables`.
+    """Return the changes of the body momentum Π(t) of a free body, of the quaternion of its
+    rotation from time 0 to t, and of its body rate Ω(t), for a given change of the ten variables.
 
     - `motion`: the triple of Π(t), the quaternion and Ω(t).
-    - `derivative_rows`: the derivatives of Π(t), θ and Ω(t) with respect to the ten variables,
-      where θ is the small rotation vector that changes the rotation; three arrays (10,) for each
-      vector.
-    - `change`: (10,) the change of the variables.
+    - `derivative_rows`: the derivatives of the three vectors Π(t), θ and Ω(t), where θ is the small
+      rotation vector, in the body frame, by which the rotation changes; for each vector three
+      arrays (10,), one for each component, with the derivative with respect to each of the ten
+      variables.
+    - `change`: (10,) the change of the variables: of d12, d23, k12, k13, k23, of the three
+      components of Π(0), of k33 and of t, where kij are the entries of the inverse K of the inertia
+      tensor in principal axes, and dij = kii − kjj.
     """
     out, theta, rate = (tuple(jnp.sum(row * change) for row in three) for three in derivative_rows)
     return out, half_product(motion[1], theta), rate
@@ -187,8 +197,14 @@ def body_motion(
 
 @body_motion.defjvp
 def _body_motion_jvp(primals, tangents):
-    """Return the value of `body_motion` and its change for a change of the inputs: the rule by
-    which JAX differentiates `body_motion`.
+    """Return two pairs: the body rate Ω(t) of a free body and the quaternion of its rotation from
+    time 0 to t, both in the body frame, as `body_motion` gives them; and the changes of these two
+    for a change of the inputs. By this rule JAX differentiates `body_motion`.
+
+    - `primals`: the four inputs of `body_motion`: the inertia tensor (3, 3), the body rate Ω(0)
+      (3,), the constants of the motion, and the time t, one or (n,) times.
+    - `tangents`: the changes of these four inputs, in the same form; the change of the constants is
+      not used.
     """
     tensor, omega, constants, t = primals
     d_tensor, d_omega, _, d_t = tangents
@@ -212,8 +228,14 @@ def _body_motion_jvp(primals, tangents):
 
 @functools.partial(jnp.vectorize, signature="(n),(m)->(n)")
 def _quaternion_change(turn: Quat, theta: Vec3) -> Quat:
-    """Return the change ½ q ⊗ (0, θ) of the unit quaternion q = `turn` if the rotation is followed
-    by a small rotation with the rotation vector θ = `theta`, body frame.
+    """Return the change ½ q ⊗ (0, θ) (4,) of a unit quaternion q for a small change of its
+    rotation.
+
+    - `turn`: q (4,), (w, x, y, z).
+    - `theta`: θ (3,), rad, body frame, the rotation vector of a small rotation of the body after
+      the rotation q.
+
+    Arrays (…, 4) and (…, 3) are combined pair by pair.
     """
     return jnp.stack(half_product(components(turn), components(theta)))
 
@@ -232,10 +254,12 @@ def _at_each_time(function: Callable[[Scalar], Any], t: Float[Array, "*n"]) -> A
 
 @compiled_as_one_kernel
 def _body_motion_at(constants: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
-    """Return two things at the time t, both in the body frame: the body rate Ω(t) of a free body;
-    and the quaternion of its rotation from time 0 to t.
+    """Return two things at the time t, both in the body frame: the body rate Ω(t) (3,) of a free
+    body; and the quaternion (4,) of its rotation from time 0 to t.
 
-    `constants` are the constants of the motion.
+    - `constants`: the constants of the motion: the principal axes and moments, the momentum at time
+      0, and the numbers from which the closed form is evaluated.
+    - `t`: the time.
     """
     momentum, (w, *axis) = momentum_and_turn(constants.orbit, t)
     rate = tuple(p / i for p, i in zip(momentum, constants.moments, strict=True))
@@ -247,14 +271,14 @@ def _body_motion_at(constants: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
 def _moments_and_momentum(
     tensor: Mat3, omega: Vec3, constants: MotionConstants
 ) -> tuple[Six, Triple]:
-    """Return two things in principal axes, as differentiable functions of the inputs: the six
-    entries (11, 22, 33, 12, 13, 23) of the inertia tensor; and the three components of the body
-    momentum Π(0).
+    """Return two things in principal axes, as differentiable functions of the inertia tensor and
+    the body rate: the six entries (11, 22, 33, 12, 13, 23) of the tensor; and the three components
+    of the body momentum Π(0).
 
     - `tensor`: (3, 3) the inertia tensor, body frame.
     - `omega`: (3,) the body rate at time 0, body frame.
-    - `constants`: the constants of the motion, from which the principal axes are taken. The axes
-      are held fixed in derivatives.
+    - `constants`: the constants of the motion, from which the principal axes and moments are taken.
+      The axes are held fixed in derivatives.
     """
     moments = tensor_in_axes(tensor, constants.axes, constants.moments)
     return moments, matvec(moments, components_along(constants.axes, omega))
@@ -264,12 +288,16 @@ def _moments_and_momentum(
 def _input_derivatives(
     body: Float[Array, "12"], constants: MotionConstants
 ) -> Float[Array, "9 12"]:
-    """Return the derivatives (9, 12) of the first nine of the ten `derivative_variables`, which do
-    not contain the time, with respect to the inertia tensor and the body rate.
+    """Return the derivatives (9, 12) of nine variables of a free motion with respect to the inertia
+    tensor and the body rate.
+
+    The nine variables are d12, d23, k12, k13, k23, the three components of the body momentum Π(0),
+    and k33. Here kij are the entries of the inverse of the inertia tensor, in principal axes, and
+    dij = kii − kjj.
 
     - `body`: (12,) the nine entries of the inertia tensor, then the three of the body rate Ω(0),
       all in the body frame.
-    - `constants`: the constants of the motion, from which the principal axes are taken.
+    - `constants`: the constants of the motion, from which the principal axes and moments are taken.
     """
     tensor, omega, axes = body[:9].reshape(3, 3), body[9:], constants.axes
     moments, momentum = _moments_and_momentum(tensor, omega, constants)
@@ -293,15 +321,19 @@ def _body_motion_and_derivatives(
     tensor: Mat3, omega: Vec3, constants: MotionConstants, t: Scalar
 ) -> tuple[tuple[Vec3, Quat], tuple[Rows, Rows]]:
     """Return two pairs, both in the body frame: the body rate Ω(t) and the quaternion of the
-    rotation from time 0 to t; and the derivatives of Ω(t) and of θ with respect to the ten
-    `derivative_variables`, each as three arrays (10,), one for each component.
+    rotation from time 0 to t of a free body; and the derivatives of Ω(t) and of θ, where θ is the
+    small rotation vector by which the rotation changes, each as three arrays (10,), one for each
+    component.
 
     - `tensor`: (3, 3) the inertia tensor.
     - `omega`: (3,) the body rate Ω(0).
-    - `constants`: the constants of the motion.
+    - `constants`: the constants of the motion: the principal axes and moments, the momentum at time
+      0, and the numbers from which the closed form is evaluated.
     - `t`: the time.
 
-    θ is the small rotation vector that changes the rotation.
+    The derivatives are with respect to ten variables: d12, d23, k12, k13, k23, the three components
+    of the body momentum Π(0), k33 and t, where kij are the entries of the inverse of the inertia
+    tensor, in principal axes, and dij = kii − kjj.
     """
     moments, momentum = _moments_and_momentum(tensor, omega, constants)
     (_, (w, *axis), rate), rows, _ = motion_and_derivatives(moments, momentum, t)
@@ -314,12 +346,14 @@ def _body_motion_and_derivatives(
 
 
 class MotionDerivatives(NamedTuple):
-    """Hold the derivatives of three vectors of a free motion with respect to the ten
-    `derivative_variables`: of the body momentum Π(t), of θ and of the body rate Ω(t), each as three
-    arrays (10,), one for each component.
+    """Hold the derivatives of three vectors of a free motion with respect to ten variables: of the
+    body momentum Π(t), of θ and of the body rate Ω(t), each as three arrays (10,), one for each
+    component.
 
-    θ is the small rotation vector that changes the rotation R of the body from time 0 to t: δR = R
-    hat(θ).
+    The ten variables are d12, d23, k12, k13, k23, the three components of Π(0), k33 and t, where
+    kij are the entries of the inverse of the inertia tensor, in principal axes, and dij = kii − kjj
+    (see `derivative_variables`). θ is the small rotation vector that changes the rotation R of the
+    body from time 0 to t: δR = R hat(θ), where hat(θ) is the matrix of the cross product with θ.
     """
 
     momentum: Rows
@@ -340,8 +374,10 @@ def motion_and_derivatives(
     - `momentum`: the three components of the body momentum Π(0).
     - `t`: the time.
 
-    In the pair, `rows` are the derivatives of Π(t) − Π(0) with respect to the ten
-    `derivative_variables`, as three arrays (10,), and G = ∫ Π Πᵀ dt from 0 to t, as six entries.
+    In the pair, `rows` are the derivatives of Π(t) − Π(0) with respect to ten variables, as three
+    arrays (10,), and G = ∫ Π Πᵀ dt from 0 to t, as six entries. The ten variables are d12, d23,
+    k12, k13, k23, the three components of Π(0), k33 and t, where kij are the entries of the inverse
+    of the inertia tensor and dij = kii − kjj (see `derivative_variables`).
     """
     (out, turn), rows, g = _flow_and_first_derivatives(
         orbit(moments[:3], momentum), moments, momentum, t
@@ -355,8 +391,14 @@ def motion_and_derivatives(
 # tensor: this function is smooth to any order.
 @motion_and_derivatives.defjvp
 def _motion_and_derivatives_jvp(primals, tangents):
-    """Return the value of `motion_and_derivatives` and its change for a change of the inputs: the
-    rule by which JAX takes second derivatives of a free motion.
+    """Return two things: the motion of a free body and its first derivatives, as
+    `motion_and_derivatives` gives them; and the changes of all these numbers for a change of the
+    inputs. By this rule JAX takes second derivatives of a free motion.
+
+    - `primals`: the three inputs of `motion_and_derivatives`: the six entries
+      (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes, the three components of the
+      body momentum Π(0), and the time t.
+    - `tangents`: the changes of these three inputs, in the same form.
     """
     motion, rows, parts = motion_and_derivatives(*primals)
     (body, *k), (_, *d_k), inputs, change = _variables_and_changes(primals, tangents)
@@ -375,17 +417,21 @@ def _motion_derivatives(
     momentum_rows: Rows,
     momentum_integral: Six,
 ) -> MotionDerivatives:
-    """Return the derivatives of a free motion with respect to the ten `derivative_variables`, from
-    the derivatives of its body momentum.
+    """Return the derivatives of a free motion (of its body momentum Π(t), rotation and body rate
+    Ω(t)) with respect to ten variables, from the derivatives of its body momentum.
 
-    - `inverse_inertia`: the six entries of K = I⁻¹, the inverse of the inertia tensor.
+    - `inverse_inertia`: the six entries (11, 22, 33, 12, 13, 23) of K = I⁻¹, the inverse of the
+      inertia tensor, in principal axes.
     - `energy2`: E₂ = Π·KΠ, which is twice the energy.
     - `momentum`: the three components of the body momentum Π(0).
     - `t`: the time.
     - `motion`: the triple of Π(t), the quaternion of the rotation from time 0 to t, and Ω(t).
     - `momentum_rows`: the derivatives of Π(t) − Π(0) with respect to the ten variables, as three
-      arrays (10,).
+      arrays (10,), one for each component.
     - `momentum_integral`: the six entries of G = ∫ Π Πᵀ dt from 0 to t.
+
+    The ten variables are d12, d23, k12, k13, k23, the three of Π(0), k33 and t, where kij are the
+    entries of K and dij = kii − kjj.
     """
     out, turn, _ = motion
     p1, p2, p3 = momentum
@@ -464,14 +510,18 @@ def derivative_variables(
 def _flow_and_first_derivatives(
     constants: Orbit, moments: Six, momentum: Triple, t: Scalar
 ) -> tuple[tuple[Triple, Four], Rows, Six]:
-    """Return three things: the body momentum Π(t) and the quaternion of the rotation from time 0 to
-    t, as `flow` returns them; the derivatives of Π(t) − Π(0) with respect to the ten
-    `derivative_variables`, as three arrays (10,); and the six entries of the matrix G = ∫ Π Πᵀ dt
-    from 0 to t.
+    """Return three things: the pair of the body momentum Π(t) of a free body and the quaternion of
+    its rotation from time 0 to t; the derivatives of Π(t) − Π(0) with respect to ten variables, as
+    three arrays (10,), one for each component; and the six entries (11, 22, 33, 12, 13, 23) of the
+    matrix G = ∫ Π Πᵀ dt from 0 to t. All are in principal axes.
 
-    - `constants`: the constants of the motion.
-    - `moments`, `momentum`, `t`: the inertia tensor in principal axes, Π(0) and the time, as for
-      `flow`.
+    - `constants`: the numbers from which the closed form of the motion is evaluated.
+    - `moments`: the six entries of the inertia tensor.
+    - `momentum`: the three components of Π(0).
+    - `t`: the time.
+
+    The ten variables are d12, d23, k12, k13, k23, the three of Π(0), k33 and t, where kij are the
+    entries of the inverse of the inertia tensor and dij = kii − kjj.
     """
     half_time = reduce_time(0.5 * t, constants.half.time, constants.modulus)
     half_time_integrals = integrals(
@@ -494,17 +544,19 @@ def _flow_and_first_derivatives(
 def _changes_of_first_derivatives(
     inverse_inertia: Differences, inputs: Float[Array, "10"], change: Float[Array, "10"]
 ) -> tuple[Rows, Six]:
-    """Return two changes for a change of the ten `derivative_variables`: the change of the
-    derivatives of the body momentum Π(t) with respect to these variables, as three arrays (10,);
-    and the change of the six entries of G = ∫ Π Πᵀ dt from 0 to t.
+    """Return two changes for a change of the ten variables of a free motion: the change of the
+    derivatives of the body momentum Π(t) with respect to these variables, as three arrays (10,),
+    one for each component of Π; and the change of the six entries (11, 22, 33, 12, 13, 23) of the
+    matrix G = ∫ Π Πᵀ dt from 0 to t.
 
     - `inverse_inertia`: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
-      inertia tensor.
-    - `inputs`: (10,) the variables.
+      inertia tensor, in principal axes.
+    - `inputs`: (10,) the variables d12, d23, k12, k13, k23, the three of Π(0), k33 and t, where kij
+      are the entries of K and dij = kii − kjj.
     - `change`: (10,) the change of the variables.
 
-    The motion is taken from `sigma_form`, where it is a smooth function of the whole inertia
-    tensor.
+    The motion is taken from the module `sigma_form`, where it is a smooth function of the whole
+    inertia tensor.
     """
 
     def of_inputs(x):

@@ -131,8 +131,11 @@ def field_of(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
 def _free_euler_equations(terms: PyTree[dfx.AbstractTerm]) -> EulerEquations:
     """Return Euler's equations of a free body from inside the terms of a diffrax solver.
 
-    `terms` must be an `ODETerm` of the equations of motion of a `Spin` or an `Attitude`, with no
-    torque; a `ValueError` is raised for anything else.
+    - `terms`: an `ODETerm` whose vector field is the equations of motion of a `Spin` (a body rate)
+      or an `Attitude` (a quaternion and a body rate), with no torque. diffrax may have wrapped this
+      term together with the direction of time.
+
+    A `ValueError` is raised for any other terms.
     """
     field, _ = field_of(terms)
     euler = field.euler if isinstance(field, AttitudeEquations) else field

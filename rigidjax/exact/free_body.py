@@ -154,8 +154,11 @@ _jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0).at(t))
 def _checked_time(t: ScalarLike, omega: Array) -> Scalar:
     """Return the time t, s, as an array after a check of its shape and dtype.
 
-    `omega` (3,) is the body rate, rad/s. A `ValueError` is raised if the body turns so far in this
-    time that the dtype holds no digit within one turn; traced values are not checked for this.
+    - `t`: the time, one number.
+    - `omega`: (3,) the body rate, rad/s.
+
+    A `ValueError` is raised if the body turns so far in this time that the dtype holds no digit of
+    the angle within one turn. This is not checked if t or `omega` is traced by JAX.
     """
     t = _checks.checked_time(t)
     if not _checks.is_known((t, omega)):
@@ -172,14 +175,15 @@ def _checked_time(t: ScalarLike, omega: Array) -> Scalar:
 
 
 def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
-    """Return the inertia of the body after checks of the body and of its state; a traced inertia
-    that no real body has becomes NaN.
+    """Return the inertia of the body after checks of the inertia and of the state of the body; a
+    traced inertia that no real body has becomes NaN.
 
-    - `inertia`: of the body about its centre of mass.
-    - `state0`: a `Spin` or an `Attitude`, of the dtype of the inertia; its body rate and quaternion
-      must be finite, and the quaternion a unit one.
+    - `inertia`: the `Inertia` of one body, about its centre of mass.
+    - `state0`: a `Spin` (a body rate) or an `Attitude` (a quaternion and a body rate), with arrays
+      of the dtype of the inertia. The body rate and the quaternion must be finite, and the
+      quaternion must be of length 1.
 
-    An error is raised for anything else.
+    A `TypeError` or `ValueError` is raised for any other inertia or state.
     """
     if isinstance(state0, HasPose) or not isinstance(state0, HasSpin):
         raise TypeError(

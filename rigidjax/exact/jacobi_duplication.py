@@ -249,20 +249,22 @@ def half_period(modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> HalfPerio
 
 
 def _arithmetic_geometric_mean_step(_: Array, state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-    """Return the state of the arithmetic–geometric mean, and of two sums over its steps, after one
-    more step n.
+    """Return the eight numbers of the arithmetic–geometric mean, and of two sums over its steps,
+    after one more step.
 
-    The first argument is the number of the step, which is not used. The state has eight numbers:
+    Write n for the number of steps so far, p and q for the parameters of the elliptic function S,
+    which solves (dS/du)² = (1 − pS²)(1 − qS²) with S(0) = 0, and λ² for max(p, q). The first
+    argument is the number of the step as the loop counts it, and is not used. The second is the
+    `state`, with eight numbers:
 
     - `a`, `b`: the arithmetic mean a_n and the geometric mean b_n.
-    - `c`, `ratio`: c_n, which is half the difference of the means of the step before, and 2^{n−1}
-      c_n²/w, where w is min(p, q)/max(p, q). Here p and q are the parameters of the elliptic
-      function S, which solves (dS/du)² = (1 − pS²)(1 − qS²) with S(0) = 0.
-    - `total`: the sum of ½ and of all `ratio` so far; at the end it gives the mean of S² over half
-      a period.
+    - `c`: c_{n+1} = (a_n − b_n)/2, half the difference of the two means.
+    - `ratio`: 2ⁿ c_{n+1}²/w, where w = min(p, q)/λ².
+    - `total`: ½ plus the sum of all earlier values of `ratio`. At the end, `total`/λ² is the mean
+      of S² over half a period.
     - `point`, `part`, `sum_parts`: the numbers called p_n and Q_n in DLMF 19.8.7–19.8.9, and the
-      sum of all Q_n so far; at the end it gives the integral ∫ S²/(1 + μS²) du over half a period,
-      the phase.
+      sum of all Q_n so far. At the end, `sum_parts` is proportional to the integral ∫ S²/(1 + μS²)
+      du over half a period, with a number μ of the motion.
     """
     a, b, c, ratio, total, point, part, sum_parts = state
     square, product = point * point, a * b

@@ -69,11 +69,14 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
 
 def _checked_tensor_and_rate(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
-    """Return two things after checks of both: the inertia tensor (3, 3); and the body rate `omega0`
+    """Return two things after checks of both: the inertia tensor (3, 3), kg m²; and the body rate
     (3,), rad/s, in the dtype of the tensor.
 
-    A `ValueError` or `TypeError` is raised for a wrong shape or dtype, or a moment known to be
-    zero.
+    - `inertia`: the `Inertia` of one body.
+    - `omega0`: (3,) the body rate, rad/s.
+
+    A `ValueError` or `TypeError` is raised for a wrong shape or dtype, or for a principal moment
+    that is zero and not traced by JAX.
     """
     _checks.require_single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     tensor = validation.check_body(inertia, inertia.tensor, None, throw=False).tensor
@@ -82,8 +85,9 @@ def _checked_tensor_and_rate(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, 
 
 @jax.jit
 def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
-    """Return two times, s, both computed in one program: the period of the body rates, and the mean
-    period in which the axis that the momentum circles turns about the momentum.
+    """Return two times, s, of a free body, both computed in one program: the period of the body
+    rate; and the mean period in which a principal axis of the body turns about the momentum. This
+    axis is the one that the momentum circles in the body frame.
 
     - `tensor`: (3, 3) the inertia tensor, kg m².
     - `omega`: (3,) the body rate at any moment, rad/s.
@@ -114,12 +118,12 @@ def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Sca
 
 @jax.custom_jvp
 def _precession_angle(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
-    """Return the angle, rad, by which the axis of the body that the momentum circles turns about
-    the momentum in one period of the body rates.
+    """Return the angle, rad, by which a principal axis of a free body turns about the momentum in
+    one period of the body rate. The axis is the one that the momentum circles in the body frame.
 
     - `moments`: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes.
     - `momentum`: the three components of the body momentum.
-    - `period`: the period of the body rates, s.
+    - `period`: the period of the body rate, s.
     """
     body, k, _ = inverse_inertia_and_energy(moments, momentum)
     v = sigma_form.invariants(body, momentum)
@@ -133,8 +137,13 @@ def _precession_angle(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
 
 @_precession_angle.defjvp
 def _precession_angle_jvp(primals, tangents):
-    """Return the value of `_precession_angle` and its change for a change of the inputs: the rule
-    by which JAX differentiates `_precession_angle`.
+    """Return the angle, rad, by which a principal axis of a free body turns about the momentum in
+    one period of the body rate, and the change of this angle for a change of the inputs. By this
+    rule JAX differentiates `_precession_angle`.
+
+    - `primals`: the three inputs: the six entries of the inertia tensor in principal axes, the
+      three components of the body momentum, and the period, s.
+    - `tangents`: the changes of these three inputs, in the same form.
     """
     moments, momentum, period = primals
     (_, _, energy2), (_, d_k, d_energy2) = jax.jvp(

@@ -48,8 +48,13 @@ def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
 
 @tensor_in_axes.defjvp
 def _tensor_in_axes_jvp(primals, tangents):
-    """Return the value of `tensor_in_axes` and its change for a change of the tensor: the rule by
-    which JAX differentiates `tensor_in_axes`.
+    """Return two things: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor I in
+    principal axes, AᵀIA; and their change for a change of the tensor, with the axes A held fixed.
+    By this rule JAX differentiates `tensor_in_axes`.
+
+    - `primals`: I (3, 3), body frame; the matrix A (3, 3) whose columns are the principal axes; and
+      the three principal moments.
+    - `tangents`: the changes of these three inputs, of which the first one is used.
     """
     # Take the change of a symmetric matrix, so that a gradient is symmetric.
     axes, change = primals[1], 0.5 * (tangents[0] + tangents[0].T)
@@ -80,10 +85,12 @@ def combine_columns(axes: Mat3, components: Triple) -> Triple:
 
 @compiled_as_one_kernel
 def _axes_and_moments(matrix: Mat3) -> tuple[list[list[Scalar]], Triple]:
-    """Return the principal axes and moments of a symmetric `matrix` (3, 3), by Jacobi's method.
+    """Return the principal axes and moments of an inertia tensor, by Jacobi's method.
 
-    **Returns** two things: the rows of a matrix, each of whose columns is a principal axis; and the
-    moments (the eigenvalues) in ascending order.
+    - `matrix`: (3, 3), the tensor, symmetric.
+
+    **Returns** two things: a matrix as a list of its three rows, whose columns are the three
+    principal axes; and the three moments (the eigenvalues) in ascending order.
     """
     one, zero = jnp.ones_like(matrix[0, 0]), jnp.zeros_like(matrix[0, 0])
     # Subtract a shift from nearly equal moments: it is exact by Sterbenz' lemma, and so the moments
@@ -110,10 +117,12 @@ def _axes_and_moments(matrix: Mat3) -> tuple[list[list[Scalar]], Triple]:
 
 
 def _orthonormalise(matrix: list[list[Scalar]]) -> list[list[Scalar]]:
-    """Return the matrix A(3 − AᵀA)/2, as a list of three rows, where A = `matrix` is a list of
-    three rows, too.
+    """Return the orthonormal matrix nearest to a matrix A that is already orthonormal except for
+    round-off, by one step A(3 − AᵀA)/2 (Higham 1986).
 
-    A is a product of many rotations; this makes it orthonormal to round-off again (Higham 1986).
+    - `matrix`: A, 3×3, as a list of its three rows; the result has the same form.
+
+    The step is needed because A is a product of many rotations, and their rounding errors add up.
     """
     excess = [
         [
@@ -134,12 +143,12 @@ def _orthonormalise(matrix: list[list[Scalar]]) -> list[list[Scalar]]:
 def _rotate_last_two_axes(
     diagonal: Triple, off_diagonal: Triple, axes: tuple[Triple, ...]
 ) -> tuple[Triple, Triple, tuple[Triple, ...]]:
-    """Return the three arguments of Jacobi's method after one rotation of the axes 2 and 3 that
-    makes the off-diagonal entry of these two axes zero.
+    """Return the three arguments after one rotation of Jacobi's method for eigenvalues: it turns
+    the axes 2 and 3 so that the off-diagonal entry (2, 3) of the symmetric matrix becomes zero.
 
-    - `diagonal`: the three diagonal entries of the symmetric matrix.
-    - `off_diagonal`: the entries (23, 13, 12).
-    - `axes`: the three axes found so far, each as three components.
+    - `diagonal`: the three diagonal entries of the matrix, along the axes so far.
+    - `off_diagonal`: its entries (23, 13, 12).
+    - `axes`: the three axes so far, each as three components.
     """
     (first, second, third), (x, y, z), (u, v, w) = diagonal, off_diagonal, axes
     none = x == 0

@@ -429,14 +429,15 @@ def momentum_and_integral(
 
 
 def _normalised_sigma(sigma: Scalar, t_matrix: Six, integral: Six) -> Sigma:
-    """Return the sigma functions with the scale that `Sigma` asks for: σ and T are divided by one
-    number, so that T₂₂ = 1 in value.
+    """Return Weierstrass's sigma functions of a free motion with a common scale: the number σ and
+    the symmetric matrix T are divided by the entry T₂₂, so that T₂₂ = 1 in value.
 
     - `sigma`: the number σ.
-    - `t_matrix`: the six entries of the symmetric matrix T.
-    - `integral`: the six entries of the matrix Y = ∫ σ² T⁻² du, which the division does not change.
+    - `t_matrix`: the six entries (11, 22, 33, 12, 13, 23) of T.
+    - `integral`: the six entries of the matrix Y = ∫ σ² T⁻² du over the time u, which the division
+      does not change.
 
-    The divisor T₂₂ has no derivative here: a factor common to σ and T changes no result.
+    The divisor T₂₂ is a constant in derivatives: a factor common to σ and T changes no result.
     """
     factor = barrier(1.0 / jax.lax.stop_gradient(t_matrix[1]))
     sigma, t_matrix = barrier((sigma * factor, _scaled_matrix(t_matrix, factor)))
@@ -444,12 +445,15 @@ def _normalised_sigma(sigma: Scalar, t_matrix: Six, integral: Six) -> Sigma:
 
 
 def _scaled_matrix(matrix: Six, factor) -> Six:
-    """Return the six entries of a symmetric matrix, each multiplied by the number `factor`."""
+    """Return the six entries of a symmetric matrix, each multiplied by the scalar `factor`."""
     return tuple(c * factor for c in matrix)
 
 
 def _add_to_diagonal(matrix: Six, number) -> Six:
-    """Return the six entries (11, 22, 33, 12, 13, 23) of a symmetric matrix after `number` has been
-    added to the three diagonal ones.
+    """Return the six entries (11, 22, 33, 12, 13, 23) of the matrix A + x 1, for a symmetric matrix
+    A and a number x.
+
+    - `matrix`: the six entries of A, in the same order.
+    - `number`: x, a scalar.
     """
     return (matrix[0] + number, matrix[1] + number, matrix[2] + number, *matrix[3:])

@@ -80,9 +80,12 @@ class LagrangeEquations(eqx.Module):
         return jnp.sum(y.rate * momentum) - self._value(y.q, y.rate)
 
     def _value(self, q: Array, rate: Array) -> Scalar:
-        """Return the value of the Lagrangian, J, for the coordinates `q` (n,) and their rates (n,).
+        """Return the value of the Lagrangian, J, a scalar.
 
-        Raise an error unless the value is one number.
+        - `q`: (n,) the coordinates.
+        - `rate`: (n,) their rates, the derivatives with respect to time.
+
+        An error is raised unless the user's function returns one number.
         """
         return _checks.array_of_shape(
             self.lagrangian(q, rate), (), "lagrangian", hint="one number, J"
@@ -202,10 +205,12 @@ def from_attitude(state: HasAttitude) -> Coordinates:
 def _solve_for_acceleration(
     matrix: Float[Array, "n n"], push: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Return the second time derivatives q̈ (n,) of coordinates: the solution of M q̈ = F.
+    """Return the second time derivatives q̈ (n,) of n coordinates q, the solution of M q̈ = F.
 
-    `matrix` is M = ∂²L/∂q̇∂q̇ of the Lagrangian L, and `push` is F, the generalised forces with all
-    other terms of Lagrange's equations.
+    - `matrix`: (n, n) M = ∂²L/∂q̇∂q̇, the second derivatives of the Lagrangian L with respect to
+      the rates q̇.
+    - `push`: (n,) F, the sum of the generalised forces and of all terms of Lagrange's equations
+      without q̈.
     """
     n = push.shape[0]
     if n == 1:

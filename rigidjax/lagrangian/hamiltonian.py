@@ -131,8 +131,8 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
 def _require_invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
     """Return the inertia of one body after a check that it has an inverse.
 
-    Raise an error if a moment of the inertia is known to be zero; a traced inertia that no body can
-    have becomes NaN.
+    An error is raised if a principal moment is zero, or if no real body can have the moments. If
+    JAX traces the inertia, it becomes NaN in these cases.
     """
     _checks.require_single(inertia, _inertia.Inertia, "inertia")
     return validation.check_body(inertia, inertia.tensor, None, throw=False)
@@ -207,5 +207,10 @@ class HeavyTopHamiltonian(eqx.Module):
 
 
 def _checked_scalar(value):
-    """Return the value of a Hamiltonian, J; raise an error unless it is one number."""
+    """Return the value of a Hamiltonian, J, as a scalar array.
+
+    - `value`: what the user's function of the Hamiltonian returned.
+
+    An error is raised unless it is one number.
+    """
     return _checks.array_of_shape(value, (), "hamiltonian", hint="one number, J")

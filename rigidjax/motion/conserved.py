@@ -1,4 +1,4 @@
-"""Compute the conserved quantities of a scene, and their drift in a computed motion."""
+"""Compute the conserved quantities of a body under torques, and their drift in a simulation."""
 
 from typing import Any
 
@@ -52,7 +52,7 @@ def conserved(
     torque: Torque | None = None,
     t: ScalarLike = 0.0,
 ) -> dict[str, Float[Array, "..."]]:
-    """Return the quantities that the exact motion of this scene conserves, at one state.
+    """Return the quantities that the exact motion of a body under a torque conserves, at one state.
 
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s. A torque declares what it
     conserves by optional members (see `rigidjax.torques.AbstractTorque`); without these members
@@ -184,7 +184,7 @@ def _total_energy(body: Body, state: HasSpin, torques: tuple[Any, ...], t: Scala
     torque.
 
     - `body`: an `Inertia` or `MassProperties`
-    - `state`: the state of motion
+    - `state`: the state of motion, a `Spin`, `Attitude` or `Rigid`
     - `torques`: the torques and forces, each with a method `energy(t, state, body)`
     - `t`: s, the time
     """
@@ -202,9 +202,9 @@ def _total_angular_momentum(
     it.
 
     - `body`: an `Inertia` or `MassProperties`
-    - `state`: the state of motion, with the body rate
-    - `torques`: the torques and forces; each with a method `internal_momentum(t)`, as wheels have,
-      adds the momentum that this method returns
+    - `state`: the state of motion, a `Spin`, `Attitude` or `Rigid`
+    - `torques`: the torques and forces. If one of them has a method `internal_momentum(t)`, as
+      wheels have, the momentum that this method returns is added.
     - `t`: s, the time
     """
     momentum = angular_momentum(body, state)

@@ -130,8 +130,9 @@ def tangent_to_vector(state: PyTree, tangent_vector: PyTree) -> Float[Array, " n
 
 
 def _quaternion_flags(state: PyTree) -> list[bool]:
-    """Return one flag for each leaf (array) of `state`, a tree of arrays: true if the leaf is the
-    quaternion `q` of an `Attitude`, a `Rigid` or another state with an attitude.
+    """Return one flag for each leaf (array) of `state`, a tree of arrays, in the order of
+    `jax.tree.leaves`: true if the leaf is the quaternion `q` of an `Attitude`, a `Rigid` or another
+    state with an attitude.
     """
     out = []
     for node in jax.tree.leaves(state, is_leaf=lambda node: isinstance(node, HasAttitude)):
@@ -160,13 +161,16 @@ def _map_leaves(
     of_quaternion: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> Any:
-    """Return a tree like `state`, changed leaf by leaf: one function changes quaternions, another
-    all other arrays.
+    """Return a state after a change, computed leaf by leaf: one function changes quaternions,
+    another function changes all other arrays.
 
     - `state`: a tree of arrays
-    - `change`: (n,), the changes of all leaves one after another
-    - `of_quaternion`: a function (q, part) of a quaternion (4,) and its rotation vector (3,)
-    - `of_others`: a function (leaf, part) of any other array and its change, of equal shape
+    - `change`: (n,), the changes of all leaves one after another: a rotation vector of three
+      numbers for a quaternion, and as many numbers as the leaf has for any other leaf
+    - `of_quaternion`: a function (q, vector) of a quaternion (4,) and its rotation vector (3,),
+      which returns the new quaternion
+    - `of_others`: a function (leaf, change) of any other array and its change, of equal shape,
+      which returns the new array
     """
     (leaves, tree), out = jax.tree.flatten(state), []
     for leaf, place, turned in zip(
@@ -187,12 +191,12 @@ def _concatenate_over_leaves(
     quaternion of a state and the array at the same place of the other tree, another function to all
     other pairs of arrays.
 
-    - `first`, `second`: two trees of arrays with one structure; `second` is a state, and says which
-      leaves are quaternions
-    - `of_quaternions`: a function (a, b) of the array (4,) in `first` and the quaternion (4,) in
-      `second`, which returns three numbers
-    - `of_others`: a function (a, b) of two arrays of equal shape, which returns an array of this
-      shape
+    - `first`: a tree of arrays with the structure of `second`
+    - `second`: a state, which determines the leaves that are quaternions
+    - `of_quaternions`: a function (a, b) of the array a (4,) in `first` and the quaternion b (4,)
+      in `second`, which returns three numbers
+    - `of_others`: a function (a, b) of the array a in `first` and the array b in `second`, of equal
+      shape, which returns an array of this shape
     """
     pairs = zip(
         jax.tree.leaves(first), jax.tree.leaves(second), _quaternion_flags(second), strict=True

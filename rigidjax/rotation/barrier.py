@@ -15,8 +15,9 @@ from jaxtyping import Array, PyTree
 Tree = TypeVar("Tree")
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# XLA on CPU drops barriers before fusion, which repeats shared values: a solve of order 8 at 900
-# times took minutes, not milliseconds.
+# Whether XLA on CPU drops barriers before it fuses operations, as it does before JAX 0.11. Values
+# that are used twice are then computed twice: a solve of order 8 at 900 times took minutes, not
+# milliseconds.
 _DROPPED = jax.__version_info__ < (0, 11)
 
 
@@ -119,16 +120,23 @@ def batch_as(tree: PyTree, args: PyTree) -> Any:
 
 @batch_as.defjvp
 def _batch_as_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-    """Return `batch_as` of the two arguments, and its derivative: the change of the first argument,
-    unchanged.
+    """Return two things: the first of two trees of arrays, in which every array has a batch axis of
+    `jax.vmap` if any array of the second tree has one, as `batch_as` gives it; and the change of
+    the first tree. By this rule JAX differentiates `batch_as`.
+
+    - `primals`: the two trees
+    - `tangents`: their changes; the change of the second tree is not used
     """
     return batch_as(*primals), tangents[0]
 
 
 @jax.custom_batching.custom_vmap
 def _batch_like(tree: PyTree, args: PyTree) -> Any:
-    """Return `tree` unchanged. Under `jax.vmap` every array of `tree` is batched if any array of
-    `args` is batched.
+    """Return `tree` unchanged. Under `jax.vmap` every array of the result has a batch axis if any
+    array of `args` or of `tree` has one.
+
+    - `tree`: a tree of arrays
+    - `args`: another tree of arrays, whose values are not used
     """
     del args
     return tree
@@ -136,13 +144,15 @@ def _batch_like(tree: PyTree, args: PyTree) -> Any:
 
 @_batch_like.def_vmap
 def _batch_like_under_vmap(size: int, batched: PyTree, tree: PyTree, args: PyTree) -> Any:
-    """Return what `jax.vmap` wants of a function that returns `tree` unchanged: the tree, with
-    every array batched if any argument is batched; and for each array whether it is batched.
+    """Return the two things that `jax.vmap` wants of a function that returns `tree` unchanged: the
+    tree, in which every array has a batch axis if any array of the two arguments has one; and a
+    tree of truth values, whether each array of the result has a batch axis.
 
     - `size`: the number of members of the batch
     - `batched`: a pair of trees of truth values: which arrays of `tree`, and which of `args`, have
       a batch axis in front
-    - `tree`, `args`: two trees of arrays; `args` serves only to say whether there is a batch
+    - `tree`, `args`: the two arguments of the function, trees of arrays; the values in `args` are
+      not used
     """
     del args
     if not any(jax.tree.leaves(batched)):

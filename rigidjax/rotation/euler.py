@@ -221,8 +221,8 @@ def _unknown_sequence_message(sequence: object, reason: str) -> str:
 
 
 def _checked_angles(angles: Vec3Like) -> Vec3:
-    """Return three Euler angles (3,), rad, as an array. **Warns** if a known angle is beyond four
-    turns: it may be in degrees.
+    """Return three Euler angles (3,), rad, as an array. **Warns** if an angle that JAX does not
+    trace is beyond four turns: it may be in degrees.
     """
     angles = require_turn(_checks.array_of_shape(angles, (3,), "angles"), "angles")
     if _checks.is_known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):

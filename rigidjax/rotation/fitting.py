@@ -124,10 +124,12 @@ def wahba(
 def _weighted_outer_products(
     weights: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
 ) -> Mat3:
-    """Return the matrix Σ wᵢ world_i body_iᵀ (3, 3) of pairs of directions.
+    """Return the matrix Σ wᵢ aᵢ bᵢᵀ (3, 3), a sum over n pairs of directions aᵢ and bᵢ with the
+    weights wᵢ.
 
     - `weights`: w (n,)
-    - `world`, `body`: (n, 3), each direction in the world frame and in the body frame
+    - `world`: a (n, 3), each direction in the world frame
+    - `body`: b (n, 3), the same direction in the body frame
     """
     return (weights[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
 
@@ -135,16 +137,18 @@ def _weighted_outer_products(
 def _newton_step_of_wahba(
     best: Mat3, w: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
 ) -> Mat3:
-    """Return the rotation matrix M (3, 3), body → world, after one Newton step towards the largest
-    Σ w_i world_i · M body_i, the best fit to pairs of directions.
+    """Return the rotation matrix M (3, 3), body → world, after one Newton step of Wahba's problem:
+    to find the M with the largest Σ wᵢ aᵢ · M bᵢ, the best fit to n pairs of directions aᵢ and bᵢ
+    with the weights wᵢ.
 
-    The cross product of `world_i` and `M body_i` is computed from the small difference of the two
-    vectors, so that its rounding error is small, too. Otherwise the rounding of a direction with a
-    large weight would turn the body about this direction.
+    The cross product of aᵢ and M bᵢ is computed from the small difference of these two vectors, so
+    that its rounding error is small, too. Otherwise the rounding of a direction with a large weight
+    would turn the body about this direction.
 
     - `best`: (3, 3), the rotation matrix to start from
     - `w`: (n,), the weights
-    - `world`, `body`: (n, 3), each direction in the world frame and in the body frame
+    - `world`: a (n, 3), each direction in the world frame
+    - `body`: b (n, 3), the same direction in the body frame
     """
     moved = (best[None] * body[:, None, :]).sum(-1)
     lengths = [jnp.sqrt((x * x).sum(-1)) for x in lax.stop_gradient((moved, world))]
@@ -223,8 +227,8 @@ def mean_quaternion(
 # Compiled once: outside of `jit` the loop would be compiled again at each call.
 @partial(jax.jit, inline=True)
 def _karcher_mean(quaternions: Float[Array, "n 4"], weights: Float[Array, "n"]) -> Quat:
-    """Return the Karcher mean, the unit quaternion (4,) that minimises the weighted sum of the
-    squared angles to several rotations, by Newton's method.
+    """Return the Karcher mean of n rotations, by Newton's method: the unit quaternion (4,) with the
+    least weighted sum of the squared angles from its rotation to each of the n rotations.
 
     - `quaternions`: (n, 4), unit, each of either sign
     - `weights`: (n,), not negative
@@ -276,9 +280,10 @@ def checked_weights(weights: ArrayLike | None, rows: Array, description: str) ->
 
 
 def _signed_singular_value_sum(b: Mat3) -> tuple[Scalar, Scalar]:
-    """Return two scalars from which the rotation nearest to a matrix follows (Markley 1993): λ, the
-    sum of the singular values, in which the smallest has the sign of the determinant; and ζ = ½ (λ²
-    − 1) λ − det b. λ is the largest root of a quartic equation, found by Newton's method.
+    """Return two scalars from which the rotation nearest to a matrix b follows (Markley 1993): λ,
+    the sum of the singular values of b, in which the least one is negative if det b is negative;
+    and ζ = ½ (λ² − 1) λ − det b. λ is the largest root of a quartic equation, found by Newton's
+    method.
 
     - `b`: (3, 3), of Frobenius norm 1
     """
@@ -296,9 +301,12 @@ def _signed_singular_value_sum(b: Mat3) -> tuple[Scalar, Scalar]:
 
 
 def _curvature_of_gain(rotation: Mat3, b: Mat3) -> Mat3:
-    """Return the matrix Tr(S) 1 − S (3, 3) with S = sym(Rᵀb): for a rotation vector x, the gain
-    Tr(R exp(x)ᵀ b), which the rotation nearest to b maximises, has the second derivative −(Tr(S) 1
-    − S) at x = 0.
+    """Return the matrix Tr(S) 1 − S (3, 3), where S is the symmetric part of Rᵀb, and 1 the unit
+    matrix.
+
+    It is the curvature of the fit: the rotation nearest to b has the largest Tr(Rᵀb). After a small
+    turn with the rotation vector x, this quantity is Tr((R exp(x))ᵀ b), whose second derivative
+    with respect to x is −(Tr(S) 1 − S) at x = 0.
 
     - `rotation`: R (3, 3)
     - `b`: (3, 3), any matrix
@@ -332,8 +340,15 @@ def nearest_rotation(b: Mat3) -> Mat3:
 def _nearest_rotation_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
-    """Return the rotation R nearest to a matrix b, and its derivative R hat(x) along the change db
-    in `tangents`, where x solves (Tr(S) 1 − S) x = 2 vee(Rᵀ db) with S = sym(Rᵀb).
+    """Return the rotation matrix R (3, 3) nearest to a matrix b, and its change for a change db of
+    b. By this rule JAX differentiates `nearest_rotation`.
+
+    - `primals`: a tuple of one item, b (3, 3)
+    - `tangents`: a tuple of one item, db (3, 3)
+
+    The change is R hat(x), where hat(x) is the matrix of the cross product with x. The rotation
+    vector x solves (Tr(S) 1 − S) x = 2 vee(Rᵀ db), where S is the symmetric part of Rᵀb, and vee
+    gives the vector of the antisymmetric part of a matrix.
     """
     (b,), (db,) = primals, tangents
     r = nearest_rotation(b)

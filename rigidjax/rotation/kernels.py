@@ -89,8 +89,13 @@ def _log_of_quaternion(q: Quat) -> Vec3:
 def _log_of_quaternion_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
-    """Return the rotation vector (3,), rad, of a quaternion q of any length, and its derivative
-    along the change dq in `tangents`, by the inverse of the right Jacobian.
+    """Return the rotation vector (3,), rad, of a quaternion q of any length, and its change for a
+    change dq of q, by the inverse of the right Jacobian (the matrix from a change of the rotation
+    vector to the small turn in the body frame). By this rule JAX differentiates
+    `_log_of_quaternion`.
+
+    - `primals`: a tuple of one item, q (4,)
+    - `tangents`: a tuple of one item, dq (4,)
     """
     (q,), (dq,) = primals, tangents
     v = _log_of_quaternion(q)

@@ -127,8 +127,9 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
 
 
 def _relative_rotation(a: Mat3, b: Mat3) -> Mat3:
-    """Return the rotation matrix aᵀb (3, 3), which leads from the rotation `a` to the rotation `b`.
-    **Raises:** `ValueError` for known matrices that are not finite or far from a rotation.
+    """Return the rotation matrix aᵀb (3, 3), which leads from the rotation `a` to the rotation `b`,
+    both (3, 3). **Raises:** `ValueError` if the product is not finite or far from a rotation,
+    unless JAX traces the matrices.
     """
     between = product(a.T, b)
     if _checks.is_known(between):

@@ -3,8 +3,8 @@
 Rotations need sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³, … as functions of t = θ². These are the
 Stumpff functions c_k(t) = Σ (−t)ⁿ/(k + 2n)!  (Stumpff 1959; Battin 1999, sec. 4.5). Their
 derivatives are Stumpff functions too, c_k' = ½ (k c_{k+2} − c_{k+1}), so that no derivative needs a
-cancelling quotient. Polynomials on a reduced range replace libm's sine and cosine, which run one
-lane at a time on CPU.
+cancelling quotient. Polynomials on a reduced range replace libm's sine and cosine, which take
+one number at a time on CPU, while polynomials take a whole vector.
 """
 
 import math
@@ -18,7 +18,8 @@ from jaxtyping import Array, Float, PyTree
 
 # The largest argument of `arctan_ratio`, tan²(π/8).
 _REACH = math.tan(math.pi / 8) ** 2
-# π in three parts, the first two of 28 (float64) or 10 (float32) bits.
+# π as the sum of three numbers. The first two have only 28 (float64) or 10 (float32) bits, so that
+# their products with a number of half turns are exact.
 _PI_PARTS = {
     np.dtype("float64"): (3.141592651605606, 1.9841871479187034e-09, 1.1442377452219664e-17),
     np.dtype("float32"): (3.140625, 0.0009670257568359375, 6.278329465203569e-07),
@@ -50,8 +51,13 @@ def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
 def _stumpff_jvp(
     k: int, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
-    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, and its derivative along the change
-    dt in `tangents`, by c_k' = ½ (k c_{k+2} − c_{k+1}).
+    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, a sum over n = 0, 1, 2, …, and its
+    change for a change dt of t, from the derivative ½ (k c_{k+2} − c_{k+1}). By this rule JAX
+    differentiates `stumpff`.
+
+    - `k`: the order, 0, 1, 2, …
+    - `primals`: a tuple of one item, t
+    - `tangents`: a tuple of one item, dt
     """
     (t,), (dt,) = primals, tangents
     slope = k * stumpff(k + 2, t) - stumpff(k + 1, t) if k else -stumpff(1, t)
@@ -75,9 +81,10 @@ def arctan_ratio(z: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def _cosine_or_sinc_of_square(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return cos θ (for k = 0) or sin θ/θ (for k = 1) of an angle θ, rad, given by its square.
+    """Return cos θ (for k = 0) or sin θ/θ (for k = 1) of an angle θ, rad, that is given by its
+    square.
 
-    An angle beyond π/2 is first reduced by half turns; below, a polynomial in θ² is used.
+    If θ is above π/2, it is first reduced by half turns; else a polynomial in θ² is used.
 
     - `k`: 0 or 1
     - `t`: θ² ≥ 0, any shape
@@ -112,12 +119,12 @@ def parity(n: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def _stumpff_series(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, "..."]:
-    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, by the first terms of this series;
-    later terms are below round-off.
+    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, a sum over n = 0, 1, 2, …, by its
+    first terms; later terms are below round-off.
 
     - `k`: the order, 0, 1, 2, …
     - `t`: from 0 to `limit`, any shape
-    - `limit`: the largest t, which determines the number of terms
+    - `limit`: the largest t, which determines how many terms are summed
     """
     tiny = jnp.finfo(t.dtype).eps / 8
     size = 1 / math.factorial(k)
@@ -126,9 +133,10 @@ def _stumpff_series(k: int, t: Float[Array, "..."], limit: float) -> Float[Array
 
 
 def _evaluate_polynomial(coefficients: list[float], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the value of a polynomial at `x`, an array of any shape, by Horner's scheme.
+    """Return the value of a polynomial c₀ + c₁ x + c₂ x² + … at `x`, an array of any shape, by
+    Horner's scheme.
 
-    - `coefficients`: of 1, x, x², …
+    - `coefficients`: c₀, c₁, c₂, …
     """
     value = jnp.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:

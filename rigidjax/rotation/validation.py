@@ -57,8 +57,8 @@ def require_turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
 
 
 def _largest_component(v: Float[Array, "*n"]) -> float:
-    """Return the largest absolute value of the entries of a known array `v`; NaN if an entry is
-    NaN.
+    """Return the largest absolute value of the entries of an array `v` that JAX does not trace; NaN
+    if an entry is NaN.
     """
     # The result is NaN if an entry is NaN. The function makes one call of NumPy only, because it
     # runs before every conversion that is called outside of `jit`.

@@ -248,7 +248,7 @@ def force_and_torque(
     return None, value.astype(dtype)
 
 
-# For a part of a state: what it is called, and the class of state that has it.
+# For each field that a state of motion may lack: the name of the quantity, and a state that has it.
 _HIGHER = {
     "q": ("attitude", "Attitude(q, omega)"),
     "x": ("position", "Rigid(x, v, q, omega)"),

@@ -52,8 +52,10 @@ class InSpace(base.AbstractTimeTorque):
 
 
 class _AbstractRateTorque(base.AbstractTorque):
-    """Define a torque against the body rate Ω, such as damping, with one coefficient for each body
-    axis, (3,).
+    """Define a torque that opposes the body rate Ω, such as damping.
+
+    `coefficient` (3,) holds the strength of the torque along each body axis; a subclass defines the
+    formula and the unit.
     """
 
     feels: ClassVar[type] = HasSpin

@@ -43,8 +43,9 @@ class Input(eqx.Module):
 
 
 class _ConstantFunction(eqx.Module):
-    """Evaluate to one value at every time: the function of time that replaces an `Input` of
-    constant value.
+    """Evaluate to one `value` at every time. This function of time takes the place of an `Input` (a
+    signal in a torque that has a name, and whose values the caller gives) while its value is
+    constant, such as during one step.
     """
 
     value: Array
@@ -186,8 +187,9 @@ def require_no_jumps(source: PyTree, name: str) -> None:
 
 
 def _checked_channels(value: NumbersLike, name: str) -> Array:
-    """Return one number, or one number for each channel of a signal, as an array of finite numbers.
-    **Raises:** `ValueError` for an empty array.
+    """Return one number, or one number for each channel (component) of a signal, as an array of
+    finite numbers. **Raises:** `ValueError` for an empty array or, unless JAX traces the numbers,
+    for a number that is not finite.
 
     - `value`: the numbers
     - `name`: the name of the argument, for messages
@@ -243,8 +245,9 @@ def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
 
 
 def _is_delayed_input(node: PyTree) -> bool:
-    """Return whether `node` (a torque or a part of one) is a `Delayed` whose source is an
-    `Input`.
+    """Return whether `node` (a torque, or anything that a torque contains) is a delayed input: a
+    `Delayed` (a function of time, shifted by a delay) whose function is an `Input`, a signal that
+    has a name and whose values the caller gives.
     """
     return isinstance(node, Delayed) and isinstance(node.source, Input)
 

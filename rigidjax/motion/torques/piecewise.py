@@ -17,8 +17,8 @@ Rows = Float[ArrayLike, "rows 3"] | Sequence[Any]
 
 
 class _Table(eqx.Module):
-    """Hold a table of a quantity over time: `times` (n,), s, and `values` (n, *k), one row of
-    numbers for each time.
+    """Hold a table of a quantity over time: `times` (n,), s, and `values` (n, *k), which has one
+    row, a number or an array of the shape (*k), for each of the n times.
     """
 
     times: Float[Array, " n"]
@@ -29,8 +29,8 @@ class _Table(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times (n,) of the rows, s: the value of the table jumps, or has a kink, at
-        each.
+        """Return the times (n,) of the table, s: at each of them the quantity jumps, or its slope
+        jumps.
         """
         return self.times
 
@@ -174,10 +174,12 @@ def _interpolate_linearly(
     times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar
 ) -> Array:
     """Return the value (*k) of a table at the time `t`, s, on the straight line between the rows
-    before and after t; beyond the ends the first or the last line is continued.
+    before and after t. Before the first row the line through the first two rows is continued, and
+    after the last row the line through the last two.
 
     - `times`: (n,) s, increasing, the times of the rows
-    - `rows`: (n, *k), the row of numbers at each time
+    - `rows`: (n, *k), the row of the table, a number or an array (*k), at each time
+    - `t`: s, one time
     """
     i = jnp.clip(_index_of_row_at(times, t), 0, times.shape[0] - 2)
     part = (t - times[i]) / (times[i + 1] - times[i])
@@ -187,14 +189,15 @@ def _interpolate_linearly(
 def _checked_times_and_rows(
     name: str, times: NumbersLike, other: str, values: NumbersLike, extra: int | None = None
 ) -> tuple[Array, Array]:
-    """Check a table over time, and return two things as arrays of finite numbers: the times,
-    increasing, s; and the rows of numbers.
+    """Check a table of a quantity over time, and return two things as arrays of finite numbers: the
+    times, increasing, s; and the rows, which are the values of the quantity.
 
-    - `name`, `other`: the names of the arguments `times` and `values`, for messages
-    - `times`: (n,) s, the times of the rows, or the edges between constant pieces
-    - `values`: the rows of numbers
-    - `extra`: `None` for as many rows, of any shape, as times; a number for rows of shape (3,), of
-      which there are `extra` fewer than times
+    - `name`: the name of the argument `times`, for messages
+    - `times`: (n,) s, the times of the rows, or the edges of intervals with a constant value
+    - `other`: the name of the argument `values`, for messages
+    - `values`: the rows
+    - `extra`: `None` for n rows of any shape. A number m wants n − m rows of shape (3,): 0 for a
+      row at each time, 1 for a row in each interval between two times.
     """
     edges, rows = _checks.array_of_rows(times, (), name), _checks.numeric_array(values, other)
     count = edges.shape[0]

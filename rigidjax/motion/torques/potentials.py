@@ -135,10 +135,11 @@ class GravityGradient(base.AbstractTimeTorque):
     def _point_mass_in_body(
         self, t: ScalarLike, state: HasAttitude
     ) -> tuple[Vec3, Scalar, list[Vec3]]:
-        """Return three things about the far point mass: the unit vector u (3,) towards it, in body
-        axes; μ/r³, 1/s², with its gravitational parameter μ and its distance r; and, for each
-        degree n = 3, 4, …, the gradient (3,) of the solid harmonic Hₙ of the body's gravity at u,
-        times μ/rⁿ⁺¹.
+        """Return three things about a far point mass that attracts the body: the unit vector u (3,)
+        towards it, in body axes; μ/r³, 1/s², with its gravitational parameter μ (the gravitational
+        constant times its mass) and its distance r; and a list with μ/rⁿ⁺¹ times the gradient (3,)
+        at u of Hₙ, the solid harmonic of degree n of the body's own gravity, for each degree n = 3,
+        4, … that is given.
 
         - `t`: s, the time
         - `state`: a state with the attitude of the body
@@ -156,9 +157,11 @@ class GravityGradient(base.AbstractTimeTorque):
 
 
 def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
-    """Return the gradients (3,) of the solid harmonics Hₙ = Σ rⁿ Pₙₘ (C cos mλ + S sin mλ) at a
-    unit vector, one for each degree n = 3, 4, …, by Cunningham's recurrence (1970,
-    doi:10.1007/BF01229495).
+    """Return the gradients (3,) of solid harmonics at a unit vector, one for each degree n = 3, 4,
+    …, by Cunningham's recurrence (1970, doi:10.1007/BF01229495).
+
+    The solid harmonic of degree n is Hₙ = Σ rⁿ Pₙₘ (C cos mλ + S sin mλ), a sum over m = 0, …, n,
+    with the associated Legendre functions Pₙₘ of z/r and the longitude λ.
 
     - `harmonics`: for each degree n the coefficients (2n + 1,) in the order Cn0, Cn1, Sn1, Cn2,
       Sn2, …
@@ -186,12 +189,14 @@ def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]
 def _solid_harmonic_gradient(
     coefficients: Sequence[Scalar], n: int, lower: Sequence[tuple[Scalar, Scalar]]
 ) -> Vec3:
-    """Return the gradient (3,) of one solid harmonic Hₙ = Σ rⁿ Pₙₘ (C cos mλ + S sin mλ).
+    """Return the gradient (3,) at one point of the solid harmonic Hₙ = Σ rⁿ Pₙₘ
+    (C cos mλ + S sin mλ), a sum over m = 0, …, n, with the associated Legendre functions Pₙₘ of z/r
+    and the longitude λ.
 
     - `coefficients`: the 2n + 1 numbers Cn0, Cn1, Sn1, Cn2, Sn2, …
     - `n`: the degree
-    - `lower`: the real and imaginary parts of rⁿ⁻¹ Pₙ₋₁,ₘ exp(imλ), the solid harmonics of the
-      degree below, at the point, for m = 0, 1, …, n
+    - `lower`: for m = 0, 1, …, n the real and imaginary parts of rⁿ⁻¹ Pₙ₋₁,ₘ exp(imλ), the solid
+      harmonics of the degree below, at the point; zero for m = n
     """
     zonal = coefficients[0]
     along, flat_x, flat_y = n * zonal * lower[0][0], -zonal * lower[1][0], -zonal * lower[1][1]
@@ -278,5 +283,7 @@ class FromPotential(base.AbstractTorque):
         return -0.5 * quaternion.multiply(quaternion.conjugate(state.q), slope)[1:]
 
     def _potential_at(self, q: Array) -> Scalar:
-        """Return the potential energy, J, at the attitude `q` (4,), checked to be one number."""
+        """Return the potential energy, J, at the attitude `q` (4,), a quaternion. **Raises:** an
+        error if the user's function does not return one number.
+        """
         return _checks.array_of_shape(self.potential(q), (), "potential", hint="one number, J")

@@ -88,9 +88,12 @@ class Series(eqx.Module):
 
 
 def _numbers_in_full_precision(value: NumbersLike, name: str) -> Any:
-    """Return `value` as an array of numbers: in float64 of NumPy if the numbers are known, because
-    the times of a log have more than the seven digits of float32; in the default precision of JAX
-    if they are traced. The text `name` names the argument in messages.
+    """Return numbers as an array: of NumPy in float64 if JAX does not trace them, because the times
+    of a log have more than the seven digits of float32; of JAX in its default precision if JAX
+    traces them.
+
+    - `value`: the numbers
+    - `name`: the name of the argument, for messages
     """
     if _checks.is_known(value):
         return _checks.host_array(value, f"Series: {name}")
@@ -98,12 +101,14 @@ def _numbers_in_full_precision(value: NumbersLike, name: str) -> Any:
 
 
 def _spline_slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
-    """Return the slope of a cubic spline at each sample, as the change per step between samples, in
-    the shape of `values` (n, *channels).
+    """Return the slope of a cubic spline at each of n evenly spaced samples, as the change for one
+    step between samples, in the shape of `values`.
 
-    With vᵢ the sample and sᵢ the slope at sample i, the slopes solve sᵢ₋₁ + 4 sᵢ + sᵢ₊₁ = 3 (vᵢ₊₁ −
-    vᵢ₋₁): the second derivative is then continuous. At the two ends the condition is "not a knot":
-    the third derivative does not jump at the sample next to the end.
+    - `values`: (n, *channels), the samples, each a number or an array of the shape (*channels)
+
+    With vᵢ the sample and sᵢ the slope at sample i, the slopes solve sᵢ₋₁ + 4 sᵢ + sᵢ₊₁ = 3
+    (vᵢ₊₁ − vᵢ₋₁): the second derivative of the spline is then continuous. At the two ends the
+    condition is "not a knot": the third derivative does not jump at the sample next to the end.
     """
     n = values.shape[0]
     v = values.reshape(n, -1)

@@ -159,11 +159,12 @@ def require_frozen(law: PyTree) -> None:
 
 
 def _insert_states(tree: PyTree, own_of: Callable[[Any], Any]) -> Any:
-    """Return `tree`, a torque or a tree of torques, in which each torque with states of its own is
-    replaced by a `FrozenLaw`: the torque together with the values of its states.
+    """Return a torque in which each torque with states of its own (such as the speed of a wheel) is
+    replaced by a `FrozenLaw`: this torque together with the values of its states.
 
-    - `own_of`: a function (torque) that returns the values of the states of one torque; it is
-      called for a torque inside another torque before the other torque
+    - `tree`: the torque, or a tree of torques
+    - `own_of`: a function (torque) that returns the values of the states of one torque. If a torque
+      contains another one, the function is called for the inner torque first.
     """
 
     def is_leaf(node: PyTree) -> bool:
@@ -177,14 +178,18 @@ def _insert_states(tree: PyTree, own_of: Callable[[Any], Any]) -> Any:
 
 
 def _has_states_or_is_frozen(node: PyTree) -> bool:
-    """Return whether `node` is a torque or function of time with states of its own, or a
-    `FrozenLaw`, in which the values of such states are already inserted.
+    """Return whether `node` is a torque or a function of time with states of its own (such as the
+    speed of a wheel), or a `FrozenLaw`, in which the values of such states are already inserted.
     """
     return isinstance(node, FrozenLaw) or has_own_states(node)
 
 
 def _checked_numbers(tree: PyTree, name: str, dtype: DTypeLike) -> Any:
-    """Return `tree`, a tree of arrays that a user's torque returned, with each array checked to be
-    numeric and converted to `dtype`; the text `name` names the tree in messages.
+    """Return a tree of arrays after a check that each array holds numbers, with each array
+    converted to `dtype`.
+
+    - `tree`: the states of a user's torque, or their derivatives, as the torque returned them
+    - `name`: the name of the tree, for messages
+    - `dtype`: the dtype of the result
     """
     return jax.tree.map(lambda leaf: _checks.numeric_array(leaf, name).astype(dtype), tree)

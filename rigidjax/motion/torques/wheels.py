@@ -248,7 +248,8 @@ class ReactionWheels(base.AbstractTorque):
         )
 
     def _sum_along_axes(self, numbers: Array) -> Vec3:
-        """Return Σ xᵢ aᵢ (3,), body frame, for the unit vectors aᵢ along the axes of the wheels.
+        """Return the vector Σ xᵢ aᵢ (3,), body frame, a sum over the R wheels, with the unit
+        vectors aᵢ along their axes.
 
         - `numbers`: x (R,), one number for each wheel, such as its momentum, N m s, or its torque,
           N m
