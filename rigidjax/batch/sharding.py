@@ -117,9 +117,14 @@ def division_of(
     dtype: np.dtype,
     count: int,
 ) -> Division:
-    """Return the division of `count` bodies with numbers of the given `dtype`.
+    """Return how a batch of `count` bodies is divided: the number of bodies in a chunk, the
+    devices, and the progress meter.
 
-    **Arguments:** `chunk`, `devices` and `progress_meter` as in `rigidjax.batch.rollout`.
+    - `chunk`: the number of bodies that are computed at a time, or `None` for the default.
+    - `devices`: the devices that share the bodies, `"all"`, or `None` for the default device.
+    - `progress_meter`: a progress meter of diffrax, or `None`.
+    - `dtype`: the dtype of the numbers, on which the default size of a chunk depends.
+    - `count`: the number of bodies.
 
     **Raises:** `ValueError` for a progress meter together with devices.
     """

@@ -223,7 +223,9 @@ def _is_selected(torque: Torque | None, pick: Callable[[Any], Any]) -> PyTree:
     try:
         picked = jax.tree.leaves(pick(numbered))
     except (AttributeError, IndexError, KeyError, TypeError) as error:
-        raise ValueError(f"torque_axes: the torque has no such part ({error})") from None
+        raise ValueError(
+            f"torque_axes: the function selects a part that the torque does not have ({error})"
+        ) from None
     if not picked or not all(type(index) is int for index in picked):
         raise ValueError(
             "torque_axes: wanted a function that picks arrays of the law, or parts of it, such as "

@@ -22,8 +22,8 @@ from rigidjax.body.point_masses import points as points, quadrature as quadratur
 
 
 def box(mass: ScalarLike, size: Vector) -> MassProperties:
-    """Return a solid box of `mass` kg and full edge lengths `size` (3,) = (a, b, c), m. `𝔖 = m
-    diag(a², b², c²)/12`.
+    """Return a solid box of `mass` kg and full edge lengths `size` (3,) = (a, b, c), m. The
+    second moment ∫ r rᵀ dm is `𝔖 = m diag(a², b², c²)/12`.
 
     >>> box(12.0, [1.0, 2.0, 3.0]).inertia.moments
     Array([ 5., 10., 13.], dtype=float64)
@@ -33,8 +33,8 @@ def box(mass: ScalarLike, size: Vector) -> MassProperties:
 
 
 def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
-    """Return a solid ellipsoid of `mass` kg and `semi_axes` (3,) = (a, b, c), m. `𝔖 = m diag(a²,
-    b², c²)/5`.
+    """Return a solid ellipsoid of `mass` kg and `semi_axes` (3,) = (a, b, c), m. The second
+    moment ∫ r rᵀ dm is `𝔖 = m diag(a², b², c²)/5`.
 
     >>> ellipsoid(5.0, [1.0, 2.0, 3.0]).inertia.moments
     Array([ 5., 10., 13.], dtype=float64)
@@ -44,7 +44,8 @@ def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
 
 
 def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
-    """Return a solid sphere of `mass` kg, `radius` m. `𝔖 = m r²/5 · 1`, so `I = ⅖ m r² · 1`.
+    """Return a solid sphere of `mass` kg, `radius` m. The second moment ∫ r rᵀ dm is `𝔖 = m
+    r²/5 · 1`, so `I = ⅖ m r² · 1`.
 
     >>> sphere(5.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -71,7 +72,8 @@ def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> Mas
 
 
 def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
-    """Return a thin spherical shell of `mass` kg, `radius` m. `𝔖 = m r²/3 · 1`.
+    """Return a thin spherical shell of `mass` kg, `radius` m. The second moment ∫ r rᵀ dm is `𝔖
+    = m r²/3 · 1`.
 
     >>> shell(3.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -81,8 +83,8 @@ def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
 
 
 def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
-    """Return a solid cylinder along z of `mass` kg, `radius`, `height` m. `𝔖 = m diag(r²/4, r²/4,
-    h²/12)`.
+    """Return a solid cylinder along z of `mass` kg, `radius`, `height` m. The second moment ∫ r
+    rᵀ dm is `𝔖 = m diag(r²/4, r²/4, h²/12)`.
 
     >>> cylinder(12.0, 1.0, 1.0).inertia.moments
     Array([4., 4., 6.], dtype=float64)
@@ -94,8 +96,8 @@ def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassPr
 def hollow_cylinder(
     mass: ScalarLike, inner: ScalarLike, outer: ScalarLike, height: ScalarLike
 ) -> MassProperties:
-    """Return a tube along z. `𝔖 = m diag((R² + r²)/4, (R² + r²)/4, h²/12)`; equal radii give a thin
-    tube.
+    """Return a tube along z. The second moment ∫ r rᵀ dm is `𝔖 = m diag((R² + r²)/4, (R² +
+    r²)/4, h²/12)`; equal radii give a thin tube.
 
     **Arguments:** `mass` kg; `inner` r ≤ `outer` R radii and `height` h, m.
 
@@ -125,7 +127,8 @@ def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassPro
 
 
 def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
-    """Return a solid cone along z. `𝔖 = m diag(3r²/20, 3r²/20, 3h²/80)`.
+    """Return a solid cone along z. The second moment ∫ r rᵀ dm is `𝔖 = m diag(3r²/20, 3r²/20,
+    3h²/80)`.
 
     **Arguments:** `mass` kg; `radius` of the base, `height` m. The centre of mass, at the origin,
     is `height/4` above the base.
@@ -138,8 +141,8 @@ def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProper
 
 
 def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassProperties:
-    """Return a solid ring around z. `𝔖 = m diag(R²/2 + 3r²/8, R²/2 + 3r²/8, r²/4)`; `minor` 0 gives
-    a hoop.
+    """Return a solid ring around z. The second moment ∫ r rᵀ dm is `𝔖 = m diag(R²/2 + 3r²/8,
+    R²/2 + 3r²/8, r²/4)`; `minor` 0 gives a hoop.
 
     **Arguments:** `mass` kg; `major` R from the centre to the middle of the tube, `minor` r ≤ R of
     the tube, m.
@@ -154,8 +157,8 @@ def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassPropert
 
 
 def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
-    """Return a thin rod along z of `mass` kg, `length` m (no moment about z). `𝔖 = m diag(0, 0,
-    ℓ²/12)`.
+    """Return a thin rod along z of `mass` kg, `length` m (no moment about z). The second moment
+    ∫ r rᵀ dm is `𝔖 = m diag(0, 0, ℓ²/12)`.
 
     >>> rod(12.0, 1.0).inertia.moments
     Array([0., 1., 1.], dtype=float64)
@@ -165,7 +168,8 @@ def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
 
 
 def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProperties:
-    """Return a plate in the x–y plane of `mass` kg and `size` (2,), m. `𝔖 = m diag(a², b², 0)/12`.
+    """Return a plate in the x–y plane of `mass` kg and `size` (2,), m. The second moment ∫ r rᵀ
+    dm is `𝔖 = m diag(a², b², 0)/12`.
 
     >>> plate(12.0, [1.0, 2.0]).inertia.moments
     Array([1., 4., 5.], dtype=float64)

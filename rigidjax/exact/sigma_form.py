@@ -162,7 +162,8 @@ def sigma_near_zero(u: Scalar, constants: Invariants) -> Sigma:
         )
     )
     t = tuple(-0.5 * (a + 0.25 * b) for a, b in zip(x, commuting_product(x, x), strict=True))
-    # The integral is Y = ⅓u³ (1 − c₁/5 + 3x/5).
+    # The integral Y = ∫₀ᵘ σ² T⁻² du is ⅓u³ (1 − c₁/5 + 3x/5) to the fifth power of u, with
+    # c₁ = (p + q) u² and the matrix x = X.
     y = _scaled_matrix(_add_to_diagonal(_scaled_matrix(x, 0.6), 1.0 - 0.2 * c1), u * uu / 3)
     return _normalised_sigma(s, _add_to_diagonal(t, 1.0), y)
 

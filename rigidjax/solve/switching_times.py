@@ -254,11 +254,12 @@ def _switchings_of_monotonic(
 def _switchings_of_bent(
     timed_switch: _TimedSwitch, start: Array, end: Array, known: list[Array]
 ) -> _Places:
-    """Return the times, found on a grid, at which a switch changes whose gap may rise and fall.
+    """Return the times at which a switch changes, found on a grid of times.
 
-    A switch is an equation, such as the comparison `t < 1`, with one or more elements. Its gap,
-    here t − 1, is the function of time that shows where the result changes: where the gap is zero
-    or, for functions such as `floor`, where it passes a whole number.
+    A switch is an operation of the torque's program whose result jumps, such as the comparison
+    `t < 1`; it may have several elements. Its gap, here t − 1, is the function of time that shows
+    where the result changes: where the gap is zero or, for functions such as `floor`, where it
+    passes a whole number. This function is for a gap that may rise and fall.
 
     - `timed_switch`: the switch.
     - `start`, `end`: the times between which changes are searched for, s.

@@ -91,7 +91,8 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
 
 
 def _require_one_frame(torque: Any) -> None:
-    """Raise `TypeError` if a torque that needs the absolute body rate is used in a moving frame.
+    """Raise `TypeError` if a torque contains both a law that needs the absolute body rate and the
+    law `BodyInFrame`, with which the body is solved in a moving frame.
 
     In a moving frame of axes, such as that of an orbit, the body rate of a state is relative to the
     frame. `torque` is a torque law, a function of time, state and body, which may consist of

@@ -46,8 +46,8 @@ def test_the_same_as_a_tree_of_axes():
 @pytest.mark.parametrize(
     ("axes", "words"),
     [
-        (lambda law: law.speed, "torque_axes: the torque has no such part"),
-        (lambda law: law.parts[7], "torque_axes: the torque has no such part"),
+        (lambda law: law.speed, "torque_axes: the function selects a part that the torque does not have"),
+        (lambda law: law.parts[7], "torque_axes: the function selects a part that the torque does not have"),
         (lambda law: None, "wanted a function that picks arrays of the law"),
         (lambda law: "no", "wanted a function that picks arrays of the law"),
         (lambda law: law.parts[2], r"wanted 3 rows in torque.parts\[2\].coefficient, got shape \(\)"),

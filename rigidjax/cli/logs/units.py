@@ -58,9 +58,10 @@ def unit_in(name: str, allowed: Sequence[str]) -> str | None:
 
 
 def _usual_spelling(word: str) -> str:
-    """Return a unit in the spelling of `_SPELLINGS`.
+    """Return the text of a unit in small letters, with one spelling of each sign, as in the table
+    `_SPELLINGS`: "°/S" gives "°/s", and "m/s²" gives "m/s2".
 
-    A capital G stays unchanged, since it means gauss.
+    A capital G stays unchanged, since it means gauss, while g is the acceleration of gravity.
     """
     return word.translate(_SIGNS).lower() if word.strip() != "G" else word
 

@@ -70,8 +70,8 @@ def terms_of_recording(
 
 
 def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
-    """Return the terms of the log-density of one recording if no torque is random and no number
-    drifts.
+    """Return the terms of the log-density of one recording if no torque is random and no
+    parameter drifts.
 
     The readings are then independent, and normal about the motion that the equations of motion
     give.

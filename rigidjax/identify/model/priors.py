@@ -92,8 +92,8 @@ class Huber(AbstractLoss):
 
 
 def _checked_weight(value: float) -> Scalar:
-    """Return the weight of a prior (the factor of its divergence) as an array of shape (), and
-    raise `ValueError` unless the number `value` is positive.
+    """Return the weight of a prior, the factor by which its term in the cost is multiplied, as an
+    array of shape (), and raise `ValueError` unless the number `value` is positive.
     """
     return jnp.asarray(_checks.positive_float(value, "weight"), jnp.result_type(float))
 

@@ -132,8 +132,8 @@ def _numbers_of_thicker_body(
     """Return the free numbers of a slightly thicker body, or `None` for a body that is not flat.
 
     A flat body has the moments I1 + I2 = I3, or nearly so. The result is also `None` for a `body`
-    with NaN, for a `chart` that leaves the moments fixed, and for a chart that a user wrote, whose
-    limit is not known.
+    with NaN, for a `chart` that leaves the moments fixed, and for a chart that a user wrote, of
+    which it is not known how it becomes flat.
 
     **Arguments:** `chart` the chart (a map from free numbers to a possible body), whose free
     numbers are returned; `body` the body that may be flat.
