@@ -27,7 +27,7 @@ from rigidjax.motion.manifold import minus, names, parts_by_name
 from rigidjax.solve import difference, validation
 from rigidjax.solve.linear_map import as_known
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
-from rigidjax.solve.sides import with_constant_tables
+from rigidjax.solve.sides import with_constant_pieces
 
 # The tolerance of the second run divided by the tolerance of the run. With this value a method of
 # order 8 takes 1.6 times as many steps.
@@ -552,13 +552,13 @@ def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
       states may be fewer: then the last of them stands for all later times.
 
     **Returns** (32,) s: for each part the time of its most sudden sample, or the start of the run
-    if no sample is sudden. If the torque depends on the time only by tables of numbers over time,
-    or not at all, the array has no times: steps end at the rows of tables in any case.
+    if no sample is sudden. The array has no times if the torque depends on the time only by
+    constant pieces (`Held`, `Pulses`), or not at all: steps end at the jumps of such pieces.
     """
     state0 = jax.tree.map(lambda leaf: leaf[0], ys)
-    # Steps end at each row of a table, between which the table is a straight line.
+    # Steps end at each jump of a law of constant pieces, so that nothing is missed between them.
     field = equations_of_motion(setup.body, state0, setup.torque)
-    field = with_constant_tables(field, ts[0])
+    field = with_constant_pieces(field, ts[0])
     traced = jax.make_jaxpr(lambda t: field(t, state0, None))(ts[0]).jaxpr
     if not any(var is traced.invars[0] for equation in traced.eqns for var in equation.invars):
         return ts[:0]

@@ -22,8 +22,9 @@ from rigidjax.solve.switching import DECLARED
 
 # These laws of this package have jumps of their own; all other laws only pass on the jumps of the
 # laws inside them.
-_TABLES = (Held, Linear, Pulses, Tabulated)
-_OWN = (*_TABLES, Delayed, Lagged)
+_OWN = (Held, Linear, Pulses, Tabulated, Delayed, Lagged)
+# These laws are constant between their jumps.
+_CONSTANT_PIECES = (Held, Pulses)
 
 
 class Sided(eqx.Module):
@@ -100,16 +101,16 @@ class Constant(eqx.Module):
         return self.law(self.time, *args)
 
 
-def with_constant_tables(field: Any, time: Array) -> Any:
-    """Return the field with each table of numbers over time (`Held`, `Linear`, `Tabulated`,
-    `Pulses`) constant at its value at `time`, s.
+def with_constant_pieces(field: Any, time: Array) -> Any:
+    """Return the field with each law of constant pieces (`Held`, `Pulses`) constant at its value at
+    `time`, s.
 
-    The returned field depends on time only through laws that may change between their jumps in
-    another way than by a straight line.
+    The returned field depends on time only through laws that may change between their jumps. A
+    straight line (`Linear`) is one of them: a law may be a short pulse as a function of its value.
     """
-    is_table = lambda node: isinstance(node, _TABLES)  # noqa: E731
-    constant = lambda node: Constant(node, time) if is_table(node) else node  # noqa: E731
-    return jax.tree.map(constant, field, is_leaf=is_table)
+    has_pieces = lambda node: isinstance(node, _CONSTANT_PIECES)  # noqa: E731
+    constant = lambda node: Constant(node, time) if has_pieces(node) else node  # noqa: E731
+    return jax.tree.map(constant, field, is_leaf=has_pieces)
 
 
 def _declares_jumps(node: Any) -> bool:

@@ -70,24 +70,30 @@ def test_smooth_laws_of_time_have_no_sudden_times():
     assert _sudden_times(still._setup, still.ts, still._states).size == 0
 
 
-def test_tables_are_not_searched_for_sudden_times():
+class PulseOfAngle(eqx.Module):
+    """A pulse where a wheel, whose angle is a table of straight lines, passes 2.3 rad."""
+
+    angle: rj.torques.Linear
+
+    def __call__(self, t, state, body):
+        return 50.0 * Z * jnp.exp(-0.5 * ((self.angle(t) - 2.3) / 1e-3) ** 2)
+
+
+def test_constant_pieces_are_not_searched_for_sudden_times():
     from rigidjax.solve.error import _sudden_times
 
-    edges, rows = (
-        jnp.linspace(0.0, 9.0, 31),
-        jnp.asarray(np.random.default_rng(3).normal(size=(31, 3))),
-    )
-    tables = {
-        "pulses": rj.torques.Pulses(edges, rows[:30]),
-        "tabulated": rj.torques.Tabulated(edges, rows),
-    }
-    for name, law in tables.items():
-        alone = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), [0.0, 8.0], law)
-        assert _sudden_times(alone._setup, alone.ts, alone._states).size == 0, name
-        both = rj.torques.Sum(law, gaussian)
-        sol = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), [0.0, 8.0], both)
-        times = np.asarray(_sudden_times(sol._setup, sol.ts, sol._states))
-        assert np.min(np.abs(times - 7.3131)) < 0.05, (name, times)
+    edges, rng = jnp.linspace(0.0, 9.0, 31), np.random.default_rng(3)
+
+    def sudden(law):
+        sol = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), [0.0, 8.0], law)
+        return np.asarray(_sudden_times(sol._setup, sol.ts, sol._states))
+
+    pulses = rj.torques.Pulses(edges, jnp.asarray(rng.normal(size=(30, 3))))
+    assert sudden(pulses).size == 0
+    assert np.min(np.abs(sudden(rj.torques.Sum(pulses, gaussian)) - 7.3131)) < 0.05
+    # A law may be a pulse as a function of a straight line: 0.5 rad/s, 2.3 rad at 4.6 s.
+    angle = rj.torques.Linear(jnp.array([0.0, 9.0]), jnp.array([0.0, 4.5]))
+    assert np.min(np.abs(sudden(PulseOfAngle(angle)) - 4.6)) < 0.05
 
 
 class Until(eqx.Module):
