@@ -149,8 +149,51 @@ def _precession_angle_jvp(primals, tangents):
     (_, _, energy2), (_, d_k, d_energy2) = jax.jvp(
         inverse_inertia_and_energy, (moments, momentum), tangents[:2]
     )
-    _, _, (_, g) = motion_and_derivatives(moments, momentum, period)
+    g = _momentum_integral_of_period(moments, momentum, period)
     along = 0.5 * period * d_energy2 + energy2 * tangents[2]
     along = along + sum(w * a * b for w, a, b in zip(HALF, g, d_k, strict=True))
     h = jnp.sqrt(sum(p * p for p in momentum))
     return _precession_angle(*primals), along / h
+
+
+@jax.custom_jvp
+def _momentum_integral_of_period(moments: Six, momentum: Triple, period: Scalar) -> Six:
+    """Return the six entries (11, 22, 33, 12, 13, 23) of the matrix G = ∫ Π Πᵀ dt over one period
+    of the body rate of a free body, where Π is the body momentum in principal axes.
+
+    - `moments`: the six entries of the inertia tensor in principal axes.
+    - `momentum`: the three components of the body momentum.
+    - `period`: the period of the body rate, s.
+
+    Over a whole period the products of two components cancel. The squares have the means
+    `A₃(1 − p⟨S²⟩)/d₁₃`, `A₁A₃⟨S²⟩` and `A₁(1 − q⟨S²⟩)/d₁₃`, with the numbers A₁, A₃, p and q of
+    `sigma_form.invariants`, d₁₃ = 1/I₁ − 1/I₃, and the mean ⟨S²⟩ of `half_period`.
+    """
+    body, _, _ = inverse_inertia_and_energy(moments, momentum)
+    v = sigma_form.invariants(body, momentum)
+    mean = half_period(Modulus(v.p, v.q, v.gap), jnp.zeros_like(period), period).mean
+    zero = jnp.zeros_like(period)
+    return (
+        period * v.a3 * (1.0 - v.p * mean) / body.d13,
+        period * v.a1 * v.a3 * mean,
+        period * v.a1 * (1.0 - v.q * mean) / body.d13,
+        zero,
+        zero,
+        zero,
+    )
+
+
+@_momentum_integral_of_period.defjvp
+def _momentum_integral_of_period_jvp(primals, tangents):
+    """Return two things: the six entries of the matrix G of `_momentum_integral_of_period`, and
+    their change for a change of the inputs. By this rule JAX takes second derivatives of a period.
+
+    - `primals`: the three inputs of `_momentum_integral_of_period`.
+    - `tangents`: the changes of these three inputs, in the same form.
+
+    The closed form holds for a diagonal inertia tensor alone. Its change with the other entries is
+    that of the integral from 0 to a time, which is known for the whole tensor. The program of this
+    change takes seconds to compile, and first derivatives do not need it.
+    """
+    change = jax.jvp(lambda *at: motion_and_derivatives(*at)[2][1], primals, tangents)[1]
+    return _momentum_integral_of_period(*primals), change

@@ -420,6 +420,25 @@ def _periods_along(i, omega, e):
     return jax.vmap(lambda e: jax.jvp(along, (e,), (jnp.ones(()),)))(e)
 
 
+@pytest.mark.oldest
+def test_second_derivatives_of_the_precession_period():
+    """By the derivatives beside it, along a line that turns the principal axes."""
+    body, rate = (
+        Inertia(jnp.diag(jnp.array([1.0, 1.7, 2.3])) + 0.2 * TURN),
+        jnp.array([0.3, 1, -0.2]),
+    )
+
+    def along(e):
+        moved, omega = Inertia(body.tensor + e * TURN), rate + e * jnp.array([0.3, -0.2, 0.5])
+        return exact.precession_period(moved, omega)
+
+    slope = lambda e: jax.jvp(along, (e,), (jnp.ones(()),))[1]
+    e = 1e-4
+    second = once(lambda at: jax.jvp(slope, (at,), (jnp.ones(()),))[1])(jnp.zeros(()))
+    a, b, c, d = once(jax.vmap(slope))(e * jnp.array([-2.0, -1.0, 1.0, 2.0]))
+    np.testing.assert_allclose(second, (8 * (c - b) - (d - a)) / (12 * e), rtol=1e-7)
+
+
 def test_periods_where_there_is_none():
     @jax.jit
     def both(body, omega):

@@ -22,6 +22,7 @@ from rigidjax.identify.model.normal import NormalMatrix, normal_of
 from rigidjax.identify.model.predict import FixedSteps, HeldSteps
 from rigidjax.identify.model.terms import Blocks, Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
+from rigidjax.rotation.barrier import barrier
 
 # The beginning of a record, of these fractions of its length, is fitted one after the other. A fit
 # to a long record has many wrong minima, in which the phase is wrong by whole turns; a fit to a
@@ -129,7 +130,9 @@ def least_squares_from(
     alone = np.asarray(model.index.alone, int) if model.count >= MANY else None
 
     def evaluate(x: Array) -> tuple[Evaluation, Array, NormalMatrix, Array]:
-        errors, slopes = terms.errors_and_jacobians(model, x)
+        # Without a barrier XLA on CPU computes the derivatives again inside each residual, and the
+        # program takes a fifth longer to compile.
+        errors, slopes = barrier(terms.errors_and_jacobians(model, x))
         residuals, rows = terms.residuals_and_jacobians(
             lambda e: terms.reading_residuals(model, e, noise, weights), errors, slopes
         )
