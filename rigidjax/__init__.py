@@ -25,7 +25,7 @@ from rigidjax import (
     motion as motion,
     solve as solve,
 )
-from rigidjax._names import raise_attribute_error, show
+from rigidjax._names import define_dir_and_getattr, raise_attribute_error
 from rigidjax.body import (
     Inertia as Inertia,
     MassProperties as MassProperties,
@@ -82,7 +82,7 @@ __all__ = [
     "spatial_angular_momentum", "torques", "tumblers", "volumes", "workprecision",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -61,30 +61,36 @@ def array_of_shape(
     if got_shape != shape:
         many = array.ndim > len(shape) and array.shape[array.ndim - len(shape) :] == shape
         advice = hint or ("functions take one body; batch with jax.vmap" if many else "")
-        raise ValueError(f"{name}: wanted shape {shape}, got {array.shape}{_with_hint(advice)}")
+        raise ValueError(
+            f"{name}: wanted shape {shape}, got {array.shape}{_hint_as_message_end(advice)}"
+        )
     return array
 
 
 def array_of_rows(value: object, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
-    """Return `value` as an array (n, *shape) with n rows, converted as by `array_of_shape`."""
+    """Return `value` as an array (n, *shape) of any number n of rows, each of the given `shape`,
+    converted as by `array_of_shape`. **Raises:** the same errors; the texts `name` (of the
+    argument) and `hint` (a likely cause) are for messages.
+    """
     array = numeric_array(value, name)
     if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
         wanted = ", ".join(map(str, ("n", *shape))) + ("," if not shape else "")
-        raise ValueError(f"{name}: wanted shape ({wanted}), got {array.shape}{_with_hint(hint)}")
+        raise ValueError(
+            f"{name}: wanted shape ({wanted}), got {array.shape}{_hint_as_message_end(hint)}"
+        )
     return array
 
 
-def _with_hint(hint: str) -> str:
-    """Return the `hint` as the end of a message, after a semicolon; return an empty text for an
-    empty hint.
+def _hint_as_message_end(hint: str) -> str:
+    """Return the end of a message: a semicolon and the `hint`, or an empty text if the hint is
+    empty.
     """
     return f"; {hint}" if hint else ""
 
 
 def type_name(value: object) -> str:
-    """Return the name of the type of `value` for a message.
-
-    An array is named with its shape; a class is named as a class, with its own name.
+    """Return a text for a message that says of what type `value` is: the shape of an array of JAX,
+    "the class X" for a class X, and the name of its class for any other object.
     """
     if isinstance(value, jax.Array):
         return f"an array of shape {value.shape}"
@@ -92,7 +98,9 @@ def type_name(value: object) -> str:
 
 
 def numeric_array(value: object, name: str, unit: str = "") -> Array:
-    """Return `value` as an array of any shape, converted as by `array_of_shape`."""
+    """Return `value` as a float32 or float64 array of any shape, converted as by `array_of_shape`;
+    `name` and `unit` are the arguments of `array_of_shape`.
+    """
     value = _convert_to_si(value, name, unit)
     try:
         array = jnp.asarray(value)
@@ -101,7 +109,7 @@ def numeric_array(value: object, name: str, unit: str = "") -> Array:
         got += f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
         raise TypeError(f"{name}: wanted an array of numbers, got {got}") from error
     if isinstance(value, np.ndarray) and value.dtype == np.float64 and array.dtype != np.float64:
-        _warn_of_lost_digits()
+        _warn_of_float64_as_float32()
     if jnp.issubdtype(array.dtype, jnp.integer):
         array = array.astype(jnp.result_type(float))
     if array.dtype not in (jnp.float32, jnp.float64):
@@ -127,9 +135,8 @@ def data_and_mask(value: object) -> tuple[Any, np.ndarray | None]:
 
 
 def without_mask(value: object, name: str) -> Any:
-    """Return `value`, or the data of a masked array; refuse masked entries.
-
-    The number under a mask is often a wild reading.
+    """Return `value`; of a masked array of NumPy or astropy return the data alone. **Raises:**
+    `ValueError` if an entry is masked: the number under a mask is often a wrong reading.
     """
     value, mask = data_and_mask(value)
     if mask is not None:
@@ -142,7 +149,8 @@ def without_mask(value: object, name: str) -> Any:
 
 
 def _convert_to_si(value: Any, name: str, si_unit: str = "") -> Any:
-    """Return `value` as plain numbers in SI units if it is a quantity of astropy or pint.
+    """Return `value` as plain numbers in SI units if it is a quantity of astropy or pint, that is,
+    numbers with a unit. **Raises:** `TypeError` if the unit has another dimension.
 
     A `Rotation` of SciPy becomes its quaternion (w, x, y, z), a list is converted item by item, and
     other values are returned unchanged.
@@ -201,12 +209,11 @@ def _powers_of_si_units(value: Any, unit: Any) -> dict[str, Any] | None:
 
 
 def require_same_batch(**arrays: tuple[Array, int]) -> None:
-    """Refuse arrays whose leading axes, those before the last `n` of each, differ.
+    """Raise `ValueError` if arrays that describe the same bodies have different batch axes. A
+    container of many bodies has the same batch axes in every field; one body has none.
 
-    **Arguments:** `name=(array, n)`, for each part of one container. A container of many bodies has
-    equal leading axes everywhere; one body has none.
-
-    **Raises:** `ValueError`.
+    - `arrays`: for each field `name=(array, n)`, where the last n axes of the array belong to one
+      body, and the axes before them are batch axes
     """
     leading = {name: a.shape[: a.ndim - n] for name, (a, n) in arrays.items()}
     if len(set(leading.values())) > 1:
@@ -219,7 +226,7 @@ def require_same_batch(**arrays: tuple[Array, int]) -> None:
 
 
 @functools.cache
-def _warn_of_lost_digits() -> None:
+def _warn_of_float64_as_float32() -> None:
     """Warn, once in a process, that float64 numbers become float32 because JAX computes with 32
     bits (`jax_enable_x64` is off).
     """
@@ -232,24 +239,31 @@ def _warn_of_lost_digits() -> None:
 
 
 def is_known(value: object) -> bool:
-    """Return whether `value` is an array of known numbers, and not traced."""
+    """Return whether all numbers in `value` are known: whether none of its arrays is traced by
+    JAX, as within `jax.jit`, `jax.grad` or `jax.vmap`.
+
+    - `value`: an array, or any tree of arrays
+    """
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
 
 
-def namespace(value: object) -> Any:
-    """Return NumPy for a known `value`, else `jax.numpy`.
+def array_module(value: object) -> ModuleType:
+    """Return the module that a check of `value` computes with: `jax.numpy` if JAX traces `value`,
+    else `numpy`.
 
-    A check of known numbers is done by NumPy on the host: a JAX operation outside `jit` costs some
-    30 µs, and ten of them cost more than a whole short simulation.
+    A check of known numbers is done by NumPy: a JAX operation outside `jit` costs some 30 µs, and
+    ten of them cost more than a whole short simulation.
     """
     return np if is_known(value) else jnp
 
 
 def error_if(value: PyTree, bad: Bool[ArrayLike, "..."], message: str) -> Any:
-    """Return `value` unless `bad`; then raise an error with `message`, also under `jit`.
+    """Return `value`; raise an error with `message`, also under `jit`, if any entry of `bad` is
+    true.
 
-    Outside a trace the error is a `ValueError` with `message` alone. Inside a trace
-    `equinox.error_if` raises the error; the result must be used, or the check is dropped.
+    If `bad` is known, the error is a `ValueError` with `message` alone. If JAX traces `bad`,
+    `equinox.error_if` raises the error when the program runs; the result must be used, or the check
+    is dropped.
     """
     if is_known(bad):
         if bool(np.any(np.asarray(bad))):
@@ -258,9 +272,10 @@ def error_if(value: PyTree, bad: Bool[ArrayLike, "..."], message: str) -> Any:
     return eqx.error_if(value, bad, message)
 
 
-def own_sentence(error: RuntimeError) -> RuntimeError:
-    r"""Return an error of the same type, with the sentence of the check alone, without the long
-    text that Equinox adds.
+def error_without_equinox_text(error: RuntimeError) -> RuntimeError:
+    r"""Return an error of the same type as `error`, whose message is only the sentence of the check
+    that failed, without the long text that Equinox adds. An error of another origin is returned
+    unchanged.
     """
     match = re.search(r"^\S*EquinoxRuntimeError: (.+?)\n\n-+$", str(error), re.M | re.S)
     return type(error)(match[1]) if match else error
@@ -271,62 +286,68 @@ def own_sentence(error: RuntimeError) -> RuntimeError:
 _MANY = 4096
 
 
-def first_bad_row(faults: Callable[[Any, Any], Any], rows: Array | np.ndarray) -> Any:
-    """Return the index of the first of these known rows (n, …) that has a fault, −1 if none has.
+def index_of_first_bad_row(
+    are_bad: Callable[[ModuleType, Any], Any], rows: Array | np.ndarray
+) -> Array | np.ndarray:
+    """Return the index, a scalar, of the first of n rows that is bad, or −1 if none is. The index
+    may be an array of JAX that is still being computed.
 
-    `faults(xp, rows)` returns an array (n,) that is true for the rows with a fault; it uses the
-    functions of `xp`, which is NumPy or `jax.numpy`. Define `faults` once, at the head of a module:
-    for many rows it is compiled, and is compiled again for each new function. The index may be an
-    array of JAX that is still being computed.
+    - `are_bad`: a function (xp, rows) → booleans (n,), true for each bad row, written with the
+      functions of the module `xp`, which is `numpy` or `jax.numpy`. Define it once, at the head of
+      a module: JAX compiles it for many rows, and would compile each new function again.
+    - `rows`: (n, …), not traced
     """
     with np.errstate(invalid="ignore", over="ignore"):
         if rows.shape[0] > _MANY:
             # Compute the index at once also within a trace, where it would otherwise not be known.
             with jax.ensure_compile_time_eval():
-                return _compiled_index_of_first(faults, rows)
-        return _index_of_first_true(np, faults(np, np.asarray(rows)))
+                return _compiled_index_of_first_bad_row(are_bad, rows)
+        return _index_of_first_true(np, are_bad(np, np.asarray(rows)))
 
 
-def _index_of_first_true(xp: ModuleType, bad: Array | np.ndarray) -> Any:
-    """Return the index, a scalar, of the first true entry of the booleans `bad` (n,), or −1 if none
-    is true.
+def _index_of_first_true(xp: ModuleType, booleans: Array | np.ndarray) -> Array | np.ndarray:
+    """Return the index, a scalar, of the first true entry of the `booleans` (n,), or −1 if none is
+    true.
 
-    `xp` is the module of the array, `numpy` or `jax.numpy`.
+    - `xp`: the module of the array, `numpy` or `jax.numpy`
     """
-    return xp.where(bad.any(), xp.argmax(bad), -1)
+    return xp.where(booleans.any(), xp.argmax(booleans), -1)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _compiled_index_of_first(faults: Callable[[Any, Any], Any], rows: Array) -> Array:
-    """Return the index, a scalar, of the first row with a fault, or −1 if no row has one; the
-    search is compiled by JAX.
+def _compiled_index_of_first_bad_row(
+    are_bad: Callable[[ModuleType, Any], Any], rows: Array
+) -> Array | np.ndarray:
+    """Return the index, a scalar, of the first of n rows that is bad, or −1 if none is; JAX
+    compiles the search.
 
-    - `faults`: a function (xp, rows) of the array module and the rows that returns booleans (n,),
-      true for the rows with a fault.
-    - `rows`: (n, …) the rows (entries along the first axis) that are searched.
+    - `are_bad`: a function (xp, rows) → booleans (n,), true for each bad row; `xp` is `jax.numpy`
+    - `rows`: (n, …), the rows are the entries along the first axis
     """
-    return _index_of_first_true(jnp, faults(jnp, rows))
+    return _index_of_first_true(jnp, are_bad(jnp, rows))
 
 
-def _is_not_finite(xp: ModuleType, rows: Array | np.ndarray) -> Any:
-    """Return booleans (n,), one for each of the `rows` (n, …): whether it contains a NaN or an
-    infinity.
+def _are_not_finite(xp: ModuleType, rows: Array | np.ndarray) -> Array | np.ndarray:
+    """Return booleans (n,), one for each of n rows: whether the row contains a NaN or an infinity.
 
-    `xp` is the module of the array, `numpy` or `jax.numpy`.
+    - `xp`: the module of the array, `numpy` or `jax.numpy`
+    - `rows`: (n, …)
     """
     return ~xp.isfinite(rows).reshape(rows.shape[0], -1).all(axis=1)
 
 
 def require_finite(value: Numbers, name: str) -> Numbers:
-    """Return `value`, or refuse it if it contains a NaN or an infinity."""
+    """Return the array `value`. **Raises:** `ValueError` (`equinox` error under `jit`) if it
+    contains a NaN or an infinity; the text `name` names the array in the message.
+    """
     rows: Any = value
     if isinstance(rows, jax.Array) and is_known(rows) and rows.ndim and rows.shape[0] > _MANY:
-        row = int(first_bad_row(_is_not_finite, rows))
+        row = int(index_of_first_bad_row(_are_not_finite, rows))
         if row < 0:
             return value
         place = row, *(int(i) for i in np.argwhere(~np.isfinite(np.asarray(value)[row]))[0])
         raise ValueError(f"{name}: contains NaN or infinity at index {place}")
-    xp = namespace(value)
+    xp = array_module(value)
     bad = ~xp.isfinite(value)
     where = ""
     if xp is np and bad.ndim and bad.any():
@@ -335,34 +356,50 @@ def require_finite(value: Numbers, name: str) -> Numbers:
 
 
 def finite_array(value: object, shape: tuple[int, ...], name: str, **options: Any) -> Array:
-    """Return `value` as `array_of_shape` does; its numbers must be finite if they are known."""
+    """Return `value` as an array of the given `shape`, as `array_of_shape` does. **Raises:** also
+    `ValueError` for a NaN or an infinity, unless JAX traces the array.
+
+    - `options`: further arguments of `array_of_shape`
+    """
     array = array_of_shape(value, shape, name, **options)
     return require_finite(array, name) if is_known(array) else array
 
 
 def scalars(**named: object) -> list[Array]:
-    """Return named numbers, each converted as by `array_of_shape`, in one common precision."""
+    """Return a list of scalar arrays of one dtype, the widest, from numbers that are given as
+    `name=number`; the names are for messages. **Raises:** as `array_of_shape`.
+    """
     numbers = [array_of_shape(value, (), name) for name, value in named.items()]
     return [value.astype(jnp.result_type(*numbers)) for value in numbers]
 
 
 def checked_time(value: object, name: str = "t") -> Array:
-    """Return a time, which is one number; it must be finite if it is known."""
+    """Return a time, s, as a scalar array. **Raises:** as `array_of_shape`, and `ValueError` for a
+    NaN or an infinity, unless JAX traces the time; the text `name` names the time in messages.
+    """
     return finite_array(value, (), name)
 
 
-def require_sign(value: Array, name: str, requirement: str, *, zero: bool = False) -> Array:
-    """Return `value` if all numbers are finite and positive (with `zero`: ≥ 0), or refuse it."""
-    xp = namespace(value)
+def require_positive(
+    value: Array, name: str, requirement: str, *, allow_zero: bool = False
+) -> Array:
+    """Return the array `value`. **Raises:** `ValueError` (`equinox` error under `jit`) if a number
+    is not finite or not positive.
+
+    - `name`: the name of the array, for the message
+    - `requirement`: what was wanted, for the message, such as "a positive mass (kg)"
+    - `allow_zero`: whether a number may also be zero
+    """
+    xp = array_module(value)
     numbers = xp.asarray(value)
-    bad = ~(((numbers >= 0) if zero else (numbers > 0)) & xp.isfinite(numbers))
+    bad = ~(((numbers >= 0) if allow_zero else (numbers > 0)) & xp.isfinite(numbers))
     example = f", got {numbers[bad][0]}" if xp is np and bad.any() else ""
     return error_if(value, bad.any(), f"{name}: wanted {requirement}{example}")
 
 
 def check_if_known(check: Callable[..., Array], value: Array, *args: Any, **options: Any) -> Array:
-    """Return `check(value, …)` if `value` holds known numbers, at least one; else return `value`
-    unchanged.
+    """Return `check(value, *args, **options)` if JAX does not trace the array `value` and the array
+    is not empty; else return `value` unchanged.
     """
     return check(value, *args, **options) if is_known(value) and value.size else value
 
@@ -375,7 +412,10 @@ def require_instance(
     requirement: str = "",
     hint: str = "",
 ) -> Any:
-    """Return `value` if it is an instance of `kinds`, or raise `TypeError` with what was wanted."""
+    """Return `value` if it is an instance of a class in `kinds`. **Raises:** `TypeError` if not.
+    The texts `name` (of the argument), `requirement` (what was wanted; by default the names of the
+    classes) and `hint` (a likely cause) are for the message.
+    """
     if isinstance(value, kinds):
         return value
     if not requirement:
@@ -385,7 +425,9 @@ def require_instance(
     # inertia.
     own = [name for name in ("ys", "inertia") if isinstance(getattr(value, name, None), kinds)]
     hint = hint or (f"give its .{own[0]}" if own else "")
-    raise TypeError(f"{name}: wanted {requirement}, got {type_name(value)}{_with_hint(hint)}")
+    raise TypeError(
+        f"{name}: wanted {requirement}, got {type_name(value)}{_hint_as_message_end(hint)}"
+    )
 
 
 # The shape of each field of one body or one state, by the name of the field.
@@ -395,7 +437,7 @@ _ONE = {
 }  # fmt: skip
 
 
-def require_single(
+def require_unbatched_instance(
     value: object,
     kinds: type | tuple[type, ...],
     name: str,
@@ -403,10 +445,12 @@ def require_single(
     requirement: str = "",
     hint: str = "",
 ) -> Any:
-    """Return `value` if it is an instance of `kinds`, and one body or state, without leading axes.
+    """Return `value` if it is an instance of a class in `kinds`, and one body or one state, not a
+    batch. **Raises:** `TypeError` for another class, `ValueError` for a batch. The texts are those
+    of `require_instance`.
 
-    A container of many bodies has the type of one body; without this check its shape would raise an
-    error in the middle of the arithmetic.
+    A batch of bodies has the class of one body; without this check its shape would raise an error
+    in the middle of the arithmetic.
     """
     require_instance(value, kinds, name, requirement=requirement, hint=hint)
     for field in (field for field in _ONE if field in vars(value)):
@@ -417,11 +461,14 @@ def require_single(
 
 
 def require_function(value: object, name: str, description: str, *, hint: str = "") -> Any:
-    """Return `value` if it is a function and no class.
+    """Return `value` if it is a function. **Raises:** `TypeError` for a class, for anything else
+    that cannot be called, and for a wrong number of arguments.
 
-    `description` describes the arguments and the result in messages, such as "t → (3,)". If it
-    begins with a list of the arguments, as in "(t, state, body) → scalar", the number of arguments
-    is checked.
+    - `name`: the name of the argument, for the message
+    - `description`: the arguments and the result of the function, for the message, such as
+      "t → (3,)". The number of arguments is checked if the text begins with a list of them, as in
+      "(t, state, body) → scalar".
+    - `hint`: a likely cause, for the message
     """
     got = type_name(value)
     if callable(value) and not isinstance(value, type):
@@ -429,7 +476,9 @@ def require_function(value: object, name: str, description: str, *, hint: str = 
         if listed is None or _accepts_arguments(value, len(listed[1].split(","))):
             return value
         got = f"one with other arguments: {inspect.signature(value)}"
-    raise TypeError(f"{name}: wanted a function {description}, got {got}{_with_hint(hint)}")
+    raise TypeError(
+        f"{name}: wanted a function {description}, got {got}{_hint_as_message_end(hint)}"
+    )
 
 
 def _accepts_arguments(value: Callable[..., Any], count: int) -> bool:
@@ -443,7 +492,10 @@ def _accepts_arguments(value: Callable[..., Any], count: int) -> bool:
 
 
 def integer(value: object, name: str, least: int) -> int:
-    """Return `value` as a Python integer of at least `least`, known before anything is compiled."""
+    """Return `value` as a Python integer. **Raises:** `TypeError` for anything but an integer of
+    Python or NumPy, such as a traced number; `ValueError` for one below `least`. The text `name`
+    names the argument in messages.
+    """
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name}: wanted a whole number of Python, got {_number_or_type(value)}")
     if value < least:
@@ -452,7 +504,10 @@ def integer(value: object, name: str, least: int) -> int:
 
 
 def known_float(value: object, name: str) -> float:
-    """Return `value` as one Python float, known before anything is compiled."""
+    """Return `value` as one Python float. **Raises:** `TypeError` for a number that JAX traces, and
+    for what is no number; `ValueError` for several numbers. The text `name` names the argument in
+    messages.
+    """
     array = host_array(value, name)
     if array.shape != ():
         raise ValueError(f"{name}: wanted one number, got shape {array.shape}")
@@ -460,7 +515,10 @@ def known_float(value: object, name: str) -> float:
 
 
 def positive_float(value: object, name: str, requirement: str = "a positive number") -> float:
-    """Return `value` as a positive, finite Python float, known before anything is compiled."""
+    """Return `value` as a Python float that is positive and finite. **Raises:** `ValueError` for
+    any other float, and as `known_float`; the texts `name` (of the argument) and `requirement`
+    (what was wanted) are for messages.
+    """
     number = known_float(value, name)
     if not 0 < number < np.inf:
         raise ValueError(f"{name}: wanted {requirement}, got {number}")
@@ -468,7 +526,9 @@ def positive_float(value: object, name: str, requirement: str = "a positive numb
 
 
 def fraction(value: object, name: str, requirement: str = "a number between 0 and 1") -> float:
-    """Return `value` as a Python float above 0 and below 1."""
+    """Return `value` as a Python float above 0 and below 1. **Raises:** as `positive_float`, and
+    `ValueError` for 1 and more.
+    """
     number = positive_float(value, name, requirement)
     if not number < 1:
         raise ValueError(f"{name}: wanted {requirement}, got {number}")
@@ -476,13 +536,17 @@ def fraction(value: object, name: str, requirement: str = "a number between 0 an
 
 
 def nonnegative_float(value: object, name: str) -> float:
-    """Return `value` as a finite Python float ≥ 0, known before anything is compiled."""
+    """Return `value` as a finite Python float ≥ 0. **Raises:** `ValueError` for any other float,
+    and as `known_float`.
+    """
     number = known_float(value, name)
     return 0.0 if number == 0 else positive_float(number, name, "a number ≥ 0")
 
 
 def host_array(value: object, name: str) -> np.ndarray:
-    """Return known numbers as a NumPy array of floats; refuse traced arrays and other values."""
+    """Return numbers as a NumPy array of floats. **Raises:** `TypeError` for numbers that JAX
+    traces, and for what are no numbers; the text `name` names the argument in the message.
+    """
     if isinstance(value, Tracer):
         raise TypeError(
             f"{name}: wanted numbers that are known, got a traced array; this works on the host: "
@@ -500,7 +564,9 @@ def host_array(value: object, name: str) -> np.ndarray:
 
 
 def file_path(value: Any, name: str = "path") -> Path:
-    """Return the path of a file from its name, `value`."""
+    """Return the `Path` of a file whose name is `value`. **Raises:** `TypeError` if `value` is
+    empty, or neither a text nor a path; the text `name` names the argument in the message.
+    """
     named = isinstance(value, str | os.PathLike) and isinstance(os.fspath(value), str)
     if not named or value == "":
         raise TypeError(f"{name}: wanted the name of a file, got {_number_or_type(value)}")
@@ -508,7 +574,9 @@ def file_path(value: Any, name: str = "path") -> Path:
 
 
 def escape_controls(text: object) -> str:
-    """Return the text with control characters (escapes, ends of line) as Python writes them."""
+    """Return the text in which control characters, such as an end of line, are replaced by what
+    Python writes for them, such as a backslash and n.
+    """
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
 
 
@@ -521,21 +589,26 @@ def escape_formulas(text: object) -> str:
 
 
 def require_option(value: object, options: Sequence[str], name: str) -> str:
-    """Return `value` if it is one of `options`."""
+    """Return `value` if it is one of the texts in `options`. **Raises:** `ValueError` if not; the
+    text `name` names the argument in the message.
+    """
     if isinstance(value, str) and value in options:
         return value
     raise ValueError(f"{name}: wanted one of {', '.join(options)}, got {_number_or_type(value)}")
 
 
 def _number_or_type(value: object) -> str:
-    """Return a number or a text as Python writes it, and the name of the type for any other
-    `value`; it stands in messages after "got".
+    """Return what stands in a message after "got": a number or a text as Python writes it, and the
+    name of the type for any other `value`.
     """
     return repr(value) if isinstance(value, int | float | str) else type(value).__name__
 
 
-def random_key(value: object, name: str = "key") -> Any:
-    """Return `value` if it is one random key of JAX, of the new or of the old type."""
+def random_key(value: object, name: str = "key") -> Array:
+    """Return `value` if it is one random key of JAX, as `jax.random.key` (the new type) or
+    `jax.random.PRNGKey` (the old type) makes it. **Raises:** `TypeError` if not; the text `name`
+    names the argument in the message.
+    """
     array = isinstance(value, jax.Array)
     if array and jnp.issubdtype(value.dtype, jax.dtypes.prng_key) and value.shape == ():
         return value
@@ -548,8 +621,14 @@ def random_key(value: object, name: str = "key") -> Any:
     )
 
 
-def import_library(module: str, extra: str, caller: str) -> Any:
-    """Import the module and return it, or raise an error that names the extra to install."""
+def import_library(module: str, extra: str, caller: str) -> ModuleType:
+    """Import the module of an optional package, and return it. **Raises:** `ModuleNotFoundError`
+    if the package is missing, with the command `pip install 'rigidjax[extra]'`.
+
+    - `module`: the name of the module
+    - `extra`: the name of the group of optional packages of rigidjax that contains the package
+    - `caller`: what needs the module, such as a function or a file, by its name, for the message
+    """
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -557,8 +636,11 @@ def import_library(module: str, extra: str, caller: str) -> Any:
         raise ModuleNotFoundError(words, name=module) from error
 
 
-def float_type(value: Any, name: str = "dtype") -> Any:
-    """Return the dtype that `value` names, float32 or float64 (`float`: JAX's default)."""
+def float_type(value: Any, name: str = "dtype") -> np.dtype:
+    """Return the dtype float32 or float64 that `value` names; for the type `float` return JAX's
+    default of the two. **Raises:** `TypeError` for anything else; the text `name` names the
+    argument in the message.
+    """
     if value is float:
         return jnp.result_type(float)
     try:
@@ -571,7 +653,9 @@ def float_type(value: Any, name: str = "dtype") -> Any:
 
 
 def advice_for_large_times(dtype: DTypeLike) -> str:
-    """Return the advice for times that are so large that `dtype` cannot resolve their steps."""
+    """Return the end of a message for times that are so large that a step is lost when it is added
+    to a time of this `dtype`: an advice what to do.
+    """
     if np.dtype(dtype) == np.float64:
         return "count time from a later origin, such as the first time of the run"
     return "count time from a later origin, or use float64"

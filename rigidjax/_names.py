@@ -7,45 +7,50 @@ import functools
 import sys
 from importlib.util import find_spec
 from types import ModuleType
+from typing import NoReturn
 
 _NOT_MODELLED = ("joint", "contact", "hinge", "constraint", "collide", "render", "flexib", "urdf")
 
 
-def show(module: str) -> None:
-    """Make `dir` of a module list its `__all__`; a wrong name calls `raise_attribute_error`."""
-    here = sys.modules[module]
+def define_dir_and_getattr(module_name: str) -> None:
+    """Define `__dir__` and `__getattr__` of a module: `dir` then lists the names in its `__all__`,
+    and a name that the module lacks calls `raise_attribute_error`.
+
+    - `module_name`: the full name of the module, which its code gives as `__name__`
+    """
+    here = sys.modules[module_name]
     vars(here).update(
         __dir__=lambda: sorted(here.__all__),
-        __getattr__=functools.partial(raise_attribute_error, module),
+        __getattr__=functools.partial(raise_attribute_error, module_name),
     )
 
 
-def raise_attribute_error(module: str, name: str) -> ModuleType:
-    """Raise `AttributeError` for a name that the module lacks, with the nearest public names."""
-    here, hint = sys.modules[module], ""
-    if module == "rigidjax" and any(word in name.lower() for word in _NOT_MODELLED):
+def raise_attribute_error(module_name: str, name: str) -> NoReturn:
+    """Raise `AttributeError` for a `name` that a module lacks; the message contains the one or two
+    public names of the library that are nearest to it.
+    """
+    here, hint = sys.modules[module_name], ""
+    if module_name == "rigidjax" and any(word in name.lower() for word in _NOT_MODELLED):
         hint = (
             "; contact, joints, trees of bodies, flexibility and rendering are not modelled: take "
             "MuJoCo MJX, Brax or Drake"
         )
     # Tools ask for hidden names, and the import system for modules that are not loaded yet.
-    elif name[0] != "_" and not (hasattr(here, "__path__") and find_spec(f"{module}.{name}")):
-        paths = _public_paths()
+    elif name[0] != "_" and not (hasattr(here, "__path__") and find_spec(f"{module_name}.{name}")):
+        paths = _public_paths_by_name()
         # `fit` and `Fit` are two names: the name as it was written is looked up before the name in
         # small letters.
         same = next((one for one in (name, name.lower()) if one in paths), None)
         near = [same] if same else difflib.get_close_matches(name.lower(), paths, n=4, cutoff=0.75)
         nearest = list(dict.fromkeys(paths[one] for one in near))[:2]
         hint = f"; did you mean {' or '.join(nearest)}?" if nearest else ""
-    raise AttributeError(f"module {module!r} has no attribute {name!r}{hint}", name=name)
+    raise AttributeError(f"module {module_name!r} has no attribute {name!r}{hint}", name=name)
 
 
 @functools.cache
-def _public_paths() -> dict[str, str]:
-    """Return the shortest path, such as `rj.torques.Sum`, of each public name of the library, by
-    name.
-
-    Each name is a key of the dictionary as it is written, and also in lower case.
+def _public_paths_by_name() -> dict[str, str]:
+    """Return a dictionary from each public name of the library to its shortest path: from `Sum` to
+    `rj.torques.Sum`, for example. Each name is a key as it is written, and also in lower case.
     """
     modules, paths = [("rj", sys.modules["rigidjax"])], {}
     for path, module in modules:

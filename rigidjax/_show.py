@@ -17,7 +17,10 @@ _RATE_UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.p
 
 
 def fields_as_text(self: Any) -> str:
-    """Return `Name(field=numbers, …)`; a traced or large array is shown by its shape."""
+    """Return the text that `print` shows for an object with fields, such as a state or a body: the
+    name of its class, and each field with its numbers, `Name(field=numbers, …)`. A field that is
+    `None` is left out; a traced or large array is shown by its dtype and shape.
+    """
     fields = [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.repr]
     fields = [(name, value) for name, value in fields if value is not None]
     parts = ", ".join(f"{name}={as_text(value)}" for name, value in fields)
@@ -25,8 +28,8 @@ def fields_as_text(self: Any) -> str:
 
 
 def as_text(value: object) -> str:
-    """Return the numbers of an array as text; of a traced array, and of an array with more than
-    `MOST` numbers, return the shape.
+    """Return the numbers of an array as text. For an array that JAX traces, or that has more than
+    `MOST` numbers, the text is its dtype and shape; any other `value` is written as Equinox does.
     """
     is_array = isinstance(value, (jax.Array, np.ndarray))
     if not is_array or isinstance(value, Tracer) or value.size > MOST:
@@ -34,14 +37,18 @@ def as_text(value: object) -> str:
     return _nested_as_text(np.asarray(value).tolist())
 
 
-def time_as_text(t: Any, span: Any, digits: int = 6) -> str:
-    """Return the time `t` as text, so that differences of `span` (the duration of the record) keep
-    `digits` digits.
+def time_as_text(t: Any, duration: Any, digits: int = 6) -> str:
+    """Return the time `t` as text, with so many digits that the difference of two times of a record
+    is known to `digits` digits of its `duration`.
 
-    A time that is large beside the span, such as seconds since 1970, has more digits.
+    A time that is large beside the duration, such as seconds since 1970, is written with more
+    digits.
+
+    - `t`: one number, s
+    - `duration`: one number, s, the time from the first to the last reading of the record
     """
-    t, span = float(t), float(span)
-    more = np.log10(abs(t) / span) if span > 0 and 0 < abs(t) < np.inf else 0.0
+    t, duration = float(t), float(duration)
+    more = np.log10(abs(t) / duration) if duration > 0 and 0 < abs(t) < np.inf else 0.0
     return f"{t:.{digits + max(0, int(np.ceil(more)))}g}"
 
 
@@ -52,11 +59,12 @@ def _nested_as_text(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def shown_unit(unit: str, rate_unit: str) -> tuple[float, str]:
-    """Return the factor by which a value with `unit` is multiplied to be shown, and the unit then.
+def scale_and_unit_to_show(unit: str, rate_unit: str) -> tuple[float, str]:
+    """Return two things: the factor by which a value is multiplied before a report shows it; and
+    the unit of the product. Only values in rad/s are converted; for any other unit the factor is 1.
 
-    **Arguments:** `unit` of the value; `rate_unit` the unit in which angular rates are shown:
-    `rad/s`, `deg/s` or `deg/day`. Only values in rad/s are converted.
+    - `unit`: the unit of the value
+    - `rate_unit`: the unit in which angular rates are shown: `rad/s`, `deg/s` or `deg/day`
     """
     scale = _RATE_UNITS[_checks.require_option(rate_unit, tuple(_RATE_UNITS), "rate_unit")]
     return (float(scale), rate_unit) if unit == "rad/s" else (1.0, unit)

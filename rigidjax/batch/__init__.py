@@ -14,7 +14,7 @@ process ends early, every other process ends within `patience` seconds (an argum
 `distributed.connect`); `distributed.recover` reads the shares that had been written before.
 """
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.batch import distributed as distributed
 from rigidjax.batch.rollout import rollout as rollout
 from rigidjax.batch.sharding import compiler_options as compiler_options
@@ -22,4 +22,4 @@ from rigidjax.batch.simulate import Steps as Steps, simulate as simulate
 
 __all__ = ["Steps", "compiler_options", "distributed", "rollout", "simulate"]
 
-show(__name__)
+define_dir_and_getattr(__name__)

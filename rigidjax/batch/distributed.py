@@ -16,7 +16,7 @@ from jax.experimental import multihost_utils
 from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 
 
 def connect(address: str, processes: int, process: int, *, patience: int = 20) -> None:
@@ -252,4 +252,4 @@ def _exchange_arrays(
 
 __all__ = ["connect", "gather", "recover", "save", "share", "total"]
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -13,12 +13,12 @@ from jaxtyping import Array, ArrayLike, PyTree
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
-from rigidjax.body.validation import first_impossible_row
+from rigidjax.body.validation import index_of_first_impossible_inertia
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
-from rigidjax.rotation.validation import tolerance
+from rigidjax.rotation.validation import rotation_tolerance
 from rigidjax.solve import validation
 
 # The type of `torque_axes`, which says which arrays of a torque have a row for each body: 0 for
@@ -255,7 +255,7 @@ def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
         except ValueError as error:
             raise ValueError(f"bodies: {error}; this is body {i}") from None
 
-    return bodies, [(first_impossible_row(tensors), refuse)]
+    return bodies, [(index_of_first_impossible_inertia(tensors), refuse)]
 
 
 def _check_unit_quaternions(q: Array) -> list[Check]:
@@ -275,7 +275,7 @@ def _check_unit_quaternions(q: Array) -> list[Check]:
             "normalise with rigidjax.quaternion.normalise, and mind that the scalar is first"
         )
 
-    return [(_checks.first_bad_row(_is_not_unit, q), refuse)]
+    return [(_checks.index_of_first_bad_row(_is_not_unit, q), refuse)]
 
 
 def _is_not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
@@ -284,7 +284,7 @@ def _is_not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
     A difference of at most 1e-6 in float64, or 1e-3 in float32, is not counted. `xp` is the module
     that computes: NumPy or `jax.numpy`.
     """
-    return xp.abs(xp.sqrt(xp.sum(xp.square(q), axis=-1)) - 1) > tolerance(q.dtype)
+    return xp.abs(xp.sqrt(xp.sum(xp.square(q), axis=-1)) - 1) > rotation_tolerance(q.dtype)
 
 
 def step_of(step_size: ScalarLike, num_steps: int, dtype: np.dtype) -> tuple[Array, int]:

@@ -2,7 +2,7 @@
 `rj.parameters`.
 """
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.body.divergence import divergence as divergence
 from rigidjax.body.energy import (
     angular_momentum as angular_momentum,
@@ -25,4 +25,4 @@ __all__ = [
     "read_inertials", "spatial_angular_momentum", "write_inertials",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

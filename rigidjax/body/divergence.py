@@ -12,14 +12,16 @@ from rigidjax.rotation.linalg3 import dot
 
 
 def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
-    """Return the entropic (Bregman, log-determinant) divergence of two bodies, without units.
+    """Return the entropic (Bregman, log-determinant) divergence of two bodies, without units: a
+    measure of how different their masses, centres of mass and second moments are.
 
-    `D = Tr(J₀⁻¹ J) − log det(J₀⁻¹ J) − 4` with the 4×4 pseudo-inertia `J = [[𝔖 + m c cᵀ, m c], [m
-    cᵀ, m]]`. The divergence is zero only if the bodies are equal, convex in J, and infinite at
-    plates and rods. It does not change if both bodies are expressed in another frame or in other
-    units. It is twice the Kullback–Leibler divergence of the masses as Gaussians. Its error is the
-    round-off of the trace. Add `weight * divergence(body, guess)` to a loss: quantities that the
-    data do not determine then stay near the guess.
+    `D = Tr(J₀⁻¹ J) − log det(J₀⁻¹ J) − 4`, where J is the 4×4 pseudo-inertia of `body`, and J₀ that
+    of `reference`: `J = [[𝔖 + m c cᵀ, m c], [m cᵀ, m]]`, with the mass m, the centre of mass c and
+    the second moment 𝔖 about it. The divergence is zero only if the bodies are equal, convex in J,
+    and infinite at plates and rods. It does not change if both bodies are expressed in another
+    frame or in other units. It is twice the Kullback–Leibler divergence of the masses as Gaussians.
+    Its error is the round-off of the trace. Add `weight * divergence(body, guess)` to a loss:
+    quantities that the data do not determine then stay near the guess.
 
     **Arguments:** `body`; `reference`, a body with a positive definite 𝔖, in the frame and units of
     `body`. Source: Lee, Wensing and Park 2020, "Geometric robot dynamic identification: a convex
@@ -29,8 +31,8 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     >>> abs(float(divergence(body, body))) < 1e-14
     True
     """
-    _checks.require_single(body, MassProperties, "body")
-    _checks.require_single(reference, MassProperties, "reference")
+    _checks.require_unbatched_instance(body, MassProperties, "body")
+    _checks.require_unbatched_instance(reference, MassProperties, "reference")
     ratio = body.mass / reference.mass
     # Cholesky factors are used, since cofactors lose twice as many digits for a long, thin body.
     root = jnp.linalg.cholesky(reference.second_moment / reference.mass)

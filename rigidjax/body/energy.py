@@ -69,7 +69,7 @@ def kinetic_energy_about(
     velocity = _checks.array_of_shape(velocity, (3,), "velocity")
     omega = _checks.array_of_shape(omega, (3,), "omega")
     about_origin = body.inertia_about(jnp.zeros_like(body.com)).tensor
-    swing = quaternion.rotate(validation.attitude_quaternion(q), cross(omega, body.com))
+    swing = quaternion.rotate(validation.checked_attitude_quaternion(q), cross(omega, body.com))
     return (
         0.5 * body.mass * dot(velocity, velocity)
         + body.mass * dot(velocity, swing)
@@ -78,11 +78,12 @@ def kinetic_energy_about(
 
 
 def kinetic_energy_of_matrix_rate(second_moment: Matrix, matrix_rate: Matrix) -> Scalar:
-    """Return the energy of rotation, J: `½ Tr(Ṁ 𝔖 Ṁᵀ) = ½ Tr(J'ᵀ J' 𝔖)` (notes, eqs 63, 65 with the
-    factor ½).
+    """Return the kinetic energy of rotation, J, from the rate of the rotation matrix M: `½ Tr(Ṁ 𝔖
+    Ṁᵀ) = ½ Tr(J'ᵀ J' 𝔖)` (notes, eqs 63, 65 with the factor ½).
 
-    **Arguments:** `second_moment` (3, 3) 𝔖, kg m², body frame; `matrix_rate` (3, 3), 1/s: dM/dt of
-    the rotation matrix body → world, or its generator in the body `J' = Mᵀ Ṁ = hat(Ω)`.
+    **Arguments:** `second_moment` (3, 3) 𝔖, kg m², body frame; `matrix_rate` (3, 3), 1/s: either
+    Ṁ = dM/dt, where M is body → world, or the matrix `J' = Mᵀ Ṁ = hat(Ω)` of the cross product with
+    the body rate Ω; both give the same energy.
 
     >>> kinetic_energy_of_matrix_rate(jnp.eye(3), jnp.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]))
     Array(1., dtype=float64)
@@ -120,7 +121,7 @@ def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude)
     """
     hint = "in the body frame use angular_momentum"
     wanted = "a state with an attitude (.q)"
-    _checks.require_single(state, HasAttitude, "state", requirement=wanted, hint=hint)
+    _checks.require_unbatched_instance(state, HasAttitude, "state", requirement=wanted, hint=hint)
     momentum = quaternion.rotate(state.q, angular_momentum(body, state))
     if isinstance(body, MassProperties) and isinstance(state, HasPose):
         momentum = momentum + body.mass * cross(state.x, state.v)
@@ -162,10 +163,12 @@ def ellipsoid(
         solid = validation.require_single_body(body, MassProperties, "body")
         second_moments, q = principal(solid.second_moment)
         return jnp.sqrt(5.0 * second_moments / solid.mass), q
-    one = _checks.require_single(body, (Inertia, MassProperties), "body", hint=_HINT)
+    one = _checks.require_unbatched_instance(body, (Inertia, MassProperties), "body", hint=_HINT)
     moments, q = Inertia(tensor_of(one)).require_invertible().principal()
     wanted = "a number ≥ 0, J" if kind == "energy" else "a number ≥ 0, kg m²/s"
-    size = _checks.require_sign(_checks.array_of_shape(size, (), "size"), "size", wanted, zero=True)
+    size = _checks.require_positive(
+        _checks.array_of_shape(size, (), "size"), "size", wanted, allow_zero=True
+    )
     return (jnp.sqrt(2.0 * size / moments) if kind == "energy" else size / moments), q
 
 

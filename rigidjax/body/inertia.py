@@ -28,11 +28,11 @@ from rigidjax.body import validation
 from rigidjax.body.principal_axes import eigensystem, principal
 from rigidjax.body.symmetric3 import (
     apply as apply,
+    inertia_from_second_moment,
     inverse as inverse,
     outer,
     product,
-    swap_trace,
-    swap_trace_back,
+    second_moment_from_inertia,
 )
 from rigidjax.rotation import quaternion
 
@@ -80,7 +80,7 @@ class Inertia(eqx.Module):
         (3, 3)
         """
         a = _checks.array_of_shape(tensor, (3, 3), "inertia tensor")
-        return Inertia(validation.require_real_inertia(a))
+        return Inertia(validation.require_physical_inertia(a))
 
     @staticmethod
     def from_principal(i1: ScalarLike, i2: ScalarLike, i3: ScalarLike) -> "Inertia":
@@ -90,7 +90,9 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 3.0).tensor[2, 2]
         Array(3., dtype=float64)
         """
-        moments = validation.require_real_moments(jnp.stack(_checks.scalars(i1=i1, i2=i2, i3=i3)))
+        moments = validation.require_physical_moments(
+            jnp.stack(_checks.scalars(i1=i1, i2=i2, i3=i3))
+        )
         return Inertia(jnp.diag(moments))
 
     @staticmethod
@@ -105,12 +107,12 @@ class Inertia(eqx.Module):
         Array([1., 2., 3.], dtype=float64)
         """
         s = _checks.array_of_shape(second_moment, (3, 3), "second moment", unit="kg m²")
-        return Inertia(swap_trace(validation.require_real_second_moment(s)))
+        return Inertia(inertia_from_second_moment(validation.require_physical_second_moment(s)))
 
     @property
     def second_moment(self) -> Float[Array, "*batch 3 3"]:
         """Return 𝔖 = ½ Tr(I) 1 − I, (3, 3), kg m², body frame (notes, eqs 76–78 solved)."""
-        return swap_trace_back(self.tensor)
+        return second_moment_from_inertia(self.tensor)
 
     @property
     def moments(self) -> Vec3:
@@ -145,7 +147,7 @@ class Inertia(eqx.Module):
         )
         if self.scale is not None:
             raise ValueError("shift: wanted an inertia in kg m², got one of arbitrary scale")
-        return Inertia(self.tensor + swap_trace(m * outer(r, r)))
+        return Inertia(self.tensor + inertia_from_second_moment(m * outer(r, r)))
 
     def rotate(self, q: Quaternion) -> "Inertia":
         """Return the inertia of the turned body, or of the body in other axes: `R(q) I R(q)ᵀ`.
@@ -157,14 +159,14 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 2.5).rotate([half, 0, 0, half]).tensor[0, 0]
         Array(2., dtype=float64)
         """
-        m = quaternion.to_matrix(validation.attitude_quaternion(q))
+        m = quaternion.to_matrix(validation.checked_attitude_quaternion(q))
         return Inertia(product(m, product(self.tensor, m.T)), self.scale)
 
     def require_invertible(self) -> "Inertia":
-        """Return `self`. **Raises:** `ValueError` if a moment is zero: Euler's equations divide by
-        the moments.
+        """Return `self`. **Raises:** `ValueError` (`equinox` error under `jit`) if a moment is
+        zero: Euler's equations divide by the moments.
         """
-        return validation.check_body(self, self.tensor, None, throw=True)
+        return validation.require_physical_body(self, self.tensor, None, throw=True)
 
     def __add__(self, other: "Inertia") -> "Inertia":
         """Return the inertia of two bodies that turn as one about one point, in common axes."""
@@ -206,33 +208,35 @@ class MassProperties(eqx.Module):
         )
         _checks.require_same_batch(mass=(mass, 0), com=(com, 1), second_moment=(s, 2))
         dtype = jnp.result_type(mass, com, s)
-        mass = _checks.check_if_known(validation.require_real_mass, mass.astype(dtype))
+        mass = _checks.check_if_known(validation.require_physical_mass, mass.astype(dtype))
         # A traced mass that is not positive makes the body NaN; the method `check` raises an error
         # instead.
         self.mass = mass if _checks.is_known(mass) else jnp.where(mass > 0, mass, jnp.nan)
         self.com = _checks.check_if_known(_checks.require_finite, com.astype(dtype), "com")
         self.second_moment = _checks.check_if_known(
-            validation.require_real_second_moment, s.astype(dtype)
+            validation.require_physical_second_moment, s.astype(dtype)
         )
 
     @property
     def inertia(self) -> Inertia:
         """Return the inertia about the centre of mass, body axes."""
-        return Inertia(swap_trace(self.second_moment))
+        return Inertia(inertia_from_second_moment(self.second_moment))
 
     def check(self) -> "MassProperties":
         """Return an equal body whose values are checked, also under `jit`. **Raises:** as the
         constructor.
         """
         return MassProperties(
-            validation.require_real_mass(self.mass),
+            validation.require_physical_mass(self.mass),
             _checks.require_finite(self.com, "com"),
-            validation.require_real_second_moment(self.second_moment),
+            validation.require_physical_second_moment(self.second_moment),
         )
 
     def require_invertible(self) -> "MassProperties":
-        """Return `self`. **Raises:** `ValueError` if a moment about the centre of mass is zero."""
-        return validation.check_body(self, self.inertia.tensor, self.mass, throw=True)
+        """Return `self`. **Raises:** `ValueError` (`equinox` error under `jit`) if a moment about
+        the centre of mass is zero.
+        """
+        return validation.require_physical_body(self, self.inertia.tensor, self.mass, throw=True)
 
     def second_moment_about(self, point: Vector) -> Mat3:
         """Return 𝔖 about another point, (3, 3), kg m², body axes: `𝔖 + m d dᵀ`, `d = c − point`.
@@ -255,7 +259,7 @@ class MassProperties(eqx.Module):
         >>> body.inertia_about([0.0, 0, 0]).moments
         Array([2., 4., 4.], dtype=float64)
         """
-        return Inertia(swap_trace(self.second_moment_about(point)))
+        return Inertia(inertia_from_second_moment(self.second_moment_about(point)))
 
     def shift(self, r: Vector) -> "MassProperties":
         """Return the body shifted by `r` (3,), m, in its own axes: only its centre of mass changes.
@@ -275,7 +279,7 @@ class MassProperties(eqx.Module):
         >>> body.rotate([0.0, 0, 0, 1]).com
         Array([-1.,  0.,  0.], dtype=float64)
         """
-        m = quaternion.to_matrix(validation.attitude_quaternion(q))
+        m = quaternion.to_matrix(validation.checked_attitude_quaternion(q))
         second_moment = product(m, product(self.second_moment, m.T))
         return MassProperties(self.mass, apply(m, self.com), second_moment)
 
@@ -314,8 +318,8 @@ Body = Inertia | MassProperties
 
 
 def tensor_of(body: Body) -> Float[Array, "*batch 3 3"]:
-    """Return the inertia tensor (3, 3), kg m², of an `Inertia` or `MassProperties`; of
-    `MassProperties` the one about the centre of mass.
+    """Return the inertia tensor (3, 3), kg m², of a body, an `Inertia` or `MassProperties`; for
+    `MassProperties` the tensor is about the centre of mass.
     """
     return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
 
@@ -324,14 +328,15 @@ OneBody = TypeVar("OneBody", bound=Body)
 
 
 def with_tensor(body: OneBody, tensor: Mat3) -> OneBody:
-    """Return `body`, an `Inertia` or `MassProperties`, with another inertia tensor. The tensor is
-    not checked, since a part of a body need not be a real body.
+    """Return a copy of `body`, an `Inertia` or `MassProperties`, with another inertia tensor. The
+    tensor is not checked, since the inertia of a part of a body, such as what is left without its
+    wheels, need not be that of a real body.
 
     - `tensor`: (3, 3), kg m², body frame; of `MassProperties`, about the centre of mass
     """
     if isinstance(body, Inertia):
         return Inertia(tensor)  # pyright: ignore[reportReturnType]
-    return eqx.tree_at(lambda b: b.second_moment, body, swap_trace_back(tensor))
+    return eqx.tree_at(lambda b: b.second_moment, body, second_moment_from_inertia(tensor))
 
 
 def _add_mass(

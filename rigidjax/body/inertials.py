@@ -53,7 +53,7 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
         raise ValueError(faults[0])
     for words in [f"{fault}; this body is left out" for fault in faults]:
         warnings.warn(words, stacklevel=2)
-    for words in _settings_warnings(root):
+    for words in _mujoco_setting_warnings(root):
         warnings.warn(f"{path}: {words}", stacklevel=2)
     return bodies
 
@@ -74,9 +74,9 @@ _CHANGES = {
 }
 
 
-def _settings_warnings(root: Tree.Element) -> list[str]:
-    """Return a list of warnings, one for each setting in an XML file with which MuJoCo would not
-    use the `<inertial>` elements of the file as they are written, and one if the file includes
+def _mujoco_setting_warnings(root: Tree.Element) -> list[str]:
+    """Return a list of warnings: one for each setting of an XML file because of which MuJoCo would
+    not take the masses and inertias as they are written in the file; and one if the file includes
     other files.
 
     - `root`: the root element of the file
@@ -85,24 +85,24 @@ def _settings_warnings(root: Tree.Element) -> list[str]:
     for compiler in root.iter("compiler"):
         for key, unchanged in _UNCHANGED.items():
             value = compiler.get(key)
-            if value is not None and not _is_among(value, unchanged):
+            if value is not None and not _equals_one_of(value, unchanged):
                 words.append(f'{key}="{value}": MuJoCo {_CHANGES[key]}; read as written')
     if next(root.iter("include"), None) is not None:
         words.append("<include>: bodies in other files are not read")
     return words
 
 
-def _is_among(value: str, words: Sequence[str]) -> bool:
-    """Return whether an attribute in an XML file equals one of several words; the attribute and the
-    words are compared as numbers if all of them are numbers.
+def _equals_one_of(value: str, options: Sequence[str]) -> bool:
+    """Return whether an attribute in an XML file equals one of several texts. The texts are
+    compared as numbers if all of them are numbers: "0.0" equals "0".
 
     - `value`: the text of the attribute
-    - `words`: the words
+    - `options`: the texts with which it is compared
     """
     try:
-        return float(value) in map(float, words)
+        return float(value) in map(float, options)
     except ValueError:
-        return value.strip() in words
+        return value.strip() in options
 
 
 def write_inertials(
@@ -128,7 +128,7 @@ def write_inertials(
     root, nodes = _read_bodies_by_name(source)
     write = _write_to_urdf if root.tag == "robot" else _write_to_mujoco
     for name, body in bodies.items():
-        _checks.require_single(body, MassProperties, f"bodies[{name!r}]")
+        _checks.require_unbatched_instance(body, MassProperties, f"bodies[{name!r}]")
         if name not in nodes:
             raise ValueError(f"{source}: no body {name!r}; there are {', '.join(nodes)}")
         inertial = nodes[name].find("inertial")
@@ -169,12 +169,14 @@ def _body_from_urdf(inertial: Tree.Element) -> MassProperties:
     origin, mass, inertia = (inertial.find(tag) for tag in ("origin", "mass", "inertia"))
     if mass is None or inertia is None:
         raise ValueError("wanted a <mass> and an <inertia>")
-    place = _read_numbers(origin, "xyz", 3, [0.0] * 3)
+    com = _read_numbers(origin, "xyz", 3, [0.0] * 3)
     # The turns are about fixed axes: roll about x, then pitch about y, then yaw about z.
-    turn = euler.to_matrix(_read_numbers(origin, "rpy", 3, [0.0] * 3), "xyz")
+    rotation = euler.to_matrix(_read_numbers(origin, "rpy", 3, [0.0] * 3), "xyz")
     diagonal = [_read_numbers(inertia, key, 1)[0] for key in _KEYS[:3]]
     others = [_read_numbers(inertia, key, 1, [0.0])[0] for key in _KEYS[3:]]
-    return _body_from_parts(_read_numbers(mass, "value", 1)[0], place, turn, [*diagonal, *others])
+    return _body_from_numbers(
+        _read_numbers(mass, "value", 1)[0], com, rotation, [*diagonal, *others]
+    )
 
 
 def _body_from_mujoco(inertial: Tree.Element) -> MassProperties:
@@ -191,29 +193,29 @@ def _body_from_mujoco(inertial: Tree.Element) -> MassProperties:
         six = _read_numbers(inertial, "fullinertia", 6)
     else:
         six = [*_read_numbers(inertial, "diaginertia", 3), 0.0, 0.0, 0.0]
-    place = _read_numbers(inertial, "pos", 3, [0.0] * 3)
-    return _body_from_parts(
-        _read_numbers(inertial, "mass", 1)[0], place, quaternion.to_matrix(q), six
+    com = _read_numbers(inertial, "pos", 3, [0.0] * 3)
+    return _body_from_numbers(
+        _read_numbers(inertial, "mass", 1)[0], com, quaternion.to_matrix(q), six
     )
 
 
-def _body_from_parts(
-    mass: float, place: np.ndarray, turn: ArrayLike, entries: Sequence[float] | np.ndarray
+def _body_from_numbers(
+    mass: float, com: np.ndarray, rotation: ArrayLike, inertia_entries: Sequence[float] | np.ndarray
 ) -> MassProperties:
     """Return a body from the numbers of a robot description. **Raises:** `ValueError` for a mass
     that is not positive, and for moments that no real body can have. If the moments break the
     triangle inequality I1 + I2 ≥ I3 only by rounding (about 1e-6 of I3), they are corrected.
 
     - `mass`: kg
-    - `place`: (3,) m, the centre of mass in the body frame
-    - `turn`: (3, 3), the rotation matrix from the frame in which the inertia is given to the body
-      frame
-    - `entries`: six entries of the inertia tensor about the centre of mass, kg m²: xx, yy, zz, xy,
-      xz, yz
+    - `com`: (3,) m, the centre of mass in the body frame
+    - `rotation`: (3, 3), the rotation matrix from the frame in which the inertia is given to the
+      body frame
+    - `inertia_entries`: six entries of the inertia tensor about the centre of mass, kg m²: xx, yy,
+      zz, xy, xz, yz
     """
-    xx, yy, zz, xy, xz, yz = entries
-    turn = np.asarray(turn, float)
-    tensor = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
+    xx, yy, zz, xy, xz, yz = inertia_entries
+    rotation = np.asarray(rotation, float)
+    tensor = rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ rotation.T
     if not mass > 0:
         raise ValueError(f"wanted a positive mass, got {mass:g}")
     second = 0.5 * np.trace(tensor) * np.eye(3) - tensor
@@ -224,21 +226,21 @@ def _body_from_parts(
         raise ValueError(f"wanted moments of a body, I1 ≥ 0 and I1 + I2 ≥ I3, got {shown}")
     if least < 0:
         second = second - least * np.eye(3)
-    return MassProperties(mass, place, second)
+    return MassProperties(mass, com, second)
 
 
 def _read_numbers(
-    node: Tree.Element | None, key: str, count: int, default: list[float] | None = None
+    element: Tree.Element | None, key: str, count: int, default: list[float] | None = None
 ) -> np.ndarray:
-    """Return the numbers in an attribute of an XML element, (count,). **Raises:** `ValueError` for
-    an attribute that is missing without a default, or that does not hold `count` finite numbers.
+    """Return the numbers (count,) in an attribute of an XML element. **Raises:** `ValueError` if
+    the attribute is missing and has no default, or does not consist of `count` finite numbers.
 
-    - `node`: the element, or `None` if it is missing
+    - `element`: the element, or `None` if it is missing
     - `key`: the name of the attribute
     - `count`: how many numbers are wanted
-    - `default`: the numbers for a missing attribute, or `None`
+    - `default`: the numbers that a missing attribute stands for, or `None`
     """
-    text = None if node is None else node.get(key)
+    text = None if element is None else element.get(key)
     if text is None:
         if default is None:
             raise ValueError(f"wanted an attribute {key}, got none")

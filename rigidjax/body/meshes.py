@@ -47,17 +47,17 @@ def mesh(
     if not corners.size:
         raise ValueError("vertices: wanted some, got none")
     _checks.check_if_known(_checks.require_finite, corners, "vertices")
-    faces = faces_of(faces, corners.shape[0])
+    faces = checked_faces(faces, corners.shape[0])
     density = _checks.array_of_shape(density, (), "density")
-    _checks.check_if_known(_checks.require_sign, density, "density", "a positive number, kg/m³")
+    _checks.check_if_known(_checks.require_positive, density, "density", "a positive number, kg/m³")
 
     centre = jax.lax.stop_gradient(corners.mean(axis=0))
-    six, (a, b, c) = _tetrahedra_from_origin(corners - centre[None, :], faces)
+    six, (a, b, c) = _sixfold_volumes_and_corners(corners - centre[None, :], faces)
     com = (six[:, None] * (a + b + c)).sum(axis=0) / (4.0 * six.sum())
-    volume = _require_outward(six.sum() / 6.0, corners, faces)
+    volume = _require_positive_volume(six.sum() / 6.0, corners, faces)
     # The second moments are summed about the centre of mass itself, so that no large term is
     # subtracted afterwards.
-    six, (a, b, c) = _tetrahedra_from_origin(corners - (centre + com)[None, :], faces)
+    six, (a, b, c) = _sixfold_volumes_and_corners(corners - (centre + com)[None, :], faces)
     rows = (a, b, c, a + b + c)
     entries = ((six * sum(r[:, i] * r[:, j] for r in rows)).sum() / 120.0 for i, j in PAIRS)
     return MassProperties(density * volume, centre + com, density * from_components(*entries))
@@ -98,31 +98,32 @@ def mesh_file(
     return mesh(corners, np.asarray(surface.faces), density)
 
 
-def _tetrahedra_from_origin(corners: Array, faces: Array) -> tuple[Array, list[Array]]:
-    """Return two things about the tetrahedra between the origin and each face of a triangle mesh:
+def _sixfold_volumes_and_corners(
+    vertices: Float[Array, "n 3"], faces: Array
+) -> tuple[Float[Array, "m"], list[Array]]:
+    """Return two things about the m tetrahedra between the origin and each face of a triangle mesh:
     six times their signed volumes (m,), m³; and a list of three arrays (m, 3), m, with the first,
     second and third corner of each face.
 
-    - `corners`: (n, 3) m, the vertices of the mesh
+    - `vertices`: (n, 3) m
     - `faces`: (m, 3) integers, the three vertex numbers of each face
     """
-    a, b, c = rows = [corners[faces[:, k]] for k in range(3)]
+    a, b, c = rows = [vertices[faces[:, k]] for k in range(3)]
     return (a * jnp.cross(b, c)).sum(axis=1), rows
 
 
-def _require_outward(volume: Array, corners: Array, faces: Array) -> Array:
-    """Return the `volume` of a closed triangle mesh, m³, if it is positive. **Raises:**
-    `ValueError` for a negative volume (a mesh that is inside out), and for a volume that is zero to
-    round-off.
+def _require_positive_volume(volume: Array, vertices: Array, faces: Array) -> Array:
+    """Return the `volume` of a closed triangle mesh, m³. **Raises:** `ValueError` (`equinox` error
+    under `jit`) if it is negative, that is, if the mesh is inside out, or zero to round-off.
 
-    - `corners`: (n, 3) m, the vertices of the mesh
+    - `vertices`: (n, 3) m
     - `faces`: (m, 3) integers, the three vertex numbers of each face
     """
     # A mesh is flat to round-off if the thickness is as small as the last digit of the length.
-    a, b, c = (jax.lax.stop_gradient(corners[faces[:, k]]) for k in range(3))
-    longest = jnp.ptp(corners, axis=0).max()
+    a, b, c = (jax.lax.stop_gradient(vertices[faces[:, k]]) for k in range(3))
+    longest = jnp.ptp(vertices, axis=0).max()
     area = 0.5 * jnp.sqrt((jnp.cross(b - a, c - a) ** 2).sum(axis=1)).sum()
-    slack = 4.0 * jnp.finfo(corners.dtype).eps * jax.lax.stop_gradient(longest) * area
+    slack = 4.0 * jnp.finfo(vertices.dtype).eps * jax.lax.stop_gradient(longest) * area
     volume_text = f" (volume {float(volume):.6g} m³)" if _checks.is_known(volume) else ""
     words = f"mesh: it is inside out{volume_text}: its faces are clockwise; give faces[:, ::-1]"
     volume = _checks.error_if(volume, volume < -slack, words)
@@ -130,13 +131,14 @@ def _require_outward(volume: Array, corners: Array, faces: Array) -> Array:
     return _checks.error_if(volume, ~(volume > slack), words)
 
 
-def faces_of(faces: Any, n: int) -> Array:
+def checked_faces(faces: Any, vertex_count: int) -> Array:
     """Return the faces of a triangle mesh as an array (m, 3) of vertex numbers. **Raises:**
-    `ValueError` if known faces do not enclose a solid: a number beyond the vertices, a face with
-    one vertex twice, an open edge, or faces that disagree about which side is outside.
+    `ValueError` if the faces do not enclose a solid: for a number beyond the vertices, a face with
+    one vertex twice, an edge of one face only, and faces that disagree about which side is outside.
+    Faces that JAX traces are not checked.
 
-    - `faces`: (m, 3) integers
-    - `n`: the number of vertices
+    - `faces`: (m, 3) integers, the three vertex numbers of each face
+    - `vertex_count`: the number of vertices of the mesh
     """
     if not _checks.is_known(faces):
         return faces
@@ -149,16 +151,16 @@ def faces_of(faces: Any, n: int) -> Array:
         raise TypeError(f"faces: wanted integers (vertex numbers), got {table.dtype}")
     if table.ndim != 2 or table.shape[1] != 3 or len(table) == 0:
         raise ValueError(f"faces: wanted shape (m, 3), triangles, got {table.shape}")
-    if table.min() < 0 or table.max() >= n:
+    if table.min() < 0 or table.max() >= vertex_count:
         got = f"{table.min()} to {table.max()}; OBJ files count from 1"
-        raise ValueError(f"faces: wanted vertex numbers from 0 to {n - 1}, got {got}")
+        raise ValueError(f"faces: wanted vertex numbers from 0 to {vertex_count - 1}, got {got}")
     repeated = (table == np.roll(table, 1, axis=1)).any(axis=1)
     if repeated.any():
         which = int(np.argmax(repeated))
         words = f"mesh: face {which} is degenerate, it names a vertex twice"
-        raise ValueError(f"{words}: {_ints(table[which])}")
+        raise ValueError(f"{words}: {_python_integers(table[which])}")
     edges = np.concatenate([table[:, [0, 1]], table[:, [1, 2]], table[:, [2, 0]]])
-    number, reverse = (edges[:, k] * np.int64(n) + edges[:, 1 - k] for k in (0, 1))
+    number, reverse = (edges[:, k] * np.int64(vertex_count) + edges[:, 1 - k] for k in (0, 1))
     unique, counts = np.unique(number, return_counts=True)
     alone = ~np.isin(number, reverse)
     twice = counts > 1
@@ -167,25 +169,26 @@ def faces_of(faces: Any, n: int) -> Array:
         if np.isin(number[alone], unique[twice]).any():
             raise ValueError(
                 f"mesh: its faces disagree about which side is outside: two of them run along the "
-                f"edge {_ints(lonely)} in the same direction; turn one of them round"
+                f"edge {_python_integers(lonely)} in the same direction; turn one of them round"
             )
         raise ValueError(
             f"mesh: it is open: {int(alone.sum())} edges belong to one face only, the first is "
-            f"{_ints(lonely)}; an open mesh has no inside. Vertices that coincide must have one "
-            "number: merge them first (trimesh: merge_vertices)"
+            f"{_python_integers(lonely)}; an open mesh has no inside. Vertices that coincide must "
+            "have one number: merge them first (trimesh: merge_vertices)"
         )
     paired = dict(zip(unique.tolist(), counts.tolist(), strict=True)) if twice.any() else {}
     for edge in unique[twice].tolist():
-        back = (edge % n) * n + edge // n
+        start, end = edge // vertex_count, edge % vertex_count
+        back = end * vertex_count + start
         if paired[edge] != paired.get(back, 0):
             raise ValueError(
-                f"mesh: the edge {_ints((edge // n, edge % n))} is used {paired[edge]} times one "
+                f"mesh: the edge {_python_integers((start, end))} is used {paired[edge]} times one "
                 f"way and {paired.get(back, 0)} times the other; both numbers must be equal"
             )
     return jnp.asarray(table)
 
 
-def _ints(numbers: Iterable[Any]) -> tuple[int, ...]:
+def _python_integers(numbers: Iterable[Any]) -> tuple[int, ...]:
     """Return the integers `numbers` as a tuple of Python integers, which messages show without a
     dtype.
     """

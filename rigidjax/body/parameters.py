@@ -13,12 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Mat3, Matrix, Numbers, Scalar, Vec3, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.principal_axes import eigensystem
 from rigidjax.body.symmetric3 import apply, from_components, product
-from rigidjax.body.validation import require_real_moments, require_real_second_moment
+from rigidjax.body.validation import require_physical_moments, require_physical_second_moment
 from rigidjax.rotation.linalg3 import cross
 
 # A body is flat if its least second moment is below this fraction of their sum.
@@ -30,17 +30,18 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
 
     **Arguments:** `body`, also a plate or a rod. **Returns** (10,)
     `(α, ρ, d1, d2, s12, s23, s13, t1, t2, t3)`: `mass = e^{2α}`, `com = t` (m, body frame), and
-    `𝔖 / mass` about the centre of mass as in `pack_second_moment`, with ρ the logarithm of a length
-    (m). **Raises:** `ValueError` (`equinox` error under `jit`) for a point.
+    `𝔖 / mass` as in `pack_second_moment`, where 𝔖 is the second moment about the centre of mass,
+    and ρ the logarithm of a length (m). **Raises:** `ValueError` (`equinox` error under `jit`) for
+    a point.
 
     >>> vector = pack(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
     >>> round(float(unpack(vector).mass), 12)
     2.0
     """
     hint = "for an Inertia use pack_second_moment(body.second_moment), or pack_shape"
-    _checks.require_single(body, MassProperties, "body", hint=hint)
+    _checks.require_unbatched_instance(body, MassProperties, "body", hint=hint)
     alpha = _limit_exponent(0.5 * jnp.log(body.mass), jnp.expm1)
-    shape = _pack_second_moment(body.second_moment / body.mass)
+    shape = _unconstrained_from_second_moment(body.second_moment / body.mass)
     return jnp.concatenate([alpha[None], shape, body.com])
 
 
@@ -70,7 +71,9 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
     >>> pack_second_moment(jnp.eye(3))
     Array([0., 0., 0., 0., 0., 0.], dtype=float64)
     """
-    return _pack_second_moment(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))
+    return _unconstrained_from_second_moment(
+        _checks.array_of_shape(second_moment, (3, 3), "second_moment")
+    )
 
 
 def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
@@ -96,7 +99,9 @@ def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
     >>> pack_shape(jnp.diag(jnp.array([4.0, 4.0, 0.0])))  # a plate
     Array([0.5, 0.5, 0. , 0. , 0. ], dtype=float64)
     """
-    return _pack_second_moment(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))[1:]
+    return _unconstrained_from_second_moment(
+        _checks.array_of_shape(second_moment, (3, 3), "second_moment")
+    )[1:]
 
 
 def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
@@ -119,10 +124,10 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
     >>> pack_moments([2.0, 2.0, 2.0])
     Array([0., 0., 0.], dtype=float64)
     """
-    i = require_real_moments(_checks.array_of_shape(moments, (3,), "moments"))
+    i = require_physical_moments(_checks.array_of_shape(moments, (3,), "moments"))
     s = 0.5 * jnp.stack([(i[1] - i[0]) + i[2], (i[2] - i[1]) + i[0], (i[0] - i[2]) + i[1]])
     total = _require_positive_trace(s[0] + s[1] + s[2])
-    root = jnp.sqrt(jnp.maximum(_divide_large(s, total), 0.0))
+    root = jnp.sqrt(jnp.maximum(_divide_by_large(s, total), 0.0))
     size = _limit_exponent(0.5 * jnp.log(total / 3.0), jnp.expm1)
     return jnp.stack([size, *(3.0 * root[:2] / (root[0] + root[1] + root[2]) - 1.0)])
 
@@ -163,7 +168,7 @@ def flat_bend(
     """
     shape = _checks.array_of_shape(shape, (5,), "shape")
     slope = _checks.array_of_shape(slope, (5,), "slope")
-    root = _root_from_shape(shape)
+    root = _second_moment_root_from_shape(shape)
     # For a flat body the columns of the adjugate of A are along n: in every step of a fit, this is
     # cheaper than eigenvectors.
     rows = root[0], root[1], root[2]
@@ -195,7 +200,7 @@ def _second_moment_from_shape(shape: Float[Array, "5"]) -> Mat3:
 
     - `shape`: (5,), the entries V₁₁, V₂₂, V₁₂, V₂₃, V₁₃
     """
-    root = _root_from_shape(shape)
+    root = _second_moment_root_from_shape(shape)
     # The root is scaled first: after a step of an optimiser that is much too long, squares of the
     # entries would overflow.
     root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
@@ -203,9 +208,9 @@ def _second_moment_from_shape(shape: Float[Array, "5"]) -> Mat3:
     return square / (square[0, 0] + square[1, 1] + square[2, 2])
 
 
-def _root_from_shape(shape: Float[Array, "5"]) -> Mat3:
-    """Return the symmetric matrix 1 + V (3, 3), of trace 3, whose square is proportional to a
-    second moment; 1 is the unit matrix.
+def _second_moment_root_from_shape(shape: Float[Array, "5"]) -> Mat3:
+    """Return the symmetric matrix 1 + V (3, 3), where 1 is the unit matrix: the square root of the
+    second moment of a body, scaled to trace 3.
 
     - `shape`: (5,), the entries V₁₁, V₂₂, V₁₂, V₂₃, V₁₃ of the symmetric matrix V, whose trace is
       zero
@@ -214,23 +219,23 @@ def _root_from_shape(shape: Float[Array, "5"]) -> Mat3:
     return from_components(1.0 + d1, 1.0 + d2, 1.0 - d1 - d2, s12, s13, s23)
 
 
-def _pack_second_moment(s: Mat3) -> Float[Array, "6"]:
-    """Return six unconstrained numbers that describe a second moment s: (ρ, V₁₁, V₂₂, V₁₂, V₂₃,
-    V₁₃) with s = 3 e^{2ρ} (1 + V)²/Tr (1 + V)², where V is a symmetric matrix of trace zero, and 1
-    the unit matrix. **Raises:** `ValueError` for a matrix that is zero, or that is not symmetric
-    and positive semi-definite.
+def _unconstrained_from_second_moment(s: Mat3) -> Float[Array, "6"]:
+    """Return six numbers, each of which may have any value, that describe a second moment s: (ρ,
+    V₁₁, V₂₂, V₁₂, V₂₃, V₁₃) with s = 3 e^{2ρ} (1 + V)²/Tr (1 + V)², where V is a symmetric matrix
+    of trace zero, and 1 the unit matrix. **Raises:** `ValueError` for a matrix that is zero, or
+    that is not symmetric and positive semi-definite.
 
     - `s`: (3, 3), kg m² or any other unit, the second moment ∫ r rᵀ dm of a body
     """
     total = _require_positive_trace(s[0, 0] + s[1, 1] + s[2, 2])
-    root = _square_root(_divide_large(require_real_second_moment(s), total))
+    root = _matrix_square_root(_divide_by_large(require_physical_second_moment(s), total))
     v = 3.0 * root / (root[0, 0] + root[1, 1] + root[2, 2]) - jnp.eye(3, dtype=s.dtype)
     size = _limit_exponent(0.5 * jnp.log(total / 3.0), jnp.expm1)
     return jnp.stack([size, v[0, 0], v[1, 1], v[0, 1], v[1, 2], v[0, 2]])
 
 
 @jax.custom_jvp
-def _square_root(s: Mat3) -> Mat3:
+def _matrix_square_root(s: Mat3) -> Mat3:
     """Return the symmetric, positive semi-definite square root A (3, 3) of a second moment s: A
     A = s. The derivative of A is finite also if eigenvalues of s are equal, where the eigenvectors
     of s have no derivative.
@@ -241,11 +246,11 @@ def _square_root(s: Mat3) -> Mat3:
     return product(axes * jnp.sqrt(jnp.maximum(values, 0.0))[None], axes.T)
 
 
-@_square_root.defjvp
-def _square_root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
-    # A dA + dA A = d𝔖 is solved for dA as nine equations. This is right also at equal moments,
-    # where the axes have no derivative.
-    root, one = _square_root(*primals), jnp.eye(3, dtype=primals[0].dtype)
+@_matrix_square_root.defjvp
+def _matrix_square_root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
+    # The change dA of the root A solves A dA + dA A = d𝔖, nine linear equations. This is right also
+    # at equal moments, where the axes have no derivative.
+    root, one = _matrix_square_root(*primals), jnp.eye(3, dtype=primals[0].dtype)
     sums = jnp.kron(root, one) + jnp.kron(one, root)
     change = 0.5 * (tangents[0] + tangents[0].T)
     return root, jnp.linalg.solve(sums, change.reshape(9)).reshape(3, 3)
@@ -259,28 +264,28 @@ def _require_positive_trace(trace: Scalar) -> Scalar:
     return _checks.error_if(trace, ~((trace > 0) & (trace < jnp.inf)), words)
 
 
-def _divide_large(numerator: Array, denominator: Scalar) -> Array:
-    """Return the quotient `numerator / denominator`, correct also for a large denominator: before
-    the division both are multiplied by ¼.
+def _divide_by_large(numerator: Array, denominator: Scalar) -> Array:
+    """Return the quotient `numerator / denominator`, correct also for a large denominator: both are
+    multiplied by ¼ before the division.
 
-    XLA multiplies by the reciprocal of the denominator. Without the factor ¼, the reciprocal of the
-    second moment of the Earth would be zero in float32.
+    XLA multiplies by the reciprocal of the denominator. In float32 the reciprocal of the second
+    moment of the Earth would be zero without the factor ¼.
     """
     return (0.25 * numerator) / (0.25 * denominator)
 
 
-def _limit_exponent(exponent: Array, bend: Callable[[Array], Array] = jnp.log1p) -> Array:
-    """Return an exponent x that `exp` can take without overflow. If |x| is at most a limit (330 in
-    float64, 31 in float32), x is unchanged; beyond the limit the result is the limit plus
-    `bend`(|x| − limit), with the sign of x.
+def _limit_exponent(exponent: Array, map_excess: Callable[[Array], Array] = jnp.log1p) -> Array:
+    """Return an exponent x, changed only beyond a limit (330 in float64, 31 in float32), so that
+    `exp(2 * x)` does not overflow. If |x| exceeds the limit, the result is the limit plus
+    `map_excess`(|x| − limit), with the sign of x.
 
     - `exponent`: x, any array
-    - `bend`: `log1p`, which compresses what exceeds the limit to a logarithm; or `expm1`, which
-      undoes this
+    - `map_excess`: `log1p`, which compresses what exceeds the limit to a logarithm; or `expm1`,
+      which undoes the compression
     """
     limit = 31.0 if exponent.dtype == jnp.float32 else 330.0
     beyond = jnp.maximum(jnp.abs(exponent) - limit, 0.0)
-    return jnp.where(beyond > 0, jnp.sign(exponent) * (limit + bend(beyond)), exponent)
+    return jnp.where(beyond > 0, jnp.sign(exponent) * (limit + map_excess(beyond)), exponent)
 
 
 __all__ = [
@@ -288,4 +293,4 @@ __all__ = [
     "unpack_moments", "unpack_second_moment", "unpack_shape",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

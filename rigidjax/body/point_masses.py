@@ -32,7 +32,9 @@ def points(
     positions = _checks.array_of_shape(positions, (n, 3), "positions", hint=hint)
     if n == 0:
         raise ValueError("masses: wanted at least one, got none")
-    _checks.check_if_known(_checks.require_sign, masses, "masses", "masses ≥ 0", zero=True)
+    _checks.check_if_known(
+        _checks.require_positive, masses, "masses", "masses ≥ 0", allow_zero=True
+    )
     _checks.check_if_known(_checks.require_finite, positions, "positions")
     return sum_masses(masses, positions)
 
@@ -58,9 +60,11 @@ def voxels(
         _checks.finite_array(corner, (3,), "corner"),
     )
     _checks.check_if_known(
-        _checks.require_sign, density, "density", "values ≥ 0 (kg/m³)", zero=True
+        _checks.require_positive, density, "density", "values ≥ 0 (kg/m³)", allow_zero=True
     )
-    _checks.check_if_known(_checks.require_sign, h, "spacing", "three positive edges of a cell, m")
+    _checks.check_if_known(
+        _checks.require_positive, h, "spacing", "three positive edges of a cell, m"
+    )
     axes = [(jnp.arange(n, dtype=density.dtype) + 0.5) * h[i] for i, n in enumerate(density.shape)]
     centres = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     masses = density.reshape(-1) * (h[0] * h[1] * h[2])
@@ -95,24 +99,24 @@ def quadrature(
     dtype = jnp.result_type(float)
     cube, weight = jnp.asarray(cube, dtype), jnp.asarray(weight, dtype)
 
-    def mass_and_place_at(u: Array) -> tuple[Array, Array]:
-        """Return two things at the point `u` (3,) of the unit cube, over which the mass of a body
-        is integrated: the mass for each unit of volume of the cube, that is, density times |det
-        ∂r/∂u|, kg; and the place r (3,), m, in the body to which u belongs.
+    def mass_density_and_position(u: Float[Array, "3"]) -> tuple[Array, Float[Array, "3"]]:
+        """Return two things at the point `u` (3,) of the unit cube, over which the mass of the body
+        is integrated: the mass in the body for each unit of volume of the cube, kg, which is the
+        density times |det ∂r/∂u|; and the position r (3,), m, in the body that belongs to u.
         """
         r = _checks.array_of_shape(place(u), (3,), "place(u)")
         volume = determinant(jax.jacfwd(place)(u))
         return _checks.array_of_shape(density(r), (), "density(r)") * jnp.abs(volume), r
 
-    per_volume, positions = jax.vmap(mass_and_place_at)(cube)
+    per_volume, positions = jax.vmap(mass_density_and_position)(cube)
     _checks.check_if_known(_checks.require_finite, positions, "place(u)")
     _checks.check_if_known(_checks.require_finite, per_volume, "density(r) |∂r/∂u|")
     return sum_masses(per_volume * weight, positions)
 
 
 def sum_masses(masses: Float[Array, "n"], positions: Float[Array, "n 3"]) -> MassProperties:
-    """Return the body made of point masses. The single masses and positions are not checked; the
-    sums are, when the body is made.
+    """Return the body made of n point masses. The masses and positions are not checked; the mass
+    and second moment of the whole body are checked.
 
     - `masses`: (n,) kg
     - `positions`: (n, 3) m, body frame

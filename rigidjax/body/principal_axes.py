@@ -11,11 +11,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3
 from rigidjax.body import validation
-from rigidjax.body.scaling import exponent_of, times_power_of_two
+from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
 from rigidjax.body.symmetric3 import product
 
 # Two moments are treated as equal if they differ by less than this many units of round-off of the
@@ -75,7 +76,7 @@ def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
     body that lies along one of the coordinate axes.
     """
     # The matrix is scaled by a power of two, which costs no digit.
-    exponent = exponent_of(a)
+    exponent = largest_binary_exponent(a)
     b = times_power_of_two(0.5 * (a + a.T), -exponent)
     one, nil = jnp.ones((), a.dtype), jnp.zeros((), a.dtype)
     start = (
@@ -84,7 +85,7 @@ def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
         ((one, nil, nil), (nil, one, nil), (nil, nil, one)),
     )
     values, _, axes = jax.lax.fori_loop(0, _SWEEPS, _jacobi_sweep, start)
-    values, axes = _sort_ascending(values, axes)
+    values, axes = _sort_eigenvalues(values, axes)
     return times_power_of_two(jnp.stack(values), exponent), _reverse_axes_towards_identity(axes)
 
 
@@ -112,7 +113,7 @@ def _eigensystem_jvp(
     return (values, axes), (jnp.diagonal(turned), product(axes, turning))
 
 
-def _jacobi_sweep(_: Any, state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+def _jacobi_sweep(_: Array | int, state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
     """Apply three Jacobi rotations to a symmetric 3×3 matrix, each of which makes one entry off the
     diagonal zero, and return the new state.
 
@@ -138,9 +139,11 @@ def _jacobi_sweep(_: Any, state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
     return tuple(values), tuple(opposite), tuple(axes)
 
 
-def _sort_ascending(values: Sequence[Scalar], axes: Sequence[Any]) -> tuple[list, list]:
+def _sort_eigenvalues(
+    values: Sequence[Scalar], axes: Sequence[tuple[Scalar, ...]]
+) -> tuple[list[Scalar], list[tuple[Scalar, ...]]]:
     """Return two lists, sorted by ascending eigenvalue: the three eigenvalues; and the three
-    eigenvectors. With each exchange of two eigenvectors one of them is reversed, so that they stay
+    eigenvectors. If two eigenvectors are exchanged, one of them is reversed, so that the three stay
     right-handed.
 
     - `values`: three scalars, the eigenvalues
@@ -156,7 +159,7 @@ def _sort_ascending(values: Sequence[Scalar], axes: Sequence[Any]) -> tuple[list
     return values, axes
 
 
-def _reverse_axes_towards_identity(axes: Sequence[Any]) -> Mat3:
+def _reverse_axes_towards_identity(axes: Sequence[tuple[Scalar, ...]]) -> Mat3:
     """Return the rotation matrix (3, 3) with three orthonormal `axes` as columns, after two of the
     axes, or none, are reversed: the one of the four right-handed choices that turns least, which
     has the largest trace.
@@ -200,27 +203,33 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     # The unit is a power of two near the largest entry, so that no product leaves the range of the
     # dtype. The exponent is reduced by one, because the power of two above the largest number of
     # the dtype is infinite.
-    unit = times_power_of_two(jnp.ones((), a.dtype), exponent_of(a) - 1)
+    unit = times_power_of_two(jnp.ones((), a.dtype), largest_binary_exponent(a) - 1)
     a = 0.5 * (a + a.T) / unit
 
-    def scaled_function(value: Scalar) -> Scalar:
+    def function_of_scaled_eigenvalue(scaled: Scalar) -> Scalar:
         """Return f(λ), where f is the user's function of one eigenvalue λ of the matrix.
 
-        `value` is λ divided by the number `unit`, by which the whole matrix was divided.
+        - `scaled`: λ divided by the number `unit`, by which the whole matrix was divided
         """
-        return _checks.array_of_shape(function(unit * value), (), "function(λ)", hint="one number")
+        return _checks.array_of_shape(function(unit * scaled), (), "function(λ)", hint="one number")
 
     values, axes = eigensystem(jax.lax.stop_gradient(a))
     change = product(axes.T, product(a - jax.lax.stop_gradient(a), axes))
     close = _CLOSE * jnp.max(jnp.abs(values))
     x, y = values[np.array(_PAIRS)].T
-    first = jax.vmap(lambda x, y: _divided_difference(scaled_function, x, y, close))(x, y)[_PAIR]
+    first = jax.vmap(lambda x, y: _divided_difference(function_of_scaled_eigenvalue, x, y, close))(
+        x, y
+    )[_PAIR]
     x, y, z = values[np.array(_TRIPLES)].T
-    second = jax.vmap(lambda x, y, z: _second_divided_difference(scaled_function, x, y, z, close))(
-        x, y, z
-    )[_TRIPLE]
+    second = jax.vmap(
+        lambda x, y, z: _second_divided_difference(function_of_scaled_eigenvalue, x, y, z, close)
+    )(x, y, z)[_TRIPLE]
     bent = second * change[:, :, None] * change[None, :, :]
-    inner = jnp.diag(jax.vmap(scaled_function)(values)) + first * change + bent.sum(axis=1)
+    inner = (
+        jnp.diag(jax.vmap(function_of_scaled_eigenvalue)(values))
+        + first * change
+        + bent.sum(axis=1)
+    )
     return product(axes, product(inner, axes.T))
 
 

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 
-def exponent_of(x: Float[Array, "..."]) -> Int[Array, ""]:
-    """Return the integer n with 2ⁿ⁻¹ ≤ max |x| < 2ⁿ for the largest entry of an array `x`; 0 for x
-    = 0. In derivatives n is constant.
+def largest_binary_exponent(x: Float[Array, "..."]) -> Int[Array, ""]:
+    """Return the binary exponent of the largest entry of an array `x`: the integer n with 2ⁿ⁻¹ ≤
+    max |x| < 2ⁿ, or 0 if all entries are zero. In derivatives n is constant.
     """
     return jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(x))))[1]
 

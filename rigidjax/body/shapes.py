@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Numbers, NumbersLike, ScalarLike, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.meshes import mesh as mesh, mesh_file as mesh_file
@@ -187,7 +187,9 @@ def _checked_lengths(value: NumbersLike, shape: tuple[int, ...], name: str) -> A
     - `name`: the name of the argument, for messages
     """
     lengths = _checks.finite_array(value, shape, name, unit="m")
-    return _checks.check_if_known(_checks.require_sign, lengths, name, "lengths ≥ 0 (m)", zero=True)
+    return _checks.check_if_known(
+        _checks.require_positive, lengths, name, "lengths ≥ 0 (m)", allow_zero=True
+    )
 
 
 def _checked_radii(
@@ -207,23 +209,24 @@ def _checked_radii(
     return r, R
 
 
-def _axisymmetric_diagonal(transverse: Array, axial: Array) -> Array:
+def _axisymmetric_diagonal(transverse: Array, axial: Array) -> Float[Array, "3"]:
     """Return the diagonal (3,) of a matrix that is symmetric about the z axis: `transverse` for x
     and y, `axial` for z.
     """
     return jnp.stack([transverse, transverse, axial])
 
 
-def _body_at_centre(mass: ScalarLike, moments_per_mass: Array) -> MassProperties:
+def _body_at_centre(mass: ScalarLike, second_moments_per_mass: Float[Array, "3"]) -> MassProperties:
     """Return the body with its centre of mass at the origin and its principal axes along x, y and
     z.
 
     - `mass`: kg
-    - `moments_per_mass`: (3,) m², the principal second moments ∫ x² dm, ∫ y² dm, ∫ z² dm, divided
-      by the mass
+    - `second_moments_per_mass`: (3,) m², the principal second moments ∫ x² dm, ∫ y² dm, ∫ z² dm,
+      divided by the mass
     """
     m = _checks.array_of_shape(mass, (), "mass")
-    return MassProperties(m, jnp.zeros_like(moments_per_mass), jnp.diag(m * moments_per_mass))
+    com = jnp.zeros_like(second_moments_per_mass)
+    return MassProperties(m, com, jnp.diag(m * second_moments_per_mass))
 
 
 __all__ = [
@@ -231,4 +234,4 @@ __all__ = [
     "mesh_file", "plate", "points", "quadrature", "rod", "shell", "sphere", "torus", "voxels",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

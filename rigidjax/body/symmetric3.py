@@ -68,28 +68,33 @@ def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
 # The function is compiled as one program: outside of a trace, each operation would be a program of
 # its own.
 @jax.jit
-def swap_trace(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Return `Tr(A) 1 − A` of symmetric 3×3 matrices A = `a` (..., 3, 3): the inertia tensor of a
-    second moment (notes, eqs 76–78). The diagonal is computed as A22 + A33, …, so that no digit
-    cancels.
+def inertia_from_second_moment(
+    second_moment: Float[Array, "*batch 3 3"],
+) -> Float[Array, "*batch 3 3"]:
+    """Return the inertia tensor `Tr(𝔖) 1 − 𝔖` (..., 3, 3) of a second moment 𝔖 (notes, eqs 76–78),
+    in the unit of 𝔖. The diagonal is computed as 𝔖22 + 𝔖33, …, so that no digit cancels.
+
+    - `second_moment`: 𝔖 (..., 3, 3), symmetric
     """
-    x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
-    return _negate_with_diagonal(a, jnp.stack([y + z, z + x, x + y], axis=-1))
+    x, y, z = second_moment[..., 0, 0], second_moment[..., 1, 1], second_moment[..., 2, 2]
+    return _negative_with_new_diagonal(second_moment, jnp.stack([y + z, z + x, x + y], axis=-1))
 
 
-def swap_trace_back(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Return `½ Tr(A) 1 − A` of symmetric 3×3 matrices A = `a` (..., 3, 3): the second moment of an
-    inertia tensor, the inverse of `swap_trace`.
+def second_moment_from_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+    """Return the second moment `½ Tr(I) 1 − I` (..., 3, 3) of an inertia tensor I, in the unit of I
+    (notes, eqs 76–78 solved).
+
+    - `tensor`: I (..., 3, 3), symmetric
     """
-    x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
-    return _negate_with_diagonal(
-        a, 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1)
+    x, y, z = tensor[..., 0, 0], tensor[..., 1, 1], tensor[..., 2, 2]
+    return _negative_with_new_diagonal(
+        tensor, 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1)
     )
 
 
-def _negate_with_diagonal(a: Array, diagonal: Array) -> Array:
-    """Return the matrices −A for A = `a` (..., 3, 3), with their diagonal entries replaced by
-    `diagonal` (..., 3).
+def _negative_with_new_diagonal(a: Array, diagonal: Array) -> Array:
+    """Return −A for matrices A = `a` (..., 3, 3), but with the entries of `diagonal` (..., 3) on
+    the diagonal.
     """
     eye = jnp.broadcast_to(jnp.eye(3, dtype=bool), a.shape)
     return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)

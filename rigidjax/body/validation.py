@@ -18,43 +18,43 @@ from jaxtyping import Array, Bool, Float, PyTree
 from rigidjax import _checks
 from rigidjax._types import Quat, Quaternion
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.validation import require_near_unit, tolerance
+from rigidjax.rotation.validation import require_near_unit, rotation_tolerance
 
-# The tolerance, in units of round-off of the largest entry. A product R I Rᵀ has an error of about
-# ten such units.
+# The tolerance of the checks, in units of round-off of the largest entry of a matrix. The error of
+# a turned tensor R I Rᵀ, about ten such units, must pass.
 _FORGIVEN = 64.0
 
 
-def require_real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+def require_physical_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Return the mass (...), kg. **Raises:** `ValueError` (`equinox` error under `jit`) if it is
     not positive and finite.
     """
-    return _checks.require_sign(mass, "mass", "a positive mass (kg)")
+    return _checks.require_positive(mass, "mass", "a positive mass (kg)")
 
 
-def require_real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+def require_physical_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Return the inertia tensor (..., 3, 3), kg m². **Raises:** `ValueError` (`equinox` error under
-    `jit`) if it is not symmetric, or if no real body has its principal moments.
+    `jit`) if it is not finite or not symmetric, or if no real body has its principal moments.
     """
     tensor = _require_symmetric(_checks.require_finite(tensor, "inertia tensor"), "inertia tensor")
-    return _require_moments_of_a_body(tensor, _eigenvalues(tensor))
+    return _require_triangle_inequality(tensor, _eigenvalues(tensor))
 
 
-def require_real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
+def require_physical_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
     """Return the principal moments (3,), kg m², which may be in any order. **Raises:** `ValueError`
     (`equinox` error under `jit`) if no real body has these moments.
     """
     if not _checks.is_known(moments) and _checks.is_known(plain := lax.stop_gradient(moments)):
         # The numbers are known, and are traced only to be differentiated: check them once by NumPy,
         # instead of by twenty compiled programs.
-        require_real_moments(plain)
+        require_physical_moments(plain)
         return moments
     moments = _checks.require_finite(moments, "principal moments")
     xp = np if _checks.is_known(moments) else jnp
-    return _require_moments_of_a_body(moments, xp.sort(_without_derivatives(moments)))
+    return _require_triangle_inequality(moments, xp.sort(_constant_for_checks(moments)))
 
 
-def require_real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+def require_physical_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Return the second moment s = ∫ r rᵀ dm (..., 3, 3), kg m². **Raises:** `ValueError`
     (`equinox` error under `jit`) if it is not symmetric and positive semi-definite.
     """
@@ -65,7 +65,7 @@ def require_real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*
     )
     return _checks.error_if(
         s,
-        (least < -_round_off_bound(s) * largest).any() | (largest < 0).any(),
+        (least < -_relative_round_off_tolerance(s) * largest).any() | (largest < 0).any(),
         "second moment 𝔖 = ∫ r rᵀ dm: wanted a positive semi-definite matrix (mass is not "
         f"negative){got}; is this an inertia tensor I? then use from_tensor (I = Tr(𝔖) 1 − 𝔖)",
     )
@@ -82,14 +82,19 @@ def require_single_body(
     """Return `value` if it is one body (not a batch) of one of the classes `kinds`, and if a real
     body can have its mass and inertia.
 
-    Known numbers that no real body has are refused; a traced body with such numbers becomes NaN. A
-    moment may be zero: a function that divides by the moments calls `check_body`. The texts `name`
-    (of the argument), `requirement` (what was wanted) and `hint` are for messages.
+    Numbers that no real body has raise `ValueError` if they are known, and become NaN if JAX traces
+    them. A moment may be zero: a function that divides by the moments calls
+    `require_physical_body`. The texts `name` (of the argument), `requirement` (what was wanted) and
+    `hint` (a likely cause) are for messages.
     """
-    body = _checks.require_single(value, kinds, name, requirement=requirement, hint=hint)
+    body = _checks.require_unbatched_instance(
+        value, kinds, name, requirement=requirement, hint=hint
+    )
     has_mass = hasattr(body, "mass")
     tensor = body.inertia.tensor if has_mass else body.tensor
-    return check_body(body, tensor, body.mass if has_mass else None, throw=False, allow_thin=True)
+    return require_physical_body(
+        body, tensor, body.mass if has_mass else None, throw=False, allow_zero_moment=True
+    )
 
 
 def check_symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
@@ -99,46 +104,48 @@ def check_symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
     """
     if _checks.is_known(a):
         return _require_symmetric(a, name)
-    return jnp.where(_asymmetry(a)[1], jnp.nan, a)
+    return jnp.where(_largest_asymmetry(a)[1], jnp.nan, a)
 
 
-def check_body(
+def require_physical_body(
     body: PyTree,
     tensor: Float[Array, "*batch 3 3"],
     mass: Array | None,
     throw: bool,
     *,
-    allow_thin: bool = False,
+    allow_zero_moment: bool = False,
 ) -> Any:
     """Return `body` if a real body can have the inertia `tensor` and the `mass`, and if no
     principal moment is zero.
 
-    If not, an error is raised if the numbers are known, or if `throw` is true; else the traced body
-    becomes NaN.
+    If not, `ValueError` is raised for known numbers. For traced numbers an error of `equinox` is
+    raised if `throw` is true; else every number of the body becomes NaN.
 
     - `body`: any tree of arrays, which is returned
     - `tensor`: (..., 3, 3) kg m², body frame
     - `mass`: (...) kg, or `None`
     - `throw`: whether wrong traced numbers raise an error
-    - `allow_thin`: whether a moment may be zero, as that of a rod about its axis
+    - `allow_zero_moment`: whether a moment may be zero, as that of a rod about its axis
     """
     tensor = _checks.numeric_array(tensor, "inertia tensor")
     is_known = _checks.is_known((tensor, mass))
     if not is_known and _checks.is_known(plain := lax.stop_gradient((tensor, mass))):
         # The numbers are known, and are traced only to be differentiated: check them once by NumPy,
         # instead of by thirty compiled programs.
-        faults = _faults(np, plain[0], allow_thin)
+        faults = _inertia_faults(np, plain[0], allow_zero_moment)
         if not any(f.any() for f in faults) and (mass is None or (np.asarray(plain[1]) > 0).all()):
             return body
     xp = np if is_known else jnp
-    light = xp.asarray(False) if mass is None else ~(_without_derivatives(mass) > 0)
-    flat, broken, skew = _faults(xp, tensor if is_known else lax.stop_gradient(tensor), allow_thin)
+    light = xp.asarray(False) if mass is None else ~(_constant_for_checks(mass) > 0)
+    flat, broken, skew = _inertia_faults(
+        xp, tensor if is_known else lax.stop_gradient(tensor), allow_zero_moment
+    )
     bad = light | flat | broken | skew
     if is_known:
         if bad.any():
             if mass is not None:
-                require_real_mass(mass)
-            require_real_inertia(tensor)
+                require_physical_mass(mass)
+            require_physical_inertia(tensor)
             _checks.error_if(
                 body, True, f"{_FLAT} {_moments_as_text(_eigenvalues(tensor))} kg m²{_THIN}"
             )
@@ -151,26 +158,28 @@ def check_body(
     return eqx.branched_error_if(body, bad.any(), jnp.where(light.any(), 0, which), words)
 
 
-def first_impossible_row(tensors: Float[Array, "n 3 3"]) -> Any:
-    """Return the index of the first matrix of a stack that is the inertia tensor of no body, or −1
-    if there is none.
+def index_of_first_impossible_inertia(
+    tensors: Float[Array, "n 3 3"],
+) -> Array | np.ndarray:
+    """Return the index, a scalar, of the first of n matrices that is the inertia tensor of no body
+    or has a principal moment of zero, or −1 if there is none.
 
     A matrix with a NaN is skipped: in a batch the result of such a body is `nonfinite_input`, and
     the other bodies are computed.
 
     - `tensors`: (n, 3, 3) inertia tensors, kg m², that are not traced.
     """
-    return _checks.first_bad_row(_are_not_of_a_body, tensors)
+    return _checks.index_of_first_bad_row(_are_impossible_inertias, tensors)
 
 
-def _are_not_of_a_body(xp: ModuleType, tensors: Array | np.ndarray) -> Any:
-    """Return a truth value for each matrix of a stack, (...): true if the matrix cannot be the
-    inertia tensor of a body, or if it has a principal moment of zero; false if it has an entry NaN.
+def _are_impossible_inertias(xp: ModuleType, tensors: Array | np.ndarray) -> Any:
+    """Return booleans (...), one for each matrix: true if the matrix cannot be the inertia tensor
+    of a body, or if it has a principal moment of zero; false if it has an entry NaN.
 
     - `xp`: the module that computes, `numpy` or `jax.numpy`
     - `tensors`: (..., 3, 3) kg m², the matrices
     """
-    flat, broken, skew = _faults(xp, tensors, allow_thin=False)
+    flat, broken, skew = _inertia_faults(xp, tensors, allow_zero_moment=False)
     return (flat | broken | skew) & ~xp.isnan(xp.asarray(tensors)).any(axis=(-1, -2))
 
 
@@ -189,19 +198,22 @@ _THIN = (
 )
 
 
-def _faults(xp: ModuleType, tensor: Array | np.ndarray, allow_thin: bool) -> tuple[Any, Any, Any]:
-    """Return three truth values (...) for each inertia tensor: whether a principal moment is zero
-    or NaN; whether no real body can have its principal moments; and whether it is not symmetric.
+def _inertia_faults(
+    xp: ModuleType, tensor: Array | np.ndarray, allow_zero_moment: bool
+) -> tuple[Any, Any, Any]:
+    """Return three booleans (...) for each inertia tensor: whether a principal moment is zero or
+    NaN; whether no real body can have its principal moments; and whether it is not symmetric.
 
     The second value comes from the minors (subdeterminants) of the second moment 𝔖 = ½ Tr(I) 1 − I
     divided by the trace of I: a real body has an 𝔖 that is positive semi-definite.
 
     - `xp`: the module that computes, `numpy` or `jax.numpy`
     - `tensor`: (..., 3, 3) kg m², the inertia tensors
-    - `allow_thin`: whether a moment may be zero; if true, the first value is always false
+    - `allow_zero_moment`: whether a moment may be zero; if true, the first boolean is always false
     """
-    slack = _round_off_bound(tensor)
-    # The nine entries are split by one operation: NumPy needs a tenth of the time of nine slices.
+    slack = _relative_round_off_tolerance(tensor)
+    # The nine entries are split by one operation, because nine slices would take NumPy ten times as
+    # long.
     nine = xp.moveaxis(xp.asarray(tensor).reshape(*tensor.shape[:-2], 9), -1, 0)
     xx, xy, xz, yx, yy, yz, zx, zy, zz = np.ascontiguousarray(nine) if xp is np else nine
     trace = xx + yy + zz
@@ -222,37 +234,40 @@ def _faults(xp: ModuleType, tensor: Array | np.ndarray, allow_thin: bool) -> tup
     for minor in (sx, sy, sz, *minors, whole):
         # If an entry is NaN, the other entries are not scaled, so that the minors mean nothing.
         broken = broken | (some & (minor < -slack))
-    if allow_thin:
+    if allow_zero_moment:
         return broken & False, broken, skew
     # The product of the two larger moments is 1/9 to 1/4 of the squared trace.
     determinant = xx * (yy * zz - squares[2]) - yy * squares[1] - zz * squares[0] + product
     return ~some | ~(determinant > 0.125 * slack), broken, skew
 
 
-def is_real(tensor: Float[Array, "*batch 3 3"]) -> Bool[Array, "*batch"]:
-    """Return whether a real body can have the inertia `tensor`, kg m², and no moment is zero."""
-    flat, broken, skew = _faults(jnp, lax.stop_gradient(tensor), allow_thin=False)
+def is_physical_inertia(tensor: Float[Array, "*batch 3 3"]) -> Bool[Array, "*batch"]:
+    """Return whether a real body can have the inertia `tensor` (..., 3, 3), kg m², and none of its
+    principal moments is zero.
+    """
+    flat, broken, skew = _inertia_faults(jnp, lax.stop_gradient(tensor), allow_zero_moment=False)
     return ~(flat | broken | skew)
 
 
-def attitude_quaternion(q: Quaternion) -> Quat:
-    """Return a unit quaternion (w, x, y, z), normalised if its length is wrong by round-off; refuse
-    any other quaternion.
+def checked_attitude_quaternion(q: Quaternion) -> Quat:
+    """Return a unit quaternion (w, x, y, z), scaled to length 1. **Raises:** `ValueError` for a
+    quaternion, not traced by JAX, that is not finite or whose length differs from 1 by more than
+    1e-6 (float32: 1e-3).
     """
     q = _checks.finite_array(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
-    return quaternion.normalise(require_near_unit(q, "q", tolerance(q.dtype)))
+    return quaternion.normalise(require_near_unit(q, "q", rotation_tolerance(q.dtype)))
 
 
-def _require_moments_of_a_body(value: Any, moments: Any) -> Any:
+def _require_triangle_inequality(value: Array, moments: Array | np.ndarray) -> Array:
     """Return `value`. **Raises:** `ValueError` (`equinox` error under `jit`) if a principal moment
     is negative, or if the moments break the triangle inequality I1 + I2 ≥ I3.
 
     - `value`: the array to return: an inertia tensor (..., 3, 3) or principal moments, kg m²
-    - `moments`: (..., 3) kg m², its principal moments, ascending
+    - `moments`: (..., 3) kg m², its principal moments in ascending order
     """
     m1, m2, m3 = moments[..., 0], moments[..., 1], moments[..., 2]
     moments_text = f" {_moments_as_text(moments)} kg m²" if _checks.is_known(value) else ""
-    slack = _round_off_bound(value) * abs(m3)
+    slack = _relative_round_off_tolerance(value) * abs(m3)
     value = _checks.error_if(
         value,
         (m1 < -slack).any() | (m3 < 0).any(),
@@ -270,23 +285,24 @@ def _require_moments_of_a_body(value: Any, moments: Any) -> Any:
     )
 
 
-def _asymmetry(a: Any) -> tuple[Any, Any]:
+def _largest_asymmetry(a: Array) -> tuple[Any, Any]:
     """Return two things about matrices A = `a` (..., 3, 3), any unit: the largest entry of |A −
-    Aᵀ|, (...); and whether this entry exceeds round-off in any of the matrices.
+    Aᵀ| of each matrix, (...); and one boolean, whether this entry exceeds round-off in any matrix.
     """
-    difference = abs(_without_derivatives(a) - _without_derivatives(a).swapaxes(-1, -2)).max(
+    difference = abs(_constant_for_checks(a) - _constant_for_checks(a).swapaxes(-1, -2)).max(
         axis=(-1, -2)
     )
     return difference, (
-        difference > _round_off_bound(a) * abs(_without_derivatives(a)).max(axis=(-1, -2))
+        difference
+        > _relative_round_off_tolerance(a) * abs(_constant_for_checks(a)).max(axis=(-1, -2))
     ).any()
 
 
-def _require_symmetric(a: Any, name: str) -> Any:
+def _require_symmetric(a: Array, name: str) -> Array:
     """Return the matrices `a` (..., 3, 3). **Raises:** `ValueError` (`equinox` error under `jit`)
     if they are not symmetric to round-off; the text `name` names the matrices in the message.
     """
-    difference, bad = _asymmetry(a)
+    difference, bad = _largest_asymmetry(a)
     difference_text = (
         f" (largest difference {float(difference.max()):.3g})" if _checks.is_known(a) else ""
     )
@@ -297,14 +313,14 @@ def _require_symmetric(a: Any, name: str) -> Any:
     )
 
 
-def _without_derivatives(a: Any) -> Any:
-    """Return the array `a` as constants, whose derivatives are zero: as an array of JAX if JAX
+def _constant_for_checks(a: Array) -> Array | np.ndarray:
+    """Return the array `a` as a constant, whose derivatives are zero: as an array of JAX if JAX
     traces it, else as an array of NumPy, with which a check takes only microseconds.
     """
     return np.asarray(a) if _checks.is_known(a) else lax.stop_gradient(a)
 
 
-def _eigenvalues(a: Any) -> Any:
+def _eigenvalues(a: Array) -> Array | np.ndarray:
     """Return the eigenvalues (..., 3), ascending, of symmetric matrices `a` (..., 3, 3), as
     constants whose derivatives are zero. NumPy computes them unless JAX traces the matrices.
     """
@@ -315,14 +331,14 @@ def _eigenvalues(a: Any) -> Any:
     return jnp.linalg.eigvalsh(lax.stop_gradient(a) / scale) * scale[..., 0]
 
 
-def _round_off_bound(a: Any) -> float:
-    """Return the relative error that a check forgives in an array `a`: 64 units of round-off of its
-    dtype.
+def _relative_round_off_tolerance(a: Array | np.ndarray) -> float:
+    """Return the relative error that a check tolerates in an array `a`: 64 times the unit of
+    round-off of its dtype.
     """
     return float(_FORGIVEN * jnp.finfo(a.dtype).eps)
 
 
-def _moments_as_text(moments: Any) -> str:
+def _moments_as_text(moments: Array | np.ndarray) -> str:
     """Return principal moments as a text for messages, such as "(1, 2, 3)".
 
     - `moments`: (3,) kg m², or (n, 3) for n bodies, of which the first three are shown

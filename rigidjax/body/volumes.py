@@ -6,7 +6,7 @@
 import jax.numpy as jnp
 
 from rigidjax import _checks
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Scalar, ScalarLike, Vector
 
 
@@ -107,4 +107,4 @@ __all__ = [
     "torus",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

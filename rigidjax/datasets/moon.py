@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify.model.charts import AbstractBodyChart
@@ -354,4 +354,4 @@ def _subdivide_polynomials(rows: np.ndarray, parts: int) -> np.ndarray:
 
 __all__ = ["CITATION", "DAY", "EPOCH", "Moon"]
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rigidjax import exact
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.body import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify.answer.result import Fit
@@ -172,4 +172,4 @@ __all__ = [
     "recording", "remarks", "rms_degrees", "rows",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

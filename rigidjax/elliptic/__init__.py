@@ -9,7 +9,7 @@ every loop. **Raises:** `TypeError` for half precision, `ValueError` for shapes 
 broadcast, and if m + m1 ≠ 1.
 """
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.elliptic.carlson import rc as rc, rd as rd, rf as rf, rj_ as rj_
 from rigidjax.elliptic.jacobi import am as am, sncndn as sncndn
 from rigidjax.elliptic.legendre import (
@@ -26,4 +26,4 @@ __all__ = [
     "rj_", "sncndn",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from rigidjax import _checks
-from rigidjax.rotation.barrier import batch_as
+from rigidjax.rotation.barrier import match_batch_axes
 
 # The arguments and results of all functions are real numbers, of shapes that broadcast.
 Real = Float[ArrayLike, "..."]
@@ -69,7 +69,7 @@ def exact_complement(value: RealOrArray, complement: RealOrArray) -> Any:
     The derivative with respect to `complement` is −1, and the derivative with respect to `value` is
     0.
     """
-    return batch_as(value, complement)
+    return match_batch_axes(value, complement)
 
 
 @exact_complement.defjvp

@@ -32,7 +32,7 @@ from rigidjax.elliptic.arguments import (
 )
 from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, sncndn_near_one
 from rigidjax.elliptic.legendre import complete_integral, incomplete_integral, mean_iterates
-from rigidjax.rotation.stumpff import parity, split_half_turns
+from rigidjax.rotation.stumpff import power_of_minus_one, split_half_turns
 
 # If cn and dn are below this number, integrals over sd² depend on the ratio of cn and dn only, with
 # a relative error of about the square of this number.
@@ -74,7 +74,7 @@ def am(u: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     """
     u, m, m1 = to_common_dtype(u=u, **complement_pair("m", m, m1))
     s, c, _, turns = _functions_and_half_turns(u, exact_complement(m, m1), m1)
-    sign = parity(turns)
+    sign = power_of_minus_one(turns)
     return jnp.arctan2(sign * s, sign * c) + math.pi * turns
 
 
@@ -113,7 +113,7 @@ def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
     - `m1`: 1 − m.
     """
     turns, angle, rows = _reduce_argument(u, m1)
-    sign = parity(turns)
+    sign = power_of_minus_one(turns)
     theta = jnp.abs(angle)
     # Bulirsch's recursion carries cot²φ, which must not overflow near 0 or near a half period.
     tiny = jnp.abs(u) * jnp.maximum(1, jnp.sqrt(m1)) < float(jnp.finfo(u.dtype).eps) ** (1 / 3)
@@ -228,7 +228,7 @@ def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Array, Ar
     """
     s, c, d = _sncndn(u, m, m1)
     turns = _reduce_argument(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
-    sign = parity(turns)
+    sign = power_of_minus_one(turns)
     # X grows as 1/dn² and must not overflow. If cn and dn are tiny, X depends, except for a factor,
     # only on the ratio of cn and dn (to the square of the floor): multiply cn and dn by the same
     # large number.

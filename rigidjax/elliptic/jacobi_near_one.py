@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from rigidjax.elliptic.arguments import RealOrArray
-from rigidjax.rotation.stumpff import parity
+from rigidjax.rotation.stumpff import power_of_minus_one
 
 # For m1 up to this number the nome is below 0.0066: a few images, and two terms of the series of
 # the nome in m1, are enough.
@@ -65,8 +65,8 @@ def sncndn_near_one(
     # Take tanh without its limits ±1 on either side, which cancel in pairs.
     tangent = jnp.where(offset == 0, -side * (1 - z * z), side * 2 * z * z) / (1 + z * z)
 
-    sine = rate / root * (parity(image) * tangent).sum(-1)
-    cosine = rate / root * (parity(image) * hyperbolic).sum(-1)
+    sine = rate / root * (power_of_minus_one(image) * tangent).sum(-1)
+    cosine = rate / root * (power_of_minus_one(image) * hyperbolic).sum(-1)
     return jnp.where(u < 0, -sine, sine), cosine, rate * hyperbolic.sum(-1)
 
 

@@ -1,6 +1,6 @@
 """Solve the motion of a torque-free body in closed form, without a solver."""
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.exact.free_body import FreeBody as FreeBody, free_body as free_body
 from rigidjax.exact.periods import (
     body_period as body_period,
@@ -9,4 +9,4 @@ from rigidjax.exact.periods import (
 
 __all__ = ["FreeBody", "body_period", "free_body", "precession_period"]
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -13,12 +13,12 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, ScalarLike, Vec3
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.scaling import exponent_of, times_power_of_two
+from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
 from rigidjax.exact.derivatives import MotionConstants, body_motion, set_up
 from rigidjax.motion import Attitude, Rigid
-from rigidjax.rotation.kernels import product4
+from rigidjax.rotation.kernels import quaternion_product
 from rigidjax.rotation.linalg3 import components
-from rigidjax.rotation.validation import require_near_unit, tolerance
+from rigidjax.rotation.validation import require_near_unit, rotation_tolerance
 
 State = TypeVar("State", bound=HasSpin)
 
@@ -43,8 +43,8 @@ class FreeBody(eqx.Module):
     def __init__(self, inertia: Inertia, state0: HasSpin):
         inertia = _checked_inertia(inertia, state0)
         # Scale by powers of two: this loses no digit, and then no body is too large or too small.
-        self.exponent = exponent_of(state0.omega)
-        self.tensor = times_power_of_two(inertia.tensor, -exponent_of(inertia.tensor))
+        self.exponent = largest_binary_exponent(state0.omega)
+        self.tensor = times_power_of_two(inertia.tensor, -largest_binary_exponent(inertia.tensor))
         self.omega = times_power_of_two(state0.omega, -self.exponent)
         self.setting = set_up(*jax.lax.stop_gradient((self.tensor, self.omega)))
         self.state0 = state0
@@ -190,7 +190,9 @@ def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
             f"state0: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
             "also moves is free in both: add x + v t yourself, or use simulate"
         )
-    _checks.require_single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
+    _checks.require_unbatched_instance(
+        inertia, Inertia, "inertia", hint="of MassProperties pass .inertia"
+    )
     tensor = inertia.tensor
     arrays = {"omega": _checks.array_of_shape(state0.omega, (3,), "omega")}
     if isinstance(state0, HasAttitude):
@@ -200,13 +202,13 @@ def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
     for name, array in arrays.items():
         if array.dtype != tensor.dtype:
             raise TypeError(f"{name} is {array.dtype}, but the inertia tensor is {tensor.dtype}")
-    inertia = validation.check_body(inertia, tensor, None, throw=False)
+    inertia = validation.require_physical_body(inertia, tensor, None, throw=False)
     if not _checks.is_known((tensor, arrays)):
         return inertia
     for name, array in arrays.items():
         _checks.require_finite(array, name)
     if "q" in arrays:
-        require_near_unit(arrays["q"], "q", tolerance(tensor.dtype))
+        require_near_unit(arrays["q"], "q", rotation_tolerance(tensor.dtype))
     return inertia
 
 
@@ -215,5 +217,5 @@ def _unit_product(left: Quat, right: Quat) -> Quat:
     """Return the product `left` ⊗ `right` of two quaternions (w, x, y, z), divided by its length;
     arrays (…, 4) are multiplied pair by pair.
     """
-    out = jnp.stack(product4(components(left), components(right)))
+    out = jnp.stack(quaternion_product(components(left), components(right)))
     return out / jnp.sqrt(jnp.sum(out * out))

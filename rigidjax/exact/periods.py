@@ -9,7 +9,7 @@ from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, Vec3, Vec3Like
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
-from rigidjax.body.scaling import exponent_of, times_power_of_two
+from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
 from rigidjax.exact import sigma_form
 from rigidjax.exact.components3 import HALF, Six, Triple, matvec
 from rigidjax.exact.derivatives import inverse_inertia_and_energy, motion_and_derivatives
@@ -78,8 +78,10 @@ def _checked_tensor_and_rate(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, 
     A `ValueError` or `TypeError` is raised for a wrong shape or dtype, or for a principal moment
     that is zero and not traced by JAX.
     """
-    _checks.require_single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
-    tensor = validation.check_body(inertia, inertia.tensor, None, throw=False).tensor
+    _checks.require_unbatched_instance(
+        inertia, Inertia, "inertia", hint="of MassProperties pass .inertia"
+    )
+    tensor = validation.require_physical_body(inertia, inertia.tensor, None, throw=False).tensor
     return tensor, _checks.array_of_shape(omega0, (3,), "omega0").astype(tensor.dtype)
 
 
@@ -92,8 +94,8 @@ def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Sca
     - `tensor`: (3, 3) the inertia tensor, kg m².
     - `omega`: (3,) the body rate at any moment, rad/s.
     """
-    exponent = exponent_of(omega)
-    moments, axes = principal_frame(times_power_of_two(tensor, -exponent_of(tensor)))
+    exponent = largest_binary_exponent(omega)
+    moments, axes = principal_frame(times_power_of_two(tensor, -largest_binary_exponent(tensor)))
     momentum = matvec(moments, components_along(axes, times_power_of_two(omega, -exponent)))
     body, _, _ = inverse_inertia_and_energy(moments, momentum)
     v = sigma_form.invariants(body, momentum)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from rigidjax._types import Mat3, Scalar, Vec3
 from rigidjax.exact.components3 import Six, Triple
-from rigidjax.rotation.barrier import batch_as, compiled_as_one_kernel
+from rigidjax.rotation.barrier import compiled_as_one_kernel, match_batch_axes
 
 # Jacobi's cyclic method converges quadratically; a 3×3 matrix needs four or five sweeps from
 # anywhere.
@@ -43,7 +43,7 @@ def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
     The value is the diagonal matrix of `moments`; the derivative is a full symmetric matrix.
     """
     zero = jnp.zeros_like(tensor[0, 0])
-    return batch_as((*moments, zero, zero, zero), (tensor, axes, moments))
+    return match_batch_axes((*moments, zero, zero, zero), (tensor, axes, moments))
 
 
 @tensor_in_axes.defjvp

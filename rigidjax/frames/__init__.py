@@ -1,6 +1,6 @@
 """Describe moving frames, and particles that move in such frames. No rigid body is needed."""
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.frames.base import AbstractScene as AbstractScene, Force as Force
 from rigidjax.frames.frame_dynamics import BodyInFrame as BodyInFrame
 from rigidjax.frames.moving import MovingFrame as MovingFrame
@@ -9,4 +9,4 @@ from rigidjax.frames.rotation_models import AboutAxis as AboutAxis, Uniform as U
 
 __all__ = ["AboutAxis", "AbstractScene", "BodyInFrame", "Force", "MovingFrame", "Point", "Uniform"]
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -76,7 +76,9 @@ class Earth(AbstractScene):
         0.02195
         """
         h = _checks.array_of_shape(height, (), "height")
-        h = _checks.require_sign(h, "height", "metres above the ground, a number ≥ 0", zero=True)
+        h = _checks.require_positive(
+            h, "height", "metres above the ground, a number ≥ 0", allow_zero=True
+        )
         time = jnp.sqrt(2 * h / self.gravity)
         return self.rate * self.gravity * jnp.cos(self.latitude) * time**3 / 3
 
@@ -95,7 +97,7 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
     lat, g, w = _checks.scalars(latitude=latitude, gravity=gravity, rate=rate)
     words = "latitude: wanted radians between −π/2 and π/2; were these degrees?"
     lat = _checks.error_if(lat, ~(jnp.abs(lat) <= 0.5000001 * jnp.pi), words)
-    g = _checks.require_sign(g, "gravity", "a positive number, m/s²; it points down")
+    g = _checks.require_positive(g, "gravity", "a positive number, m/s²; it points down")
     return Earth(
         lat, g, _checks.error_if(w, ~jnp.isfinite(w), "rate: wanted a finite number, rad/s")
     )
@@ -222,5 +224,5 @@ def foucault(
     """
     place = earth(latitude, gravity, rate)
     string = _checks.array_of_shape(length, (), "length")
-    string = _checks.require_sign(string, "length", "a positive number, m")
+    string = _checks.require_positive(string, "length", "a positive number, m")
     return Foucault(place, string.astype(jnp.promote_types(string.dtype, place.rate.dtype)))

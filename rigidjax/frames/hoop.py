@@ -102,7 +102,7 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
     [0.0, 0.0, 0.0]
     """
     r, w, g = _checks.scalars(radius=radius, rate=rate, gravity=gravity)
-    r = _checks.require_sign(r, "radius", "a positive number, m")
+    r = _checks.require_positive(r, "radius", "a positive number, m")
     return Hoop(r, _checks.require_finite(w, "rate"), _checks.require_finite(g, "gravity"))
 
 

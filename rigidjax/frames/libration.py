@@ -67,7 +67,7 @@ def libration_integral(state: PyTree, body: _inertia.Inertia, rate: ScalarLike) 
     >>> float(libration_integral(at_rest, body, 2.0))
     1.0
     """
-    _checks.require_single(
+    _checks.require_unbatched_instance(
         state, HasAttitude, "state", requirement="an Attitude in the orbital frame"
     )
     body = validation.require_single_body(body, _inertia.Inertia, "body")

@@ -1,6 +1,6 @@
 """Provide scenes of a particle, for `rigidjax.simulate(None, Point(x, v), ts, scene)`."""
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.frames.earth import (
     Earth as Earth,
     Foucault as Foucault,
@@ -18,4 +18,4 @@ __all__ = [
     "turntable",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

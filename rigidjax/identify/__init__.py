@@ -7,7 +7,7 @@ the unknown torques; `sample` draws a motion under random torques. `LogDensity` 
 density of a fit: `posterior` draws from it, `refit` finds its maximum.
 """
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.cli.logs.table import read_table as read_table
 from rigidjax.identify import report as report
 from rigidjax.identify.answer.fit import fit as fit
@@ -96,4 +96,4 @@ __all__ = [
     "refit", "report", "sample", "simulate_readings", "smooth", "step", "windows",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rigidjax import _checks, _show
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.identify.answer.result import Fit, require_one_fit
 
 Row = tuple[str, float, float, float, str]
@@ -37,7 +37,7 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
     out: list[Row] = []
     for quantity in fit.quantities:
         low, high = bounds[quantity.name]
-        scale, unit = _show.shown_unit(quantity.unit, rate_unit)
+        scale, unit = _show.scale_and_unit_to_show(quantity.unit, rate_unit)
         name = quantity.name
         if name.startswith("Ω"):
             axis, *where = name.split(" ", 1)
@@ -274,7 +274,7 @@ def write_html(
     '<!doctype html>'
     """
     require_one_fit(fit)
-    units = [_show.shown_unit(unit, rate_unit) for *_, unit in _rms_of_axes(fit)]
+    units = [_show.scale_and_unit_to_show(unit, rate_unit) for *_, unit in _rms_of_axes(fit)]
     sizes = _table_rows_as_html(
         (name, " ".join(f"{scale * x:.3g}" for x in axes), unit)
         for (name, axes, _), (scale, unit) in zip(_rms_of_axes(fit), units, strict=True)
@@ -350,4 +350,4 @@ __all__ = [
     "Row", "as_dict", "as_html", "numbers", "rows", "table", "verdict", "write_html", "write_json",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -6,7 +6,7 @@ singular at sin θ = 0, and need many small steps near this attitude. `equations
 Lagrangian; `lie_poisson` and `lie_poisson_with_direction` take a Hamiltonian.
 """
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.lagrangian.coordinates import (
     Coordinates as Coordinates,
     EulerAngleTop as EulerAngleTop,
@@ -28,4 +28,4 @@ __all__ = [
     "to_attitude",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -195,7 +195,7 @@ def from_attitude(state: HasAttitude) -> Coordinates:
     >>> back.rate.round(12).tolist()
     [1.0, 2.0, 3.0]
     """
-    _checks.require_single(state, HasAttitude, "state", requirement="an Attitude")
+    _checks.require_unbatched_instance(state, HasAttitude, "state", requirement="an Attitude")
     angles = euler.from_quaternion(state.q)
     words = "from_attitude: Euler angles (3-1-3) are singular at sin θ = 0; solve for an Attitude"
     angles = _checks.error_if(angles, euler.is_singular(angles), words)

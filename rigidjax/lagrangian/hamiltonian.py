@@ -134,8 +134,8 @@ def _require_invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
     An error is raised if a principal moment is zero, or if no real body can have the moments. If
     JAX traces the inertia, it becomes NaN in these cases.
     """
-    _checks.require_single(inertia, _inertia.Inertia, "inertia")
-    return validation.check_body(inertia, inertia.tensor, None, throw=False)
+    _checks.require_unbatched_instance(inertia, _inertia.Inertia, "inertia")
+    return validation.require_physical_body(inertia, inertia.tensor, None, throw=False)
 
 
 class RotationalHamiltonian(eqx.Module):

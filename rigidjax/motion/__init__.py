@@ -2,10 +2,10 @@
 `rj.energy`.
 """
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import HasAttitude as HasAttitude, HasPose as HasPose, HasSpin as HasSpin
 from rigidjax.motion.equations import Attitude as Attitude, Rigid as Rigid, Spin as Spin
 
 __all__ = ["Attitude", "HasAttitude", "HasPose", "HasSpin", "Rigid", "Spin"]
 
-show(__name__)
+define_dir_and_getattr(__name__)

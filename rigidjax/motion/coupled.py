@@ -34,8 +34,8 @@ class Coupled(eqx.Module):
         """Return the `Coupled` of `state0` and the initial states of `torque` (see
         `rigidjax.simulate`) at `t`, s.
         """
-        _checks.require_single(body, (Inertia, MassProperties), "body")
-        _checks.require_single(
+        _checks.require_unbatched_instance(body, (Inertia, MassProperties), "body")
+        _checks.require_unbatched_instance(
             state0, HasSpin, "state0", requirement="a Spin, an Attitude or a Rigid"
         )
         dtype = state0.omega.dtype

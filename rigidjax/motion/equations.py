@@ -14,7 +14,7 @@ from rigidjax.body.inertia import Inertia, MassProperties, apply, inverse
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques.base import Torque, evaluate, force_and_torque, require_law
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.kernels import square4
+from rigidjax.rotation.kernels import squared_quaternion_length
 from rigidjax.rotation.linalg3 import components, cross
 
 State = TypeVar("State")
@@ -105,7 +105,7 @@ class EulerEquations(eqx.Module):
     torque: Torque | None
 
     def __init__(self, inertia: Inertia, torque: Torque | None = None):
-        _checks.require_single(inertia, Inertia, "inertia", hint=_HINT)
+        _checks.require_unbatched_instance(inertia, Inertia, "inertia", hint=_HINT)
         if torque is not None:
             require_law(torque)
         # Traced numbers are checked when a motion is computed: during a fit an optimiser may try
@@ -174,7 +174,9 @@ class NewtonEuler(eqx.Module):
     body: MassProperties
 
     def __init__(self, body: MassProperties, torque: Torque | None = None):
-        _checks.require_single(body, MassProperties, "body", hint="an Inertia has no mass")
+        _checks.require_unbatched_instance(
+            body, MassProperties, "body", hint="an Inertia has no mass"
+        )
         self.euler = EulerEquations(body.inertia, torque)
         self.body = body
 
@@ -220,4 +222,4 @@ def _normalise_reproducibly(q: Quat) -> Quat:
     discretisation (an error of 7e-6 at a tolerance of 1e-11). A root and a quotient that are
     separate operations round equally everywhere.
     """
-    return q / lax.optimization_barrier(jnp.sqrt(square4(components(q))))
+    return q / lax.optimization_barrier(jnp.sqrt(squared_quaternion_length(components(q))))

@@ -231,7 +231,7 @@ def _positive_distance(value: ScalarLike, name: str, dtype: DTypeLike | None) ->
     `value`), or raise an error that begins with `name`.
     """
     distance = _checks.array_of_shape(value, (), name)
-    return _checks.require_sign(
+    return _checks.require_positive(
         distance if dtype is None else distance.astype(dtype), name, "a positive number"
     )
 

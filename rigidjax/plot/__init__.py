@@ -7,7 +7,7 @@ drawn, or for flat axes where 3-D axes are needed; `ValueError` for a batch inst
 times and states of different length, for an unknown unit or option, and for axes of a wrong shape.
 """
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.plot.animation import player as player, tumble as tumble
 from rigidjax.plot.ellipsoids import inertia_ellipsoid as inertia_ellipsoid
 from rigidjax.plot.fit import fit as fit
@@ -28,4 +28,4 @@ __all__ = [
     "motion", "phase_portrait", "player", "polhode", "residuals", "tumble",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

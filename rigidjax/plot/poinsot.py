@@ -70,7 +70,7 @@ def polhode(
     >>> polhode(body, sol.ys).get_zlabel()
     'Π₃ / h'
     """
-    _checks.require_single(inertia, Inertia, "inertia")
+    _checks.require_unbatched_instance(inertia, Inertia, "inertia")
     _checks.require_instance(
         states, HasSpin, "states", requirement="a Spin, an Attitude or a Rigid"
     )

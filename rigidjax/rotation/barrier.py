@@ -15,9 +15,9 @@ from jaxtyping import Array, PyTree
 Tree = TypeVar("Tree")
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Whether XLA on CPU drops barriers before it fuses operations, as it does before JAX 0.11. Values
-# that are used twice are then computed twice: a solve of order 8 at 900 times took minutes, not
-# milliseconds.
+# Whether XLA on CPU drops barriers before it fuses operations, as it does before JAX 0.11. A value
+# that is used twice is then computed twice, and so is each value that it depends on: a run with a
+# solver of order 8 and 900 output times took minutes, not milliseconds.
 _DROPPED = jax.__version_info__ < (0, 11)
 
 
@@ -37,7 +37,7 @@ def barrier(tree: Tree) -> Tree:
     """Return the arrays of `tree` unchanged, such that XLA on CPU computes each once for all its
     uses, instead of repeating its operations at each use.
 
-    This is `lax.optimization_barrier`, or `compute_once` where XLA drops barriers.
+    This is `lax.optimization_barrier`, or `prevent_recomputation` where XLA drops barriers.
 
     On a GPU each barrier would end a kernel, which costs more than computing some numbers twice; no
     barrier is set there.
@@ -47,22 +47,22 @@ def barrier(tree: Tree) -> Tree:
     if not _DROPPED:
         return lax.optimization_barrier(tree)
     real = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
-    return jax.tree.map(lambda x: compute_once(x) if real(x) else x, tree)
+    return jax.tree.map(lambda x: prevent_recomputation(x) if real(x) else x, tree)
 
 
-def compute_once(x: Array) -> Array:
-    """Return the number `x` unchanged, such that XLA on CPU computes it once, here and in the
+def prevent_recomputation(x: Array) -> Array:
+    """Return the array `x` unchanged, such that XLA on CPU computes it once, here and in the
     gradient.
 
-    The number is divided by one (by 2 if it is NaN). XLA on CPU computes a quotient once; XLA
-    repeats any cheaper operation, with all inputs of the operation, for every component.
+    The array is divided by one (by 2 where it is NaN). XLA on CPU computes a quotient once; XLA
+    repeats any cheaper operation, with all that the operation depends on, at each use.
     """
     return x / jnp.where(x == x, 1, 2)
 
 
 def compiled_as_one_kernel(function: Function) -> Function:
-    """Return a function of trees of arrays that computes `function`, compiled as one kernel where
-    no argument is batched.
+    """Return a function with the same arguments and result as `function`, trees of arrays, that XLA
+    compiles as one kernel if no argument is batched by `jax.vmap`.
 
     Many small kernels for one body take long to compile; XLA on CPU makes one kernel of a loop with
     a small state. Therefore `function` runs in a loop with one iteration. XLA knows neither the
@@ -102,59 +102,63 @@ def compiled_as_one_kernel(function: Function) -> Function:
     @call.defjvp
     def _jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
         out, change = jax.jvp(plain, primals, tangents)
-        return batch_as(out, primals), change
+        return match_batch_axes(out, primals), change
 
     return call  # pyright: ignore[reportReturnType]
 
 
 @jax.custom_jvp
-def batch_as(tree: PyTree, args: PyTree) -> Any:
-    """Return `tree` with every array batched by `jax.vmap` if any array of `args` is batched.
+def match_batch_axes(tree: PyTree, reference: PyTree) -> PyTree:
+    """Return the arrays of `tree` unchanged; under `jax.vmap` every one of them has a batch axis if
+    any array of the tree `reference` has one.
 
-    This repeats what the batching rule of `compiled_as_one_kernel` returns. Under `jit`, JAX takes
-    the axes of a batch from the function, and the values from the rule for the derivative. If the
-    function and the rule batch differently, arrays have wrong shapes, and no error is raised.
+    The batching rule of `compiled_as_one_kernel` does the same. Under `jit`, JAX takes the batch
+    axes from the function, and the values from the rule for the derivative. If the function and the
+    rule batch differently, arrays have wrong shapes, and no error is raised.
     """
-    return _batch_like(tree, args)
+    return _unchanged_with_batch_axes(tree, reference)
 
 
-@batch_as.defjvp
-def _batch_as_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-    """Return two things: the first of two trees of arrays, in which every array has a batch axis of
-    `jax.vmap` if any array of the second tree has one, as `batch_as` gives it; and the change of
-    the first tree. By this rule JAX differentiates `batch_as`.
+@match_batch_axes.defjvp
+def _match_batch_axes_jvp(
+    primals: tuple[PyTree, PyTree], tangents: tuple[PyTree, PyTree]
+) -> tuple[PyTree, PyTree]:
+    """Return two things: the first of two trees of arrays, with the batch axes that
+    `match_batch_axes` gives it; and the change of the first tree. By this rule JAX differentiates
+    `match_batch_axes`.
 
     - `primals`: the two trees
     - `tangents`: their changes; the change of the second tree is not used
     """
-    return batch_as(*primals), tangents[0]
+    return match_batch_axes(*primals), tangents[0]
 
 
 @jax.custom_batching.custom_vmap
-def _batch_like(tree: PyTree, args: PyTree) -> Any:
+def _unchanged_with_batch_axes(tree: PyTree, reference: PyTree) -> PyTree:
     """Return `tree` unchanged. Under `jax.vmap` every array of the result has a batch axis if any
-    array of `args` or of `tree` has one.
+    array of `reference` or of `tree` has one.
 
     - `tree`: a tree of arrays
-    - `args`: another tree of arrays, whose values are not used
+    - `reference`: another tree of arrays, whose values are not used
     """
-    del args
+    del reference
     return tree
 
 
-@_batch_like.def_vmap
-def _batch_like_under_vmap(size: int, batched: PyTree, tree: PyTree, args: PyTree) -> Any:
-    """Return the two things that `jax.vmap` wants of a function that returns `tree` unchanged: the
-    tree, in which every array has a batch axis if any array of the two arguments has one; and a
-    tree of truth values, whether each array of the result has a batch axis.
+@_unchanged_with_batch_axes.def_vmap
+def _match_batch_axes_under_vmap(
+    size: int, batched: PyTree, tree: PyTree, reference: PyTree
+) -> tuple[PyTree, PyTree]:
+    """Return two things: `tree`, in which every array has a batch axis in front if any array of
+    `tree` or `reference` has one; and a tree of booleans, whether each array of this result has a
+    batch axis. By this rule `jax.vmap` batches `_unchanged_with_batch_axes`.
 
     - `size`: the number of members of the batch
-    - `batched`: a pair of trees of truth values: which arrays of `tree`, and which of `args`, have
+    - `batched`: a pair of trees of booleans: which arrays of `tree`, and which of `reference`, have
       a batch axis in front
-    - `tree`, `args`: the two arguments of the function, trees of arrays; the values in `args` are
-      not used
+    - `tree`, `reference`: trees of arrays; the values in `reference` are not used
     """
-    del args
+    del reference
     if not any(jax.tree.leaves(batched)):
         return tree, batched[0]
     grow = lambda a, b: a if b else jnp.broadcast_to(a, (size, *a.shape))  # noqa: E731

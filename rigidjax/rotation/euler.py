@@ -22,11 +22,11 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from rigidjax import _checks
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, components, cross, dot, power_of_two_scale
-from rigidjax.rotation.validation import require_direction, require_turn
+from rigidjax.rotation.validation import require_direction, require_turn_not_too_large
 
 _MANY_TURNS = 8 * np.pi
 
@@ -41,7 +41,9 @@ def to_quaternion(angles: Vec3Like, sequence: str = "ZXZ") -> Quat:
     [0.0, 1.0, 0.0, 0.0]
     """
     axes, reverse = _axes_of_sequence(sequence)
-    first, second, third = map(_rotation_about, axes, _reverse_if(_checked_angles(angles), reverse))
+    first, second, third = map(
+        _rotation_about, axes, _components_in_order(_checked_angles(angles), reverse)
+    )
     return quaternion.multiply(quaternion.multiply(first, second), third)
 
 
@@ -88,7 +90,7 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     q = power_of_two_scale(*components(q)) * q
     symmetric = i == k
     last = 3 - i - j
-    handed = _handedness(i, j)
+    handed = _cross_product_sign(i, j)
     w, x, y, z = q[0], q[1 + i], q[1 + j], q[1 + last]
     if symmetric:
         z = handed * z
@@ -127,7 +129,7 @@ def is_singular(angles: Vec3Like, sequence: str = "ZXZ") -> Bool[Array, ""]:
     True
     """
     axes, _ = _axes_of_sequence(sequence)
-    return _triple_product_of_axes(_checked_angles(angles)[1], axes)[1]
+    return _triple_product_and_singularity(_checked_angles(angles)[1], axes)[1]
 
 
 def rates_to_omega(
@@ -149,8 +151,8 @@ def rates_to_omega(
     _checks.require_option(frame, ("body", "world"), "frame")
     axes, reverse = _axes_of_sequence(sequence)
     angles, rates = _checked_angles(angles), _checks.array_of_shape(rates, (3,), "rates")
-    first, second, third = _turn_axes_in_body(axes, _reverse_if(angles, reverse))
-    a, b, c = _reverse_if(rates, reverse)
+    first, second, third = _turn_axes_in_body(axes, _components_in_order(angles, reverse))
+    a, b, c = _components_in_order(rates, reverse)
     omega = a * first + b * second + c * third
     return omega if frame == "body" else apply(to_matrix(angles, sequence), omega)
 
@@ -176,10 +178,10 @@ def omega_to_rates(
     angles, omega = _checked_angles(angles), _checks.array_of_shape(omega, (3,), "omega")
     if frame == "world":
         omega = apply(to_matrix(angles, sequence).T, omega)
-    first, second, third = _turn_axes_in_body(axes, _reverse_if(angles, reverse))
-    reach, singular = _triple_product_of_axes(angles[1], axes)
-    # `second` is normal to `first` and `third`; `aside`, `second` and `third` are an orthonormal
-    # frame.
+    first, second, third = _turn_axes_in_body(axes, _components_in_order(angles, reverse))
+    reach, singular = _triple_product_and_singularity(angles[1], axes)
+    # `second` is normal to `first` and `third`, so that `aside`, `second` and `third` are an
+    # orthonormal frame: the rates follow from the components of `omega` in this frame.
     aside, along = cross(third, second), dot(first, third)
     a = dot(aside, omega) / jnp.where(singular, 1, reach)
     a = jnp.where(singular, 0 if reverse else along * dot(third, omega), a)
@@ -211,8 +213,8 @@ def _axes_of_sequence(sequence: str) -> tuple[tuple[int, int, int], bool]:
 
 
 def _unknown_sequence_message(sequence: object, reason: str) -> str:
-    """Return the message that refuses `sequence` as the name of a sequence of Euler angles, with
-    the `reason`.
+    """Return the message of the error for a `sequence` that is no sequence of Euler angles; the
+    text `reason` says why it is none.
     """
     return (
         f"sequence: unknown {sequence!r}, {reason}; capitals are intrinsic (moving axes) as in "
@@ -224,24 +226,24 @@ def _checked_angles(angles: Vec3Like) -> Vec3:
     """Return three Euler angles (3,), rad, as an array. **Warns** if an angle that JAX does not
     trace is beyond four turns: it may be in degrees.
     """
-    angles = require_turn(_checks.array_of_shape(angles, (3,), "angles"), "angles")
+    angles = require_turn_not_too_large(_checks.array_of_shape(angles, (3,), "angles"), "angles")
     if _checks.is_known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
         words = "are over four turns: are they degrees? use jnp.deg2rad"
         warnings.warn(f"angles {angles.tolist()} rad {words}", stacklevel=3)
     return angles
 
 
-def _reverse_if(numbers: Vec3, reverse: bool) -> tuple[Scalar, Scalar, Scalar]:
-    """Return the three `numbers` as a tuple of scalars, in the opposite order if `reverse` is
-    true.
+def _components_in_order(numbers: Vec3, reverse: bool) -> tuple[Scalar, Scalar, Scalar]:
+    """Return the components of the vector `numbers` (3,) as a tuple of scalars, in the opposite
+    order if `reverse` is true.
     """
     a, b, c = numbers
     return (c, b, a) if reverse else (a, b, c)
 
 
-def _handedness(i: int, j: int) -> int:
-    """Return +1 if e_i × e_j is the third of the basis vectors e_0, e_1, e_2 (x, y, z), and −1 if
-    it is the opposite vector, for two axis numbers `i` ≠ `j`.
+def _cross_product_sign(i: int, j: int) -> int:
+    """Return the sign s of the cross product e_i × e_j = s e_k of two basis vectors: +1 or −1, for
+    two axis numbers `i` ≠ `j` (0 for x, 1 for y, 2 for z), where k is the third axis.
     """
     return 1 if (j - i) % 3 == 1 else -1
 
@@ -263,7 +265,9 @@ def _wrap_to_half_turn(angle: Scalar) -> Scalar:
     return jnp.where(angle <= -np.pi, angle + 2 * np.pi, angle)
 
 
-def _turn_axes_in_body(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3, Vec3]:
+def _turn_axes_in_body(
+    axes: tuple[int, int, int], angles: tuple[Scalar, Scalar, Scalar]
+) -> tuple[Vec3, Vec3, Vec3]:
     """Return the axes of the three turns of Euler angles as unit vectors (3,) in the body frame:
     the angular velocity of the body is the sum of these axes, each times the rate of its angle.
 
@@ -277,19 +281,19 @@ def _turn_axes_in_body(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3,
     return first, quaternion.rotate_inverse(last, second), third
 
 
-def _triple_product_of_axes(
-    middle: Scalar, axes: tuple[int, int, int]
+def _triple_product_and_singularity(
+    middle_angle: Scalar, axes: tuple[int, int, int]
 ) -> tuple[Scalar, Bool[Array, ""]]:
     """Return two things that tell how near Euler angles are to the singular case ("gimbal lock"):
     the product first · (third × second) of the unit axes of the three turns; and whether this
     product is zero to round-off.
 
-    - `middle`: the middle angle, rad
+    - `middle_angle`: rad
     - `axes`: the axis numbers of the three intrinsic turns (0 for x, 1 for y, 2 for z)
     """
     i, j, k = axes
-    size = jnp.sin(middle) if i == k else -_handedness(i, j) * jnp.cos(middle)
-    return size, jnp.abs(size) < 4 * jnp.finfo(middle.dtype).eps
+    size = jnp.sin(middle_angle) if i == k else -_cross_product_sign(i, j) * jnp.cos(middle_angle)
+    return size, jnp.abs(size) < 4 * jnp.finfo(middle_angle.dtype).eps
 
 
 __all__ = [
@@ -297,4 +301,4 @@ __all__ = [
     "to_matrix", "to_quaternion",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -7,13 +7,12 @@ The derivative is regular if R is unique.
 """
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3Like
@@ -116,7 +115,7 @@ def wahba(
         (one, _weighted_outer_products(seen, these, these), 4 * np.sqrt(eps)),
         (lax.stop_gradient(best), _weighted_outer_products(heavy, those, these), 64 * eps),
     ):
-        firmness = determinant(_curvature_of_gain(turn, b / jnp.sqrt((b * b).sum())))
+        firmness = determinant(_curvature_of_rotation_fit(turn, b / jnp.sqrt((b * b).sum())))
         loose = loose | ~(firmness > least)
     return _checks.error_if(best, loose, words)
 
@@ -135,30 +134,35 @@ def _weighted_outer_products(
 
 
 def _newton_step_of_wahba(
-    best: Mat3, w: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
+    rotation: Mat3,
+    weights: Float[Array, "n"],
+    world: Float[Array, "n 3"],
+    body: Float[Array, "n 3"],
 ) -> Mat3:
-    """Return the rotation matrix M (3, 3), body → world, after one Newton step of Wahba's problem:
-    to find the M with the largest Σ wᵢ aᵢ · M bᵢ, the best fit to n pairs of directions aᵢ and bᵢ
-    with the weights wᵢ.
+    """Return the rotation matrix M (3, 3), body → world, after one step of Newton's method for
+    Wahba's problem: to find the M with the largest Σ wᵢ aᵢ · M bᵢ, the best fit to n pairs of
+    directions aᵢ and bᵢ with the weights wᵢ.
 
     The cross product of aᵢ and M bᵢ is computed from the small difference of these two vectors, so
     that its rounding error is small, too. Otherwise the rounding of a direction with a large weight
     would turn the body about this direction.
 
-    - `best`: (3, 3), the rotation matrix to start from
-    - `w`: (n,), the weights
+    - `rotation`: (3, 3), the matrix M before the step
+    - `weights`: w (n,)
     - `world`: a (n, 3), each direction in the world frame
     - `body`: b (n, 3), the same direction in the body frame
     """
-    moved = (best[None] * body[:, None, :]).sum(-1)
+    moved = (rotation[None] * body[:, None, :]).sum(-1)
     lengths = [jnp.sqrt((x * x).sum(-1)) for x in lax.stop_gradient((moved, world))]
     ratio = lengths[0] / jnp.where(lengths[1] > 0, lengths[1], 1)
-    moment = (w[:, None] * jax.vmap(cross)(moved - ratio[:, None] * world, world)).sum(0)
+    moment = (weights[:, None] * jax.vmap(cross)(moved - ratio[:, None] * world, world)).sum(0)
     turn = solve(
-        _curvature_of_gain(jnp.eye(3, dtype=w.dtype), _weighted_outer_products(w, moved, world)),
+        _curvature_of_rotation_fit(
+            jnp.eye(3, dtype=weights.dtype), _weighted_outer_products(weights, moved, world)
+        ),
         moment,
     )
-    return product(quaternion.to_matrix(quaternion.exp(turn)), best)
+    return product(quaternion.to_matrix(quaternion.exp(turn)), rotation)
 
 
 def align(a: Vec3Like, b: Vec3Like) -> Mat3:
@@ -251,19 +255,19 @@ def _karcher_mean(quaternions: Float[Array, "n 4"], weights: Float[Array, "n"]) 
 
 
 def scale_to_order_one(x: Array) -> Array:
-    """Return an array `x` of any shape multiplied by a power of two that brings its largest entry
+    """Return an array `x` of any shape, multiplied by a power of two so that its largest entry is
     near 1.
 
-    Formulas of ratios, in which the scale cancels, use this function: no product then overflows.
+    A formula in which the scale cancels uses this function, so that no product overflows.
     """
     return power_of_two_scale(jnp.max(jnp.abs(x))) * x
 
 
 def checked_weights(weights: ArrayLike | None, rows: Array, description: str) -> Array:
-    """Return one weight (n,) for each of n items. **Raises:** `ValueError` if there is no item, and
-    if known weights are negative or all zero.
+    """Return the weights (n,) of n items. **Raises:** `ValueError` if there is no item, and if
+    weights that JAX does not trace are negative or all zero.
 
-    - `weights`: (n,), or `None` for ones
+    - `weights`: (n,), or `None` for weights of 1
     - `rows`: (n,), an array with the dtype of the result and one entry for each item
     - `description`: the name of the items, for messages
     """
@@ -274,12 +278,14 @@ def checked_weights(weights: ArrayLike | None, rows: Array, description: str) ->
     w = _checks.array_of_shape(weights, rows.shape, "weights")
     if _checks.is_known(w):
         words = "numbers ≥ 0, at least one of them positive"
-        _checks.require_sign(_checks.require_finite(w, "weights"), "weights", words, zero=True)
+        _checks.require_positive(
+            _checks.require_finite(w, "weights"), "weights", words, allow_zero=True
+        )
         _checks.error_if(w, ~(w > 0).any(), f"weights: wanted {words}")
     return w
 
 
-def _signed_singular_value_sum(b: Mat3) -> tuple[Scalar, Scalar]:
+def _signed_singular_value_sum_and_zeta(b: Mat3) -> tuple[Scalar, Scalar]:
     """Return two scalars from which the rotation nearest to a matrix b follows (Markley 1993): λ,
     the sum of the singular values of b, in which the least one is negative if det b is negative;
     and ζ = ½ (λ² − 1) λ − det b. λ is the largest root of a quartic equation, found by Newton's
@@ -300,13 +306,12 @@ def _signed_singular_value_sum(b: Mat3) -> tuple[Scalar, Scalar]:
     return root, 0.5 * (root * root - 1) * root - det
 
 
-def _curvature_of_gain(rotation: Mat3, b: Mat3) -> Mat3:
+def _curvature_of_rotation_fit(rotation: Mat3, b: Mat3) -> Mat3:
     """Return the matrix Tr(S) 1 − S (3, 3), where S is the symmetric part of Rᵀb, and 1 the unit
-    matrix.
+    matrix: minus the second derivative of Tr((R exp(x))ᵀ b) with respect to a rotation vector x, at
+    x = 0.
 
-    It is the curvature of the fit: the rotation nearest to b has the largest Tr(Rᵀb). After a small
-    turn with the rotation vector x, this quantity is Tr((R exp(x))ᵀ b), whose second derivative
-    with respect to x is −(Tr(S) 1 − S) at x = 0.
+    The rotation R nearest to b has the largest Tr(Rᵀb); Newton's method for R needs this curvature.
 
     - `rotation`: R (3, 3)
     - `b`: (3, 3), any matrix
@@ -323,7 +328,7 @@ def nearest_rotation(b: Mat3) -> Mat3:
     """
     b = scale_to_order_one(b)
     b = b / jnp.sqrt((b * b).sum())
-    root, zeta = _signed_singular_value_sum(b)
+    root, zeta = _signed_singular_value_sum_and_zeta(b)
     kappa = 0.5 * (root * root - 1)
     rough = ((kappa + 1) * b + root * cofactors(b) - product(b, product(b.T, b))) / zeta
     q = matrix_to_quaternion(rough)
@@ -331,15 +336,13 @@ def nearest_rotation(b: Mat3) -> Mat3:
     # digits.
     for _ in range(3):
         r = quaternion.to_matrix(q)
-        turn = solve(_curvature_of_gain(r, b), 2 * vee(product(r.T, b)))
+        turn = solve(_curvature_of_rotation_fit(r, b), 2 * vee(product(r.T, b)))
         q = quaternion.normalise(quaternion.multiply(q, quaternion.exp(turn)))
     return quaternion.to_matrix(q)
 
 
 @nearest_rotation.defjvp
-def _nearest_rotation_jvp(
-    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[Any, Any]:
+def _nearest_rotation_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
     """Return the rotation matrix R (3, 3) nearest to a matrix b, and its change for a change db of
     b. By this rule JAX differentiates `nearest_rotation`.
 
@@ -355,4 +358,4 @@ def _nearest_rotation_jvp(
     # `b` may have any size: a common factor for `b` and `db` leaves the derivative unchanged.
     scale = power_of_two_scale(jnp.max(jnp.abs(b)))
     b, db = scale * b, scale * db
-    return r, product(r, hat(solve(_curvature_of_gain(r, b), 2 * vee(product(r.T, db)))))
+    return r, product(r, hat(solve(_curvature_of_rotation_fit(r, b), 2 * vee(product(r.T, db)))))

@@ -8,19 +8,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
-from rigidjax.rotation.barrier import compute_once
+from rigidjax.rotation.barrier import prevent_recomputation
 from rigidjax.rotation.linalg3 import (
     components,
     cross_components,
     dot_components,
     entries,
     power_of_two_scale,
-    square,
+    squared_length,
 )
-from rigidjax.rotation.stumpff import arctan_ratio, inverse_kernel, stumpff
+from rigidjax.rotation.stumpff import arctan_ratio_of_square, inverse_jacobian_coefficient, stumpff
 
 # The compiled functions are inlined in whatever is being traced, so that XLA and `jax.grad` see no
 # boundary.
@@ -29,25 +29,26 @@ _compiled = partial(jax.jit, inline=True)
 
 @_compiled
 def vector_to_quaternion(v: Vec3) -> Quat:
-    """Return the unit quaternion (cos θ/2, ½ v sin(θ/2)/(θ/2)), (4,), of a rotation vector v (3,),
-    rad, with the angle θ = |v|.
+    """Return the unit quaternion (4,) of a rotation vector v (3,), rad: (cos θ/2, ½ v
+    sin(θ/2)/(θ/2)), with the angle θ = |v|.
     """
     x, y, z = parts = components(v)
-    s = 0.25 * square(parts)
+    s = 0.25 * squared_length(parts)
     half = 0.5 * stumpff(1, s)
     return jnp.stack([stumpff(0, s), half * x, half * y, half * z])
 
 
 @_compiled
 def vector_to_matrix(v: Vec3) -> Mat3:
-    """Return the rotation matrix 1 + A hat v + B (hat v)², (3, 3), of a rotation vector v (3,),
-    rad, with A = sin θ/θ, B = (1 − cos θ)/θ² and the angle θ = |v|.
+    """Return the rotation matrix (3, 3) of a rotation vector v (3,), rad: 1 + A hat v + B (hat v)²,
+    with A = sin θ/θ, B = (1 − cos θ)/θ² and the angle θ = |v|; hat v is the matrix of the cross
+    product, (hat v) y = v × y.
     """
     parts = components(v)
-    s = 0.25 * square(parts)
+    s = 0.25 * squared_length(parts)
     half = stumpff(1, s)
     return hat_polynomial(
-        parts, compute_once(stumpff(0, s) * half), compute_once(0.5 * half * half)
+        parts, prevent_recomputation(stumpff(0, s) * half), prevent_recomputation(0.5 * half * half)
     )
 
 
@@ -80,15 +81,13 @@ def _log_of_quaternion(q: Quat) -> Vec3:
     # all terms of the sums are positive, so nothing cancels.
     a = jnp.abs(w) + jnp.sqrt(n2 + w * w)
     inverse = 1 / (a + jnp.sqrt(n2 + a * a))
-    scale = 8 * inverse * arctan_ratio(n2 * inverse * inverse)
+    scale = 8 * inverse * arctan_ratio_of_square(n2 * inverse * inverse)
     scale = jnp.where(is_noncanonical(parts), -scale, scale)
     return jnp.stack([scale * x, scale * y, scale * z])
 
 
 @_log_of_quaternion.defjvp
-def _log_of_quaternion_jvp(
-    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[Any, Any]:
+def _log_of_quaternion_jvp(primals: tuple[Quat], tangents: tuple[Quat]) -> tuple[Vec3, Vec3]:
     """Return the rotation vector (3,), rad, of a quaternion q of any length, and its change for a
     change dq of q, by the inverse of the right Jacobian (the matrix from a change of the rotation
     vector to the small turn in the body frame). By this rule JAX differentiates
@@ -104,12 +103,12 @@ def _log_of_quaternion_jvp(
     w, *u = parts = components(scale * q)
     dw, *du = components(scale * dq)
     # First the small turn in the body frame, 2 vec(q̄ dq)/|q|², then the inverse right Jacobian.
-    scale, aside = 2 / square4(parts), cross_components(u, du)
+    scale, aside = 2 / squared_quaternion_length(parts), cross_components(u, du)
     turn = [scale * (w * du[i] - dw * u[i] - aside[i]) for i in range(3)]
     vs = components(v)
     across = cross_components(vs, turn)
     twice = cross_components(vs, across)
-    g = inverse_kernel(dot_components(vs, vs))
+    g = inverse_jacobian_coefficient(dot_components(vs, vs))
     return v, jnp.stack([turn[i] + 0.5 * across[i] + g * twice[i] for i in range(3)])
 
 
@@ -120,7 +119,7 @@ quaternion_to_vector = _compiled(_log_of_quaternion)
 def to_unit_length(q: Quat) -> Quat:
     """Return the quaternion q (4,), of any length but zero, scaled to length 1."""
     q = power_of_two_scale(*components(q)) * q
-    return q / jnp.sqrt(square4(components(q)))
+    return q / jnp.sqrt(squared_quaternion_length(components(q)))
 
 
 def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar | float) -> Mat3:
@@ -139,19 +138,20 @@ def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar | float) -> Mat3:
 
 
 def left_jacobian_inverse(v: Vec3) -> Mat3:
-    """Return the inverse of the left Jacobian of a rotation vector v (3,), rad: the matrix 1 − ½
-    hat v + g (hat v)², with g = (1 − (θ/2) cot(θ/2))/θ² and θ = |v|.
+    """Return the inverse (3, 3) of the left Jacobian of a rotation vector v (3,), rad: 1 − ½ hat v
+    + g (hat v)², with g = (1 − (θ/2) cot(θ/2))/θ² and θ = |v|; hat v is the matrix of the cross
+    product, (hat v) y = v × y.
     """
-    t = square(parts := components(v))
-    return hat_polynomial(parts, jnp.full_like(t, -0.5), inverse_kernel(t))
+    t = squared_length(parts := components(v))
+    return hat_polynomial(parts, jnp.full_like(t, -0.5), inverse_jacobian_coefficient(t))
 
 
-def square4(q: Sequence[Scalar]) -> Scalar:
+def squared_quaternion_length(q: Sequence[Scalar]) -> Scalar:
     """Return the squared length of a quaternion `q`, given as four scalars."""
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
 
 
-def product4(p: Iterable[Any], q: Iterable[Any]) -> tuple[Any, ...]:
+def quaternion_product(p: Iterable[Any], q: Iterable[Any]) -> tuple[Any, ...]:
     """Return the product p q of two quaternions as a tuple of four scalars.
 
     - `p`, `q`: four scalars each, (w, x, y, z), of JAX or NumPy
@@ -168,7 +168,8 @@ def product4(p: Iterable[Any], q: Iterable[Any]) -> tuple[Any, ...]:
 
 def is_noncanonical(q: Sequence[Scalar]) -> Array:
     """Return whether the first nonzero component of a quaternion `q`, given as four scalars, is
-    negative: −q is then the canonical one of the two quaternions of this rotation.
+    negative. The quaternions q and −q are one rotation; the one whose first nonzero component is
+    positive is called canonical.
     """
     w, x, y, z = q
     lead = jnp.where(w != 0, w, jnp.where(x != 0, x, jnp.where(y != 0, y, z)))

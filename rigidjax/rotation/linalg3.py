@@ -16,12 +16,12 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3, Vec3Like
-from rigidjax.rotation.barrier import compute_once
+from rigidjax.rotation.barrier import prevent_recomputation
 
 
 def components(v: Float[Array, "n"]) -> tuple[Scalar, ...]:
-    """Return the entries of a vector `v` (n,) as a tuple of scalars; one `lax.split` is faster in
-    gradients than indices.
+    """Return the n entries of a vector `v` (n,) as a tuple of scalars. They come from one
+    `lax.split`, which is faster in gradients than indices.
     """
     return tuple(part.reshape(()) for part in lax.split(v, (1,) * v.shape[0]))
 
@@ -54,20 +54,19 @@ def dot_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def square(v: Sequence[Scalar]) -> Scalar:
-    """Return the squared length of a vector `v`, given as three scalars; it is computed once,
-    because costly functions use the result.
+def squared_length(v: Sequence[Scalar]) -> Scalar:
+    """Return the squared length of a vector `v`, given as three scalars. XLA computes it once for
+    all its uses, because costly functions depend on it.
     """
-    return compute_once(dot_components(v, v))
+    return prevent_recomputation(dot_components(v, v))
 
 
 def power_of_two_scale(*parts: Scalar) -> Scalar:
-    """Return a power of two that, multiplied by the largest of the scalars `parts`, is near 1; its
+    """Return the power of two whose product with the largest of the scalars `parts` is near 1; its
     derivative is zero.
 
-    Formulas that do not depend on the length of an argument use this function. The argument
-    multiplied by the power of two keeps all digits, and the squares of its components do not
-    overflow.
+    A formula that does not depend on the length of a vector first multiplies the vector by this
+    power of two: no digit is lost, and the squares of its components do not overflow.
     """
     sizes = [jnp.abs(lax.stop_gradient(part)) for part in parts]
     info = jnp.finfo(sizes[0].dtype)
@@ -77,8 +76,8 @@ def power_of_two_scale(*parts: Scalar) -> Scalar:
 
 
 def hat(w: Vec3Like) -> Mat3:
-    """Return the matrix J with J y = w × y, of `w` (3,) in any units and frame (notes, eqs 41–43,
-    49).
+    """Return the matrix J (3, 3) of the cross product with a vector `w` (3,), any units: J y = w ×
+    y (notes, eqs 41–43, 49).
 
     >>> hat(jnp.array([1.0, 2.0, 3.0])).tolist()
     [[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]]
@@ -89,8 +88,9 @@ def hat(w: Vec3Like) -> Mat3:
 
 
 def vee(matrix: Mat3Like) -> Vec3:
-    """Return the vector w of an antisymmetric `matrix` (3, 3) A; for any A, w_i = ½ Tr(A J_iᵀ)
-    (notes, eqs 52, 53).
+    """Return the vector w (3,) of an antisymmetric `matrix` A (3, 3), with A y = w × y. Of any
+    other A the antisymmetric part is taken: w_i = ½ Tr(A J_iᵀ), where J_i = hat(e_i) is the matrix
+    of the basis vector e_i (notes, eqs 52, 53).
 
     >>> vee(hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]
@@ -100,8 +100,8 @@ def vee(matrix: Mat3Like) -> Vec3:
 
 
 def basis(dtype: DTypeLike = float) -> Float[Array, "3 3 3"]:
-    """Return the matrices J_1, J_2, J_3: J_i y = e_i × y, ½ Tr(J_iᵀ J_j) = δ_ij (notes, eqs 41–43,
-    53).
+    """Return the basis J_1, J_2, J_3 of the antisymmetric matrices, with J_i y = e_i × y for the
+    basis vectors e_i, and ½ Tr(J_iᵀ J_j) = δ_ij (notes, eqs 41–43, 53).
 
     **Arguments:** `dtype` of the (3, 3, 3) array. Eq 16 of the notes prints −J_3, the transpose of
     J_3; eq 42 is right.

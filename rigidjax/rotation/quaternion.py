@@ -21,7 +21,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import (
     Mat3,
     Mat3Like,
@@ -38,7 +38,7 @@ from rigidjax.rotation.kernels import (
     hat_polynomial,
     is_noncanonical,
     matrix_to_quaternion,
-    product4,
+    quaternion_product,
     quaternion_to_vector,
     to_unit_length,
     vector_to_quaternion,
@@ -53,7 +53,7 @@ from rigidjax.rotation.linalg3 import (
 from rigidjax.rotation.validation import (
     require_direction,
     require_rotation_matrix,
-    require_turn,
+    require_turn_not_too_large,
     require_unit_quaternion,
 )
 
@@ -70,7 +70,9 @@ def exp(v: Vec3Like) -> Quat:
     >>> exp(jnp.array([0.0, 0.0, jnp.pi])).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    return vector_to_quaternion(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
+    return vector_to_quaternion(
+        require_turn_not_too_large(_checks.array_of_shape(v, (3,), "v"), "v")
+    )
 
 
 def log(q: QuatLike) -> Vec3:
@@ -99,7 +101,9 @@ def multiply(p: QuatLike, q: QuatLike) -> Quat:
     [0.0, 0.0, 0.0, 1.0]
     """
     first = components(_checks.array_of_shape(p, (4,), "p", hint=_HINT))
-    return jnp.stack(product4(first, components(_checks.array_of_shape(q, (4,), "q", hint=_HINT))))
+    return jnp.stack(
+        quaternion_product(first, components(_checks.array_of_shape(q, (4,), "q", hint=_HINT)))
+    )
 
 
 def conjugate(q: QuatLike) -> Quat:
@@ -185,7 +189,7 @@ def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
     [0.0, 0.0, 0.0, 1.0]
     """
     axis = require_direction(_checks.array_of_shape(axis, (3,), "axis"), "axis")
-    half = 0.5 * require_turn(
+    half = 0.5 * require_turn_not_too_large(
         _checks.array_of_shape(angle, (), "angle").astype(axis.dtype), "angle"
     )
     axis = power_of_two_scale(*components(axis)) * axis
@@ -205,7 +209,7 @@ def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
     q = _checks.array_of_shape(q, (4,), "q", hint=_HINT)
     omega = _checks.array_of_shape(omega, (3,), "omega")
     dt = _checks.array_of_shape(dt, (), "dt").astype(omega.dtype)
-    return multiply(q, vector_to_quaternion(require_turn(dt * omega, "dt * omega")))
+    return multiply(q, vector_to_quaternion(require_turn_not_too_large(dt * omega, "dt * omega")))
 
 
 def rate(q: QuatLike, omega: Vec3Like) -> Quat:
@@ -235,7 +239,9 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
     """
     p = _checks.array_of_shape(p, (4,), "p", hint=_HINT)
     v = quaternion_to_vector(require_direction(multiply(conjugate(p), q), "p̄ q"))
-    part = require_turn(_checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn")
+    part = require_turn_not_too_large(
+        _checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn"
+    )
     return multiply(p, vector_to_quaternion(part))
 
 
@@ -335,4 +341,4 @@ __all__ = [
     "to_matrix", "to_xyzw", "uniform",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from rigidjax import _checks
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import components, cross, dot, power_of_two_scale
@@ -101,4 +101,4 @@ __all__ = [
     "to_matrix", "to_quaternion",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

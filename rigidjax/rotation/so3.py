@@ -10,7 +10,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Mat3, Mat3Like, Scalar, ScalarLike, Vec3, Vec3Like
 from rigidjax.rotation import kernels, quaternion
 from rigidjax.rotation.fitting import (
@@ -31,11 +31,11 @@ from rigidjax.rotation.linalg3 import (
     hat as hat,
     product as product,
     solve as solve,
-    square,
+    squared_length,
     vee as vee,
 )
 from rigidjax.rotation.stumpff import stumpff
-from rigidjax.rotation.validation import require_rotation_matrix, require_turn
+from rigidjax.rotation.validation import require_rotation_matrix, require_turn_not_too_large
 
 
 def exp(v: Vec3Like) -> Mat3:
@@ -47,7 +47,7 @@ def exp(v: Vec3Like) -> Mat3:
     >>> exp(jnp.array([0.0, 0.0, jnp.pi / 2])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
     """
-    return vector_to_matrix(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
+    return vector_to_matrix(require_turn_not_too_large(_checks.array_of_shape(v, (3,), "v"), "v"))
 
 
 def log(matrix: Mat3Like) -> Vec3:
@@ -73,8 +73,8 @@ def left_jacobian(v: Vec3Like) -> Mat3:
     >>> left_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    parts = components(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
-    t = square(parts)
+    parts = components(require_turn_not_too_large(_checks.array_of_shape(v, (3,), "v"), "v"))
+    t = squared_length(parts)
     return hat_polynomial(parts, stumpff(2, t), stumpff(3, t))
 
 
@@ -97,7 +97,9 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
     >>> left_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    return kernels.left_jacobian_inverse(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
+    return kernels.left_jacobian_inverse(
+        require_turn_not_too_large(_checks.array_of_shape(v, (3,), "v"), "v")
+    )
 
 
 def right_jacobian_inverse(v: Vec3Like) -> Mat3:
@@ -152,8 +154,8 @@ def about_axis(axis: Vec3Like, angle: ScalarLike) -> Mat3:
 
 
 def adjoint(matrix: Mat3Like) -> Mat3:
-    """Return Ad_M, with M hat(w) Mᵀ = hat(Ad_M w): the `matrix` (3, 3) itself (notes, eq 48 with
-    Mᵀ).
+    """Return the adjoint matrix Ad_M (3, 3) of a rotation M, with M hat(w) Mᵀ = hat(Ad_M w) for
+    every vector w: it is the `matrix` (3, 3) M itself (notes, eq 48 with Mᵀ).
 
     >>> adjoint(jnp.eye(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -182,8 +184,8 @@ def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
-    """Return M T Mᵀ, in the world frame, of a `turn` (3, 3) T in the body frame, by `matrix` M
-    (notes, eqs 25, 26).
+    """Return the rotation M T Mᵀ (3, 3): the `turn` T (3, 3), given in the body frame, expressed in
+    the world frame by the rotation `matrix` M (3, 3), body → world (notes, eqs 25, 26).
 
     >>> conjugate(jnp.eye(3), jnp.eye(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -205,7 +207,8 @@ def rate(matrix: Mat3Like, omega: Vec3Like) -> Mat3:
 
 
 def body_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
-    """Return Ω of M and dM/dt: Ω_i = ½ Tr(Mᵀ Ṁ J_iᵀ) (notes, eqs 48–50, 80).
+    """Return the angular velocity Ω, body frame, of a rotation matrix M and its rate Ṁ = dM/dt:
+    Ω_i = ½ Tr(Mᵀ Ṁ J_iᵀ), where J_i is the i-th matrix of `basis` (notes, eqs 48–50, 80).
 
     **Arguments:** `matrix` (3, 3), body → world; `rate` (3, 3), 1/s. **Returns:** (3,) rad/s, body
     frame; the symmetric part of MᵀṀ is dropped.
@@ -218,8 +221,8 @@ def body_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
 
 
 def world_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
-    """Return the angular velocity w, world frame, of M and dM/dt: hat(w) = Ṁ Mᵀ (notes, eqs 36–42,
-    50).
+    """Return the angular velocity w, world frame, of a rotation matrix M and its rate Ṁ = dM/dt:
+    hat(w) = Ṁ Mᵀ (notes, eqs 36–42, 50).
 
     **Arguments:** `matrix` (3, 3), body → world; `rate` (3, 3), 1/s. **Returns:** (3,) rad/s, world
     frame.
@@ -242,7 +245,9 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     """
     a, b = _checks.array_of_shape(a, (3, 3), "a"), _checks.array_of_shape(b, (3, 3), "b")
     v = quaternion.log(matrix_to_quaternion(_relative_rotation(a, b)))
-    part = require_turn(_checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn")
+    part = require_turn_not_too_large(
+        _checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn"
+    )
     return product(a, vector_to_matrix(part))
 
 
@@ -280,4 +285,4 @@ __all__ = [
     "wahba", "world_rate",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -9,14 +9,13 @@ one number at a time on CPU, while polynomials take a whole vector.
 
 import math
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
-# The largest argument of `arctan_ratio`, tan²(π/8).
+# The largest argument of `arctan_ratio_of_square`, tan²(π/8).
 _REACH = math.tan(math.pi / 8) ** 2
 # π as the sum of three numbers. The first two have only 28 (float64) or 10 (float32) bits, so that
 # their products with a number of half turns are exact.
@@ -49,8 +48,8 @@ def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
 
 @stumpff.defjvp
 def _stumpff_jvp(
-    k: int, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[Any, Any]:
+    k: int, primals: tuple[Float[Array, "..."]], tangents: tuple[Float[Array, "..."]]
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, a sum over n = 0, 1, 2, …, and its
     change for a change dt of t, from the derivative ½ (k c_{k+2} − c_{k+1}). By this rule JAX
     differentiates `stumpff`.
@@ -64,20 +63,24 @@ def _stumpff_jvp(
     return stumpff(k, t), 0.5 * slope * dt
 
 
-def inverse_kernel(t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return (1 − (θ/2) cot(θ/2))/θ² as a smooth function of t = θ² < (2π)², any shape; it is 1/12
-    at 0. The inverses of the left and right Jacobians of a rotation vector have this coefficient.
+def inverse_jacobian_coefficient(t: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the coefficient g = (1 − (θ/2) cot(θ/2))/θ² of (hat v)² in the inverse of the left or
+    right Jacobian of a rotation vector v, as a smooth function of `t`; it is 1/12 at 0.
+
+    - `t`: θ² = |v|², below (2π)², any shape
     """
     return (stumpff(3, t) - 2 * stumpff(4, t)) / stumpff(1, 0.25 * t) ** 2
 
 
-def arctan_ratio(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return arctan(√z)/√z for 0 ≤ z ≤ tan²(π/8), by its Taylor series (Abramowitz & Stegun
-    4.4.42).
+def arctan_ratio_of_square(square: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return arctan(x)/x of a number x that is given by its square, by the Taylor series
+    (Abramowitz & Stegun 4.4.42).
+
+    - `square`: x², from 0 to tan²(π/8), any shape
     """
-    tiny = jnp.finfo(z.dtype).eps / 4
+    tiny = jnp.finfo(square.dtype).eps / 4
     terms = next(n for n in range(1, 40) if _REACH**n / (2 * n + 1) < tiny)
-    return _evaluate_polynomial([(-1) ** n / (2 * n + 1) for n in range(terms)], z)
+    return _evaluate_polynomial([(-1) ** n / (2 * n + 1) for n in range(terms)], square)
 
 
 def _cosine_or_sinc_of_square(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -99,7 +102,7 @@ def _cosine_or_sinc_of_square(k: int, t: Float[Array, "..."]) -> Float[Array, ".
     value = value * jnp.where(far, remainder, 1) if k else value
     # The value is divided by the sign, not multiplied: XLA on CPU computes a quotient once, but
     # repeats a polynomial for each use.
-    sign = parity(turns)
+    sign = power_of_minus_one(turns)
     return value / jnp.where(far, sign * theta if k else sign, 1)
 
 
@@ -113,7 +116,7 @@ def split_half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], F
     return turns, ((angle - turns * head) - turns * middle) - turns * tail
 
 
-def parity(n: Float[Array, "..."]) -> Float[Array, "..."]:
+def power_of_minus_one(n: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return (−1)ⁿ for integers `n`, given as floating-point numbers of any shape."""
     return 1 - 2 * (n - 2 * jnp.floor(0.5 * n))
 

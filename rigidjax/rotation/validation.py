@@ -12,51 +12,54 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 
 
-def tolerance(dtype: object) -> float:
-    """Return how far a rotation that a user gives may be from a rotation: 1e-6 for the `dtype`
-    float64, 1e-3 for float32. This is the largest error of the length of a quaternion, or of an
-    entry of MᵀM for a matrix M.
+def rotation_tolerance(dtype: object) -> float:
+    """Return the largest error that checks of a rotation tolerate: 1e-6 for the `dtype` float64,
+    1e-3 for float32. It is the error of the length of a quaternion, or of an entry of MᵀM for a
+    matrix M.
     """
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
 def require_direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
-    """Return the vector `v` (n,), any unit. **Raises:** `ValueError` if it is known and has no
-    direction: zero, NaN, infinity; the text `name` names it in the message.
+    """Return the vector `v` (n,), any unit. **Raises:** `ValueError` if it has no direction, that
+    is, for zero, NaN and infinity, unless JAX traces it; the text `name` names the vector in the
+    message.
 
-    XLA takes a number below the least normal number, 2e-308, for zero on some machines.
+    Entries that are all below the least normal number of the dtype, 2e-308 in float64, count as
+    zero, because XLA on some machines takes such numbers for zero.
     """
     if (
         _checks.is_known(v)
-        and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest_component(v) < np.inf
+        and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest_absolute_entry(v) < np.inf
     ):
         _checks.require_finite(v, name)
         got = (
             "zero"
-            if _largest_component(v) == 0
+            if _largest_absolute_entry(v) == 0
             else f"less than the least normal number, {least:.2g}"
         )
         raise ValueError(f"{name}: wanted a direction, got {got}")
     return v
 
 
-def require_turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
-    """Return the rotation vector or angle `v`, rad. **Raises:** `ValueError` if it is known and so
-    large that no digit of the rotation is correct; the text `name` names it in the message.
+def require_turn_not_too_large(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
+    """Return the rotation vector or the angle `v`, rad. **Raises:** `ValueError` if it is so large
+    (4.5e15 rad; in float32 8.4e6) that no digit of the rotation is correct, unless JAX traces it;
+    the text `name` names it in the message.
     """
-    if _checks.is_known(v) and not _largest_component(v) <= (
+    if _checks.is_known(v) and not _largest_absolute_entry(v) <= (
         limit := 1 / float(jnp.finfo(v.dtype).eps)
     ):
         _checks.require_finite(v, name)
         raise ValueError(
-            f"{name}: a turn by {_largest_component(v):.3g} rad; beyond {limit:.2g} rad "
+            f"{name}: a turn by {_largest_absolute_entry(v):.3g} rad; beyond {limit:.2g} rad "
             f"neighbouring {v.dtype} numbers are more than half a radian apart: the attitude is "
             "unknown"
         )
     return v
 
 
-def _largest_component(v: Float[Array, "*n"]) -> float:
+def _largest_absolute_entry(v: Float[Array, "*n"]) -> float:
     """Return the largest absolute value of the entries of an array `v` that JAX does not trace; NaN
     if an entry is NaN.
     """
@@ -67,8 +70,8 @@ def _largest_component(v: Float[Array, "*n"]) -> float:
 
 def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
     """Return the matrices m (..., 3, 3). **Raises:** `ValueError` (under `jit` `equinox.error_if`)
-    if any of them is no rotation, with its determinant or its error; the text `name` names the
-    matrix in the message.
+    if any of them is no rotation. The message contains its determinant or its error; the text
+    `name` names the matrix in the message.
     """
     m = _checks.require_finite(m, name)
     known = _checks.is_known(m)
@@ -82,7 +85,7 @@ def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[A
     words = f"left-handed frame{got}; a rotation has det = +1 (an axis flipped or swapped?)"
     m = _checks.error_if(m, (det < 0).any(), f"{name}: {words}")
     error = abs(gram - xp.eye(3, dtype=values.dtype).reshape((1,) * (values.ndim - 2) + (3, 3)))
-    limit = tolerance(values.dtype)
+    limit = rotation_tolerance(values.dtype)
     got = f" is {error.max():.3g}" if known else " is too large"
     words = f"{name}: not orthogonal, the largest entry of |MᵀM − 1|{got} (limit {limit:g}); "
     words += "so3.project gives the nearest rotation"
@@ -90,8 +93,8 @@ def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[A
 
 
 def require_near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"]:
-    """Return the quaternion `q` (4,). **Raises:** `ValueError` if it is known and its length
-    differs from 1 by more than `limit`; the text `name` names it in the message.
+    """Return the quaternion `q` (4,). **Raises:** `ValueError` if its length differs from 1 by more
+    than `limit`, unless JAX traces it; the text `name` names the quaternion in the message.
     """
     if _checks.is_known(q):
         length = float(np.linalg.norm(np.asarray(q, float)))
@@ -109,13 +112,13 @@ def require_unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Arr
     q = _checks.require_finite(q, name)
     # Use NumPy for known numbers: under `jit`, JAX would trace what is computed from known numbers,
     # too.
-    xp = _checks.namespace(q)
+    xp = _checks.array_module(q)
     with np.errstate(over="ignore"):
         length = xp.sqrt((xp.asarray(q) ** 2).sum(-1, keepdims=True))
     words = f"{name}: zero quaternion; it is no rotation (w, x, y, z)"
     q = _checks.error_if(q, (length == 0).any(), words)
     off = xp.abs(length - 1)
-    limit = tolerance(q.dtype)
+    limit = rotation_tolerance(q.dtype)
     got = f", its length is {length.ravel()[off.argmax()]:.6g}" if xp is np else ""
     words = f"{name}: not a unit quaternion{got} (limit 1 ± {limit:g}); use quaternion.normalise"
     q = _checks.error_if(q, ~(off.max() <= limit), words)

@@ -1,6 +1,6 @@
 """Solve for the motion of a body: with adaptive steps, with equal steps, or in closed form."""
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.solve.adaptive import adaptive as adaptive
 from rigidjax.solve.crossings import Event as Event, crossings as crossings
 from rigidjax.solve.exponents import lyapunov_exponents as lyapunov_exponents
@@ -14,4 +14,4 @@ __all__ = [
     "lyapunov_exponents", "simulate",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

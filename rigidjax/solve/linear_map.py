@@ -18,7 +18,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-from rigidjax.rotation.barrier import batch_as
+from rigidjax.rotation.barrier import match_batch_axes
 
 Arrays = list[Any]
 Map = Callable[..., Arrays]
@@ -62,7 +62,7 @@ def as_known(known: Any, moved: Any) -> Any:
 @jax.custom_jvp
 def _with_derivatives_of(known: Array, moved: Array) -> Array:
     """Return the array `known` with the derivatives of `moved`, another array of its shape."""
-    return batch_as(known, (known, moved))
+    return match_batch_axes(known, (known, moved))
 
 
 @_with_derivatives_of.defjvp
@@ -90,7 +90,7 @@ def _with_nan_derivatives(count: int, *numbers: Array) -> Arrays:
     The values are returned as they are. The other arrays in `numbers` are the inputs: a number that
     is NaN or infinite gets NaN as its derivative with respect to all of them.
     """
-    return batch_as(list(numbers[:count]), numbers)
+    return match_batch_axes(list(numbers[:count]), numbers)
 
 
 @_with_nan_derivatives.defjvp

@@ -19,7 +19,7 @@ from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations, project_to_group
 from rigidjax.motion.torques.base import sees_attitude
 from rigidjax.rotation.barrier import barrier
-from rigidjax.rotation.kernels import product4
+from rigidjax.rotation.kernels import quaternion_product
 from rigidjax.solve.components import join, split
 from rigidjax.solve.equal_steps import change_and_slope
 from rigidjax.solve.explicit import NestedInterpolation, cubic_rows, direction_and_length
@@ -129,7 +129,7 @@ class Magnus4(dfx.AbstractSolver):
             return way * a, way * b, way * c
 
         change, turn = change_and_turn(slope, rate, t0, t1, h, omega)
-        change = join((*product4(q, turn), *change), y0)
+        change = join((*quaternion_product(q, turn), *change), y0)
         y1 = project_to_group(jax.tree.map(jnp.add, y0, change))
         left, right = terms.vf(t0, y0, args), terms.vf(t1, y1, args)
 

@@ -162,7 +162,7 @@ def direction(times: Array) -> Int[Array, ""] | None:
 
     If the direction is known to be 1 before the run, the result is `None`.
     """
-    ends = _checks.namespace(times).asarray(times)
+    ends = _checks.array_module(times).asarray(times)
     change = ends[-1] - ends[0]
     if _checks.is_known(times) and change > 0:
         return None

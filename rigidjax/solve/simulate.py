@@ -288,7 +288,9 @@ def _solve_run(setup: Any, event: Any, state0: Any, times: Array, run: Any = Non
             state0 = start_with_checked_condition(event, setup.body, state0, setup.torque, times[0])
             ys, stats, result, event_time, event_state = solve_until(setup, event, state0, times)
     except RuntimeError as error:
-        raise words_of_steps(setup, state0, times, _checks.own_sentence(error)) from None
+        raise words_of_steps(
+            setup, state0, times, _checks.error_without_equinox_text(error)
+        ) from None
     warn_of_missed(setup, state0, times, stats)
     if setup.throw and "ended" in stats:
         ys = raise_if_ended(setup.torque, ys, stats, times)

@@ -1,6 +1,6 @@
 """Provide every solver of this package, and the adjoint that runs them, as `rigidjax.solvers`."""
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.exact.diffrax_solver import FreeSolver as FreeSolver
 from rigidjax.solve.explicit import (
     DormandPrince8 as DormandPrince8,
@@ -21,4 +21,4 @@ __all__ = [
     "Splitting2", "Splitting4", "Splitting6", "Tsitouras5",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

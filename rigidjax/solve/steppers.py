@@ -27,7 +27,7 @@ from rigidjax.motion.torques.base import evaluate, sees_attitude
 from rigidjax.motion.torques.inputs import bind, delays_of
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.barrier import barrier
-from rigidjax.rotation.kernels import product4, square4
+from rigidjax.rotation.kernels import quaternion_product, squared_quaternion_length
 from rigidjax.rotation.linalg3 import components
 from rigidjax.solve import splitting
 from rigidjax.solve.components import Atoms, join, split
@@ -198,7 +198,7 @@ def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         slope = lambda _, p: _free_momentum_derivative(weights, gaps, p)  # noqa: E731
         dp, turn = change_and_turn(slope, partial(splitting.rate_of, weights), t, end, h, y[4:])
-        return (*product4(y[:4], turn), *dp)
+        return (*quaternion_product(y[:4], turn), *dp)
 
     def state(y: Atoms) -> Attitude:
         # y[:4] is the quaternion of the turn since the start, with its vector along the principal
@@ -260,7 +260,7 @@ def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
             return add(cross(p, omega), split(value))
 
         dp, turn = change_and_turn(slope, rate, t, end, h, y[4:])
-        return (*product4(y[:4], turn), *dp)
+        return (*quaternion_product(y[:4], turn), *dp)
 
     def state(y: Atoms) -> Attitude:
         return Attitude(quaternion.normalise(jnp.stack(y[:4])), jnp.stack(rate(y[4:])))
@@ -350,7 +350,7 @@ def _change_to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
     after, moved = components(after), components(moved)
     # A rounding error of the excess |q|² − 1 only changes the length of q and does not turn the
     # body.
-    excess = jnp.minimum(square4(after) - 1.0, 1.0)
+    excess = jnp.minimum(squared_quaternion_length(after) - 1.0, 1.0)
     # 1 − 1/√(1 + e), with the excess e, is computed by a series, because on a GPU a root and a
     # quotient take a third of the time of a step. The error e⁴/4 of the series is below round-off
     # for steps that turn the body by less than half a radian; after a longer step the following

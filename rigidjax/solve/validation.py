@@ -12,14 +12,14 @@ from jaxtyping import Array
 from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.validation import check_body
+from rigidjax.body.validation import require_physical_body
 from rigidjax.frames import AbstractScene, BodyInFrame, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of_force
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.torques import ChangingInertia, GravityGradient
 from rigidjax.motion.torques.base import require_state_type
 from rigidjax.motion.torques.composite import parts_of
-from rigidjax.rotation.validation import tolerance
+from rigidjax.rotation.validation import rotation_tolerance
 
 
 def checked_scene(
@@ -87,7 +87,7 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
             )
         )
     if body is not None:
-        _checks.require_single(body, type(body), "body")
+        _checks.require_unbatched_instance(body, type(body), "body")
 
 
 def _require_one_frame(torque: Any) -> None:
@@ -165,7 +165,7 @@ def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
     """
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
-    return check_body(body, tensor, body.mass if matter else None, throw)
+    return require_physical_body(body, tensor, body.mass if matter else None, throw)
 
 
 def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
@@ -217,7 +217,7 @@ def checked_times(ts: Any, throw: bool) -> Array:
     found = _checks.array_of_shape(ts, length, "ts")
     if throw or _checks.is_known(found):
         found = _checks.require_finite(found, "ts")
-    xp = _checks.namespace(found)
+    xp = _checks.array_module(found)
     numbers = xp.asarray(found)
     back = numbers[-1] < numbers[0]
     ahead = xp.where(back, numbers[:-1] > numbers[1:], numbers[1:] > numbers[:-1])
@@ -273,7 +273,9 @@ def checked_start(state0: Any, throw: bool) -> Any:
     instead, and traced numbers that are not finite are left as they are.
     """
     wanted = "Spin, Attitude or Rigid, or Point without a body"
-    _checks.require_single(state0, (Spin, Attitude, Rigid, Point), "state0", requirement=wanted)
+    _checks.require_unbatched_instance(
+        state0, (Spin, Attitude, Rigid, Point), "state0", requirement=wanted
+    )
     named, tree = jax.tree.flatten_with_path(state0)
     leaves = [
         _checks.require_finite(leaf, str(path[-1]).lstrip("."))
@@ -283,11 +285,11 @@ def checked_start(state0: Any, throw: bool) -> Any:
     ]
     state0 = tree.unflatten(leaves)
     if isinstance(state0, HasAttitude):
-        xp = _checks.namespace(state0.q)
+        xp = _checks.array_module(state0.q)
         off = xp.abs(xp.sqrt(xp.sum(xp.square(state0.q))) - 1)
         q = _error_or_nan_if_bad(
             state0.q,
-            off > tolerance(state0.q.dtype),
+            off > rotation_tolerance(state0.q.dtype),
             "q: wanted a unit quaternion (w, x, y, z), got one whose length is not 1; normalise it "
             "with rigidjax.quaternion.normalise, and mind that the scalar comes first",
             throw,

@@ -1,6 +1,6 @@
 """Compute the brightness of tumbling bodies, and fit the motion of a body to one light curve."""
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.tumblers import brightness as brightness, plot as plot
 from rigidjax.tumblers.light_curve import (
     LightCurve as LightCurve,
@@ -11,4 +11,4 @@ from rigidjax.tumblers.two_frequencies import two_frequencies as two_frequencies
 
 __all__ = ["Brightness", "LightCurve", "brightness", "fit_light_curve", "plot", "two_frequencies"]
 
-show(__name__)
+define_dir_and_getattr(__name__)

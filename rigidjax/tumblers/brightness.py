@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike, Float, Int
 
 from rigidjax import _checks
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Numbers, Scalar, Vector
-from rigidjax.body.meshes import faces_of
-from rigidjax.body.scaling import exponent_of, times_power_of_two
+from rigidjax.body.meshes import checked_faces
+from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
 from rigidjax.tumblers.scattering import (
     AbstractScattering as AbstractScattering,
     Geometric as Geometric,
@@ -48,13 +48,13 @@ def ellipsoid(
     """
     law = law_of(scattering)
     a = _checks.array_of_shape(semi_axes, (3,), "semi_axes", unit="m")
-    a = _checks.require_sign(a, "semi_axes", "three positive lengths, m")
+    a = _checks.require_positive(a, "semi_axes", "three positive lengths, m")
     s, o = (
         unit_direction(sun, "sun").astype(a.dtype),
         unit_direction(observer, "observer").astype(a.dtype),
     )
     # The axes are scaled by a power of two, since their fourth powers could overflow.
-    size = exponent_of(a)
+    size = largest_binary_exponent(a)
     a = times_power_of_two(a, -size)
     return times_power_of_two(law.of_ellipsoid(jnp.diag(a * a), s, o), 2 * size)
 
@@ -90,7 +90,7 @@ def mesh(
     corners = _checks.array_of_rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
     if _checks.is_known(corners):
         _checks.require_finite(corners, "vertices")
-    table = faces_of(faces, corners.shape[0])
+    table = checked_faces(faces, corners.shape[0])
     s = unit_direction(sun, "sun").astype(corners.dtype)
     o = unit_direction(observer, "observer").astype(corners.dtype)
     first, second, third = (corners[table[:, k]] for k in range(3))
@@ -107,4 +107,4 @@ def mesh(
 
 __all__ = ["AbstractScattering", "Geometric", "Lambert", "LommelSeeliger", "ellipsoid", "mesh"]
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.plot.style import COLOURS, TIMES, axes_of_shape, escape_formulas, unit_factor
 
 # The colour of a point shows its cycle, from the first to the last, in this colour map.
@@ -98,4 +98,4 @@ def light_curve(
 
 __all__ = ["light_curve"]
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -104,7 +104,7 @@ class Brightness(AbstractSensor):
         self.level = checked_level
         if semi_axes is not None:
             semi_axes = _checks.array_of_shape(semi_axes, (3,), "semi_axes").astype(float)
-            semi_axes = _checks.require_sign(semi_axes, "semi_axes", "three positive lengths")
+            semi_axes = _checks.require_positive(semi_axes, "semi_axes", "three positive lengths")
         self.semi_axes = semi_axes
         self.offset = base.optional_array_field("offset", ())(offset)
 

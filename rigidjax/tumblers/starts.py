@@ -22,7 +22,7 @@ from rigidjax import exact
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion import Attitude
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.kernels import product4
+from rigidjax.rotation.kernels import quaternion_product
 from rigidjax.tumblers.lattice_series import least_squares_remainder
 
 # The grid has the ratios b/a of the semi-axes in MIDDLE, the ratios c/b in SHORT, and PHASES phases
@@ -89,7 +89,8 @@ def candidates(
             continue
         at = k, phase[k]
         in_world = (
-            np.array(product4(q0, q[at])) for q0 in _momentum_frame_to_world(sides[at], bisector)
+            np.array(quaternion_product(q0, q[at]))
+            for q0 in _momentum_frame_to_world(sides[at], bisector)
         )
         out += [Candidate(moments[k], one, omega[at], float(least[k])) for one in in_world]
     return out
@@ -113,7 +114,7 @@ def _momentum_frame_to_world(side: np.ndarray, bisector: np.ndarray) -> list[tup
     first = _shortest_rotation(n, bisector if n @ bisector >= 0 else -bisector, np)
     halves = [0.5 * angle for angle in ABOUT]
     about = [(np.cos(half), *(np.sin(half) * bisector)) for half in halves]
-    return [product4(one, first) for one in about]
+    return [quaternion_product(one, first) for one in about]
 
 
 def _shortest_rotation(u: Any, v: Any, xp: ModuleType) -> Any:

@@ -4,7 +4,7 @@
 finds the quickest methods. `python -m rigidjax workprecision` does all three.
 """
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.workprecision.chart import draw as draw
 from rigidjax.workprecision.jax_methods import diffrax_method as diffrax_method
 from rigidjax.workprecision.measurement import measure as measure
@@ -24,4 +24,4 @@ __all__ = [
     "table",
 ]
 
-show(__name__)
+define_dir_and_getattr(__name__)

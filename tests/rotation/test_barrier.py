@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rigidjax.rotation.barrier import batch_as, compiled_as_one_kernel
+from rigidjax.rotation.barrier import compiled_as_one_kernel, match_batch_axes
 
 
 def partly_shared(a, b):
@@ -49,7 +49,7 @@ def test_a_constant_with_a_derivative():
 
     @jax.custom_jvp
     def zero(x):
-        return batch_as(jnp.zeros_like(x), x)
+        return match_batch_axes(jnp.zeros_like(x), x)
 
     zero.defjvp(lambda primals, tangents: (zero(*primals), tangents[0]))
     batch = jax.vmap(jax.jit(lambda x: 2.0 * zero(x) + 1.0))

@@ -123,7 +123,9 @@ def first_belief(
     start: Any = scene.start if state is None else state
     if state is None and x is None:
         _require_shown_attitude(record, start)
-    _checks.require_single(start, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid")
+    _checks.require_unbatched_instance(
+        start, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid"
+    )
     start = project_to_group(start)
     deviations = {"attitude": attitude, "rate": rate, "position": position, "velocity": velocity}
     words = {"x": "position", "v": "velocity", "q": "attitude", "omega": "rate"}
@@ -285,7 +287,7 @@ def grid_of(
     - `substeps`: the number of steps from one time to the next; `None` chooses this number by the
       body rate and the correlation times.
     """
-    xp = _checks.namespace((recording.t, belief.t))
+    xp = _checks.array_module((recording.t, belief.t))
     t, t0 = xp.asarray(recording.t), xp.asarray(belief.t)
     if xp is np:
         words = (

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from rigidjax import _checks
 from rigidjax.body import parameters as charts, validation
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of as tensor_of
-from rigidjax.body.symmetric3 import swap_trace
+from rigidjax.body.symmetric3 import inertia_from_second_moment
 
 # This maps each part of a `MassProperties` that may be free to the indices of its numbers in the
 # result of `rigidjax.body.parameters.pack`.
@@ -116,7 +116,7 @@ class Ratios(AbstractBodyChart):
     scale: ClassVar[str | None] = "arbitrary"
 
     def body(self, vector: Numbers) -> Inertia:
-        return Inertia(swap_trace(charts.unpack_shape(vector)))
+        return Inertia(inertia_from_second_moment(charts.unpack_shape(vector)))
 
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_shape(body.second_moment)
@@ -196,7 +196,9 @@ class Tensor(AbstractBodyChart):
     unit: ClassVar[str] = "kg m²"
 
     def body(self, vector: Numbers) -> Inertia:
-        return Inertia(swap_trace(charts.unpack_second_moment(vector) * (0.5 * self.typical)))
+        return Inertia(
+            inertia_from_second_moment(charts.unpack_second_moment(vector) * (0.5 * self.typical))
+        )
 
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_second_moment(body.second_moment / (0.5 * self.typical))
@@ -273,7 +275,7 @@ class Mass(AbstractBodyChart):
     unit: ClassVar[str] = "SI"
 
     def __init__(self, guess: MassProperties, free: Sequence[str] = tuple(_PARTS)):
-        self.guess = _checks.require_single(guess, MassProperties, "guess")
+        self.guess = _checks.require_unbatched_instance(guess, MassProperties, "guess")
         wanted = "some of mass, inertia, com"
         _checks.require_instance(free, Sequence, "free", requirement=wanted)
         chosen = [free] if isinstance(free, str) else list(free)

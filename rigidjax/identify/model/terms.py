@@ -25,7 +25,7 @@ from rigidjax.identify.model.predict import (
 from rigidjax.identify.model.scene import Scene
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import Input, bind
-from rigidjax.rotation.barrier import batch_as, platform
+from rigidjax.rotation.barrier import match_batch_axes, platform
 
 if TYPE_CHECKING:
     from rigidjax.identify.model.model import Model
@@ -195,7 +195,7 @@ def by_recording(
     def function_of_row(row: Row, *rest: PyTree) -> Any:
         return function(model, row, *rest)
 
-    return batch_as(over_records(function_of_row, model, rows), rows)
+    return match_batch_axes(over_records(function_of_row, model, rows), rows)
 
 
 @by_recording.def_jvp
@@ -218,7 +218,7 @@ def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree
         )
     out, slopes = _values_and_jacobians(model, rows, function)
     along = jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, step), slopes)
-    return batch_as(out, rows), along
+    return match_batch_axes(out, rows), along
 
 
 def errors_and_jacobians(

@@ -101,7 +101,7 @@ def require_nonnegative(value: NumbersLike, name: str) -> Array:
     array, wanted = _checks.numeric_array(value, name), "a finite number that is not below zero"
     if not array.size:
         raise ValueError(f"{name}: wanted {wanted}, got none")
-    return _checks.require_sign(array, name, wanted, zero=True)
+    return _checks.require_positive(array, name, wanted, allow_zero=True)
 
 
 def broadcast_to_shape(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:

@@ -1,6 +1,6 @@
 """Provide the sensors of a recording, each of which predicts its readings from a motion."""
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.identify.sensors.attitude import (
     AttitudeSensor as AttitudeSensor,
     Direction as Direction,
@@ -26,4 +26,4 @@ __all__ = [
     "Magnetometer", "Marker", "Position", "Range", "SensorInput", "Tolerance", "Velocity",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -50,7 +50,7 @@ class LowPass(eqx.Module):
 
     def __init__(self, cutoff: ScalarLike, order: int = 1):
         cutoff = _checks.array_of_shape(cutoff, (), "cutoff")
-        cutoff = _checks.require_sign(cutoff, "cutoff", "a positive frequency, Hz")
+        cutoff = _checks.require_positive(cutoff, "cutoff", "a positive frequency, Hz")
         self.cutoff = cutoff.astype(jnp.result_type(float))
         if _checks.integer(order, "order", 1) > 2:
             raise ValueError(f"order: wanted 1 or 2, got {order}")

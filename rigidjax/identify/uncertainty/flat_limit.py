@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.symmetric3 import swap_trace
+from rigidjax.body.symmetric3 import inertia_from_second_moment
 from rigidjax.identify.model.charts import AbstractBodyChart, as_list, chart_list, numbers_of
 from rigidjax.identify.model.model import Model, without_samples
 
@@ -153,7 +153,7 @@ def _numbers_of_thicker_body(
     second = jnp.asarray((axes * np.maximum(values, least)) @ axes.T)
     if isinstance(body, MassProperties):
         return chart.vector(MassProperties(body.mass, body.com, second))
-    return chart.vector(Inertia(swap_trace(second)))
+    return chart.vector(Inertia(inertia_from_second_moment(second)))
 
 
 def _ends_at_flat_bodies(chart: AbstractBodyChart) -> bool:

@@ -1,6 +1,6 @@
 """Provide torques and forces, each of which declares the smallest state that it acts on."""
 
-from rigidjax._names import show
+from rigidjax._names import define_dir_and_getattr
 from rigidjax.motion.torques.base import AbstractTorque as AbstractTorque, Wrench as Wrench
 from rigidjax.motion.torques.chebyshev import Chebyshev as Chebyshev
 from rigidjax.motion.torques.composite import (
@@ -54,4 +54,4 @@ __all__ = [
     "Tabulated", "Tide", "UniformGravity", "Wheel", "Wrench", "bind",
 ]  # fmt: skip
 
-show(__name__)
+define_dir_and_getattr(__name__)

@@ -187,12 +187,14 @@ def require_scene(law: Torque | None, state: object, body: object) -> None:
     - `state`: one state of motion with the parts that the torque reads
     - `body`: one `Inertia` or `MassProperties`
     """
-    _checks.require_single(state, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid")
+    _checks.require_unbatched_instance(
+        state, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid"
+    )
     if law is not None:
         require_state_type(law, state)
         require_frozen(law)
         require_one_law(law.law if isinstance(law, FrozenLaw) else law)
-    _checks.require_single(body, (Inertia, MassProperties), "body")
+    _checks.require_unbatched_instance(body, (Inertia, MassProperties), "body")
 
 
 def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:

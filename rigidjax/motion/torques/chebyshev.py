@@ -49,7 +49,7 @@ class Chebyshev(eqx.Module):
             _checks.finite_array(step, (), "step"),
         )
         self.start = self.start.astype(dtype)
-        self.step = _checks.require_sign(step, "step", "a positive length, s").astype(dtype)
+        self.step = _checks.require_positive(step, "step", "a positive length, s").astype(dtype)
 
     def __call__(self, t: ScalarLike) -> Any:
         """Return the value at `t` (s), (k,)."""

@@ -12,7 +12,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin, Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import Body, Inertia, tensor_of, with_tensor
 from rigidjax.body.symmetric3 import from_components
-from rigidjax.body.validation import is_real
+from rigidjax.body.validation import is_physical_inertia
 from rigidjax.motion.torques import base
 from rigidjax.motion.torques.inputs import require_no_jumps
 from rigidjax.rotation import quaternion
@@ -175,7 +175,7 @@ def tensor_or_nan(tensor: Mat3) -> Mat3:
     """Return `tensor` (3, 3), kg m², if it is the inertia tensor of a body; otherwise return NaN,
     which ends a run of a solver.
     """
-    return jnp.where(is_real(tensor), tensor, jnp.full_like(tensor, jnp.nan))
+    return jnp.where(is_physical_inertia(tensor), tensor, jnp.full_like(tensor, jnp.nan))
 
 
 class Tide(eqx.Module):

@@ -135,7 +135,7 @@ class Lagged(eqx.Module):
         self.source = _checks.require_function(source, "source", "of time")
         kind = jnp.result_type(float)
         time = _checks.check_if_known(
-            _checks.require_sign, _checked_channels(time, "time"), "time", "a positive time, s"
+            _checks.require_positive, _checked_channels(time, "time"), "time", "a positive time, s"
         )
         self.time = time.astype(kind)
         self.start = None if start is None else _checked_channels(start, "start").astype(kind)

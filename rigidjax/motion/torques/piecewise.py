@@ -212,7 +212,7 @@ def _checked_times_and_rows(
         words = f"{other}: wanted {count - extra} rows of 3"
         raise ValueError(f"{words}, got shape {rows.shape}; {advice}")
     edges, rows = _checks.require_finite(edges, name), _checks.require_finite(rows, other)
-    ordered = _checks.namespace(edges).asarray(edges)
+    ordered = _checks.array_module(edges).asarray(edges)
     falling = ordered[1:] <= ordered[:-1]
     where = ""
     if _checks.is_known(falling) and falling.any():

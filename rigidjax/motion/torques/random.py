@@ -60,7 +60,7 @@ class CorrelatedTorque(AbstractTorque):
     def __init__(self, density: NumbersLike, time: NumbersLike):
         self.density = density_of(density)
         number = _checks.array_of_shape(time, (), "time").astype(self.density.dtype)
-        self.time = _checks.require_sign(number, "time", "a positive correlation time, s")
+        self.time = _checks.require_positive(number, "time", "a positive correlation time, s")
 
     @property
     def deviation(self) -> Vec3:
@@ -83,4 +83,6 @@ def density_of(value: NumbersLike, name: str = "density", size: int = 3) -> Arra
     if density.shape not in ((), (size,)):
         raise ValueError(f"{name}: wanted one number or {size}, got shape {density.shape}")
     density = jnp.broadcast_to(density, (size,)).astype(density.dtype)
-    return _checks.require_sign(density, name, "a finite number that is not below zero", zero=True)
+    return _checks.require_positive(
+        density, name, "a finite number that is not below zero", allow_zero=True
+    )

@@ -156,7 +156,7 @@ class Wheel(eqx.Module):
         tilt: NumbersLike | None = None,
     ):
         direction = _checks.array_of_shape(axis, (3,), "axis")
-        x, y, z = _checks.namespace(direction).asarray(direction)
+        x, y, z = _checks.array_module(direction).asarray(direction)
         got = f", got {np.asarray(direction)}" if _checks.is_known(direction) else ""
         off = ~(abs(x * x + y * y + z * z - 1) < 2e-6)
         direction = _checks.error_if(direction, off, f"axis: wanted a unit vector (3,){got}")

@@ -142,7 +142,7 @@ class ReactionWheels(base.AbstractTorque):
         count = base.row_count(axes, "axes", "wheel")
         self.axes = base.unit_rows(axes, "axes", count)
         inertia = _checks.finite_array(inertia, (count,), "inertia")
-        self.inertia = _checks.check_if_known(_checks.require_sign, inertia, "inertia", "> 0")
+        self.inertia = _checks.check_if_known(_checks.require_positive, inertia, "inertia", "> 0")
         self.speeds = _checks.finite_array(speeds, (count,), "speeds")
         self.motor = None if motor is None else base.constant_or_callable(motor, "motor", count)
         words = "(t, state, speeds) → torques (R,), N m"
@@ -154,7 +154,9 @@ class ReactionWheels(base.AbstractTorque):
         self.viscous = _checked_one_or_each(viscous, count, "viscous", "≥ 0")
         self.coulomb = _checked_one_or_each(coulomb, count, "coulomb", "≥ 0")
         turn_over = _checks.finite_array(turn_over, (), "turn_over")
-        self.turn_over = _checks.check_if_known(_checks.require_sign, turn_over, "turn_over", "> 0")
+        self.turn_over = _checks.check_if_known(
+            _checks.require_positive, turn_over, "turn_over", "> 0"
+        )
 
     @property
     def steady(self) -> bool:
@@ -180,7 +182,7 @@ class ReactionWheels(base.AbstractTorque):
         - `state`: a state of motion, with the body rate
         """
         own = _checks.array_of_shape(own, self.inertia.shape, "own")
-        omega = _checks.require_single(
+        omega = _checks.require_unbatched_instance(
             state, HasSpin, "state", requirement="a Spin, Attitude or Rigid"
         ).omega
         along = jnp.stack([a[0] * omega[0] + a[1] * omega[1] + a[2] * omega[2] for a in self.axes])
@@ -284,5 +286,5 @@ def _checked_one_or_each(
         return None
     numbers = base.broadcast_to_each(value, count, name)
     return _checks.check_if_known(
-        _checks.require_sign, numbers, name, requirement, zero=requirement == "≥ 0"
+        _checks.require_positive, numbers, name, requirement, zero=requirement == "≥ 0"
     )
