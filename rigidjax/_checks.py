@@ -365,7 +365,7 @@ def finite_array(value: object, shape: tuple[int, ...], name: str, **options: An
     return require_finite(array, name) if is_known(array) else array
 
 
-def scalars(**named: object) -> list[Array]:
+def scalar_arrays_of_one_dtype(**named: object) -> list[Array]:
     """Return a list of scalar arrays of one dtype, the widest, from numbers that are given as
     `name=number`; the names are for messages. **Raises:** as `array_of_shape`.
     """
@@ -503,7 +503,7 @@ def integer(value: object, name: str, least: int) -> int:
     return int(value)
 
 
-def known_float(value: object, name: str) -> float:
+def python_float(value: object, name: str) -> float:
     """Return `value` as one Python float. **Raises:** `TypeError` for a number that JAX traces, and
     for what is no number; `ValueError` for several numbers. The text `name` names the argument in
     messages.
@@ -516,10 +516,10 @@ def known_float(value: object, name: str) -> float:
 
 def positive_float(value: object, name: str, requirement: str = "a positive number") -> float:
     """Return `value` as a Python float that is positive and finite. **Raises:** `ValueError` for
-    any other float, and as `known_float`; the texts `name` (of the argument) and `requirement`
+    any other float, and as `python_float`; the texts `name` (of the argument) and `requirement`
     (what was wanted) are for messages.
     """
-    number = known_float(value, name)
+    number = python_float(value, name)
     if not 0 < number < np.inf:
         raise ValueError(f"{name}: wanted {requirement}, got {number}")
     return number
@@ -537,9 +537,9 @@ def fraction(value: object, name: str, requirement: str = "a number between 0 an
 
 def nonnegative_float(value: object, name: str) -> float:
     """Return `value` as a finite Python float ≥ 0. **Raises:** `ValueError` for any other float,
-    and as `known_float`.
+    and as `python_float`.
     """
-    number = known_float(value, name)
+    number = python_float(value, name)
     return 0.0 if number == 0 else positive_float(number, name, "a number ≥ 0")
 
 

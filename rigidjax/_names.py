@@ -35,7 +35,8 @@ def raise_attribute_error(module_name: str, name: str) -> NoReturn:
             "; contact, joints, trees of bodies, flexibility and rendering are not modelled: take "
             "MuJoCo MJX, Brax or Drake"
         )
-    # Tools ask for hidden names, and the import system for modules that are not loaded yet.
+    # No near name is searched for a hidden name, for which tools ask, nor for a module that is not
+    # loaded yet, for which the import system asks.
     elif name[0] != "_" and not (hasattr(here, "__path__") and find_spec(f"{module_name}.{name}")):
         paths = _public_paths_by_name()
         # `fit` and `Fit` are two names: the name as it was written is looked up before the name in

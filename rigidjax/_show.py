@@ -12,7 +12,7 @@ from rigidjax import _checks
 
 # An array with more numbers than this is printed as its shape.
 MOST = 16
-# The units in which reports show angular rates, in rad/s.
+# How many of each unit are one rad/s, for the units in which reports show angular rates.
 _RATE_UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
 
 

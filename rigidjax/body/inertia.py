@@ -91,7 +91,7 @@ class Inertia(eqx.Module):
         Array(3., dtype=float64)
         """
         moments = validation.require_physical_moments(
-            jnp.stack(_checks.scalars(i1=i1, i2=i2, i3=i3))
+            jnp.stack(_checks.scalar_arrays_of_one_dtype(i1=i1, i2=i2, i3=i3))
         )
         return Inertia(jnp.diag(moments))
 
@@ -313,7 +313,7 @@ class MassProperties(eqx.Module):
         return _add_mass(self, -other.mass, other.com, -other.second_moment)
 
 
-# What turns: an inertia, or a body with mass.
+# A body that turns: its inertia alone, or its mass, centre of mass and second moment.
 Body = Inertia | MassProperties
 
 

@@ -14,7 +14,8 @@ from rigidjax.body.inertia import MassProperties
 from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.rotation import euler, quaternion
 
-# The tolerance of the triangle inequality: numbers in files are rounded.
+# Numbers in files are rounded: moments may break the triangle inequality by this fraction of the
+# largest moment.
 ROUNDED = 1e-6
 _KEYS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
@@ -157,7 +158,7 @@ def _read_bodies_by_name(path: Path) -> tuple[Tree.Element, dict[str, Tree.Eleme
     names = [node.get("name", f"{tag} {index}") for index, node in enumerate(nodes)]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        raise ValueError(f"{path}: two bodies are called {twice[0]!r}")
+        raise ValueError(f"{path}: two bodies are called {twice[0]!r}; wanted one name each")
     return root, dict(zip(names, nodes, strict=True))
 
 
@@ -168,7 +169,8 @@ def _body_from_urdf(inertial: Tree.Element) -> MassProperties:
     """
     origin, mass, inertia = (inertial.find(tag) for tag in ("origin", "mass", "inertia"))
     if mass is None or inertia is None:
-        raise ValueError("wanted a <mass> and an <inertia>")
+        missing = "<mass>" if mass is None else "<inertia>"
+        raise ValueError(f"wanted a <mass> and an <inertia> in <inertial>, got no {missing}")
     com = _read_numbers(origin, "xyz", 3, [0.0] * 3)
     # The turns are about fixed axes: roll about x, then pitch about y, then yaw about z.
     rotation = euler.to_matrix(_read_numbers(origin, "rpy", 3, [0.0] * 3), "xyz")

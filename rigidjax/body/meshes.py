@@ -45,7 +45,7 @@ def mesh(
     """
     corners = _checks.array_of_rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
     if not corners.size:
-        raise ValueError("vertices: wanted some, got none")
+        raise ValueError("vertices: wanted at least one row (x, y, z), got none")
     _checks.check_if_known(_checks.require_finite, corners, "vertices")
     faces = checked_faces(faces, corners.shape[0])
     density = _checks.array_of_shape(density, (), "density")
@@ -93,7 +93,7 @@ def mesh_file(
         raise ImportError(words) from error
     surface = trimesh.load_mesh(path)
     if not isinstance(surface, trimesh.Trimesh) or len(surface.faces) == 0:
-        raise ValueError(f"mesh_file: {path!r} holds no triangles")
+        raise ValueError(f"mesh_file: wanted a file with triangles, {path!r} holds no triangles")
     corners = np.asarray(surface.vertices, dtype=jnp.result_type(float)) * scale
     return mesh(corners, np.asarray(surface.faces), density)
 

@@ -169,8 +169,8 @@ def flat_bend(
     shape = _checks.array_of_shape(shape, (5,), "shape")
     slope = _checks.array_of_shape(slope, (5,), "slope")
     root = _second_moment_root_from_shape(shape)
-    # For a flat body the columns of the adjugate of A are along n: in every step of a fit, this is
-    # cheaper than eigenvectors.
+    # For a flat body the columns of the adjugate of A are along n. A fit needs n in every step, and
+    # the adjugate is cheaper than eigenvectors.
     rows = root[0], root[1], root[2]
     adjugate = jnp.stack([cross(rows[k - 2], rows[k - 1]) for k in range(3)])
     longest = adjugate[jnp.argmax(jnp.abs(jnp.diagonal(adjugate)))]
@@ -183,7 +183,8 @@ def flat_bend(
     pull = from_components(d1 + d3, d2 + d3, d3, 0.5 * s12, 0.5 * s13, 0.5 * s23)
     square = jnp.sum(root * root)
     gained = a * (n @ apply(pull, n)) / 2.0
-    # With `~(… <= 0)` a NaN passes, so that the caller sees it.
+    # For NaN, `gained > 0` would be false and the rows zero. `~(gained <= 0)` is true: the rows are
+    # then NaN, and the caller sees it.
     flat = (a * a < FLAT * square) & ~(gained <= 0)
     size = jnp.where(flat, jnp.sqrt(2.0 * jnp.where(flat, gained, 1.0)), 0.0)
     size = size / jnp.where(flat, jnp.abs(a), 1.0)
@@ -260,7 +261,10 @@ def _require_positive_trace(trace: Scalar) -> Scalar:
     """Return the trace of a second moment. **Raises:** `ValueError` if it is not positive (the
     second moment of a point is zero) or not finite.
     """
-    words = "pack: the second moment is zero (a point has no shape) or beyond the dtype"
+    words = (
+        "pack: wanted a second moment with a positive trace, got zero (a point has no shape), a "
+        "negative number, or one beyond the dtype"
+    )
     return _checks.error_if(trace, ~((trace > 0) & (trace < jnp.inf)), words)
 
 

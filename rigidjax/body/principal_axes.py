@@ -75,7 +75,8 @@ def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
     eight times as fast as LAPACK's `eigh`, and it is accurate for the small moment of a slender
     body that lies along one of the coordinate axes.
     """
-    # The matrix is scaled by a power of two, which costs no digit.
+    # The matrix is scaled to entries near 1, so that no square overflows; a power of two costs no
+    # digit.
     exponent = largest_binary_exponent(a)
     b = times_power_of_two(0.5 * (a + a.T), -exponent)
     one, nil = jnp.ones((), a.dtype), jnp.zeros((), a.dtype)

@@ -42,7 +42,7 @@ def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat
     return out, -product(product(out * scale, da / scale), out)
 
 
-# The places of the components in the order of `from_components`.
+# The row and column of each of the six entries, in the order of the arguments of `from_components`.
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 

@@ -104,7 +104,7 @@ def check_symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
     """
     if _checks.is_known(a):
         return _require_symmetric(a, name)
-    return jnp.where(_largest_asymmetry(a)[1], jnp.nan, a)
+    return jnp.where(_largest_asymmetry_and_flag(a)[1], jnp.nan, a)
 
 
 def require_physical_body(
@@ -132,12 +132,12 @@ def require_physical_body(
     if not is_known and _checks.is_known(plain := lax.stop_gradient((tensor, mass))):
         # The numbers are known, and are traced only to be differentiated: check them once by NumPy,
         # instead of by thirty compiled programs.
-        faults = _inertia_faults(np, plain[0], allow_zero_moment)
+        faults = _zero_impossible_asymmetric_flags(np, plain[0], allow_zero_moment)
         if not any(f.any() for f in faults) and (mass is None or (np.asarray(plain[1]) > 0).all()):
             return body
     xp = np if is_known else jnp
     light = xp.asarray(False) if mass is None else ~(_constant_for_checks(mass) > 0)
-    flat, broken, skew = _inertia_faults(
+    flat, broken, skew = _zero_impossible_asymmetric_flags(
         xp, tensor if is_known else lax.stop_gradient(tensor), allow_zero_moment
     )
     bad = light | flat | broken | skew
@@ -172,14 +172,14 @@ def index_of_first_impossible_inertia(
     return _checks.index_of_first_bad_row(_are_impossible_inertias, tensors)
 
 
-def _are_impossible_inertias(xp: ModuleType, tensors: Array | np.ndarray) -> Any:
+def _are_impossible_inertias(xp: ModuleType, tensors: Array | np.ndarray) -> Array | np.ndarray:
     """Return booleans (...), one for each matrix: true if the matrix cannot be the inertia tensor
     of a body, or if it has a principal moment of zero; false if it has an entry NaN.
 
     - `xp`: the module that computes, `numpy` or `jax.numpy`
     - `tensors`: (..., 3, 3) kg m², the matrices
     """
-    flat, broken, skew = _inertia_faults(xp, tensors, allow_zero_moment=False)
+    flat, broken, skew = _zero_impossible_asymmetric_flags(xp, tensors, allow_zero_moment=False)
     return (flat | broken | skew) & ~xp.isnan(xp.asarray(tensors)).any(axis=(-1, -2))
 
 
@@ -198,7 +198,7 @@ _THIN = (
 )
 
 
-def _inertia_faults(
+def _zero_impossible_asymmetric_flags(
     xp: ModuleType, tensor: Array | np.ndarray, allow_zero_moment: bool
 ) -> tuple[Any, Any, Any]:
     """Return three booleans (...) for each inertia tensor: whether a principal moment is zero or
@@ -236,7 +236,8 @@ def _inertia_faults(
         broken = broken | (some & (minor < -slack))
     if allow_zero_moment:
         return broken & False, broken, skew
-    # The product of the two larger moments is 1/9 to 1/4 of the squared trace.
+    # The least moment is the determinant divided by the product of the two larger moments. This
+    # product is 1/9 to 1/4 of the squared trace, which is 1 here; 1/8 is taken for every body.
     determinant = xx * (yy * zz - squares[2]) - yy * squares[1] - zz * squares[0] + product
     return ~some | ~(determinant > 0.125 * slack), broken, skew
 
@@ -245,7 +246,9 @@ def is_physical_inertia(tensor: Float[Array, "*batch 3 3"]) -> Bool[Array, "*bat
     """Return whether a real body can have the inertia `tensor` (..., 3, 3), kg m², and none of its
     principal moments is zero.
     """
-    flat, broken, skew = _inertia_faults(jnp, lax.stop_gradient(tensor), allow_zero_moment=False)
+    flat, broken, skew = _zero_impossible_asymmetric_flags(
+        jnp, lax.stop_gradient(tensor), allow_zero_moment=False
+    )
     return ~(flat | broken | skew)
 
 
@@ -285,7 +288,7 @@ def _require_triangle_inequality(value: Array, moments: Array | np.ndarray) -> A
     )
 
 
-def _largest_asymmetry(a: Array) -> tuple[Any, Any]:
+def _largest_asymmetry_and_flag(a: Array) -> tuple[Any, Any]:
     """Return two things about matrices A = `a` (..., 3, 3), any unit: the largest entry of |A −
     Aᵀ| of each matrix, (...); and one boolean, whether this entry exceeds round-off in any matrix.
     """
@@ -302,7 +305,7 @@ def _require_symmetric(a: Array, name: str) -> Array:
     """Return the matrices `a` (..., 3, 3). **Raises:** `ValueError` (`equinox` error under `jit`)
     if they are not symmetric to round-off; the text `name` names the matrices in the message.
     """
-    difference, bad = _largest_asymmetry(a)
+    difference, bad = _largest_asymmetry_and_flag(a)
     difference_text = (
         f" (largest difference {float(difference.max()):.3g})" if _checks.is_known(a) else ""
     )

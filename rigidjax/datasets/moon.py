@@ -71,7 +71,7 @@ class Moon(eqx.Module):
             raise ModuleNotFoundError(
                 "datasets.moon reads the package de421: pip install 'rigidjax[moon]'", name="de421"
             )
-        days = [(_checks.known_float(year, "year") - 2000) * 365.25 + 2451545.0 - _FIRST
+        days = [(_checks.python_float(year, "year") - 2000) * 365.25 + 2451545.0 - _FIRST
                 for year in (first, last)]  # fmt: skip
         low, high = int((days[0] - 10) // _BLOCK), int((days[1] + 10) // _BLOCK) + 1
         if not (days[0] < days[1] and 10 <= days[0] and high <= _BLOCKS):

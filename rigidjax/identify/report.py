@@ -79,8 +79,8 @@ def numbers(value: float, low: float, high: float) -> list[str]:
     >>> numbers(1.23456, 1.2, 1.27)
     ['1.2346', '1.2000', '1.2700']
     """
-    value = _checks.known_float(value, "value")
-    low, high = _checks.known_float(low, "low"), _checks.known_float(high, "high")
+    value = _checks.python_float(value, "value")
+    low, high = _checks.python_float(low, "low"), _checks.python_float(high, "high")
     wholes = [abs(number) for number in (value, low, high) if np.isfinite(number)]
     size, gaps = max(wholes, default=0.0), (value - low, high - value)
     fixed = size == 0 or 1e-3 <= size < 1e6

@@ -332,7 +332,7 @@ def bifurcation(
     place = index_of_held(hold)
     if isinstance(index, bool) or index not in (0, 1):
         raise ValueError(f"index: wanted 0 or 1, which of the two stability indices, got {index!r}")
-    value = _checks.known_float(value, "value")
+    value = _checks.python_float(value, "value")
     if not np.isfinite(value):
         raise ValueError(f"value: wanted a finite number, got {value}")
     a, b = (float(crossing(one)[place]) for one in (orbit, other))

@@ -26,7 +26,7 @@ from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, components, cross, dot, power_of_two_scale
-from rigidjax.rotation.validation import require_direction, require_turn_not_too_large
+from rigidjax.rotation.validation import require_nonzero_and_finite, require_turn_not_too_large
 
 _MANY_TURNS = 8 * np.pi
 
@@ -86,7 +86,7 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     [0.0, 0.0, 0.0]
     """
     (i, j, k), reverse = _axes_of_sequence(sequence)
-    q = quaternion.canonical(require_direction(_checks.array_of_shape(q, (4,), "q"), "q"))
+    q = quaternion.canonical(require_nonzero_and_finite(_checks.array_of_shape(q, (4,), "q"), "q"))
     q = power_of_two_scale(*components(q)) * q
     symmetric = i == k
     last = 3 - i - j
@@ -95,8 +95,8 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     if symmetric:
         z = handed * z
     else:
-        # A quarter turn about the middle axis takes the last axis into the first; all four numbers
-        # are multiplied by √2.
+        # A quarter turn about the middle axis takes the last axis into the first, so that the
+        # formulas for equal outer axes apply. All four numbers are multiplied by √2.
         w, x, y, z = w + handed * y, x + z, w - handed * y, x - z
     flat, up = y * y + z * z, w * w + x * x
     tiny = (2 * jnp.finfo(q.dtype).eps) ** 2 * (flat + up)

@@ -30,7 +30,7 @@ from rigidjax.rotation.linalg3 import (
     vee,
 )
 from rigidjax.rotation.validation import (
-    require_direction,
+    require_nonzero_and_finite,
     require_rotation_matrix,
     require_unit_quaternion,
 )
@@ -54,14 +54,14 @@ def project(matrix: Mat3Like) -> Mat3:
     matrix = _checks.array_of_shape(matrix, (3, 3), "matrix")
     if _checks.is_known(matrix):
         _checks.require_finite(matrix, "matrix")
-        require_direction(matrix.reshape(9), "matrix")
+        require_nonzero_and_finite(matrix.reshape(9), "matrix")
         size = np.max(np.abs(np.asarray(matrix)))
         # The determinant is that of the matrix divided by its largest entry: without the division
         # the determinant may overflow.
         det = np.linalg.det(np.asarray(matrix) / size)
         if det <= 0:
-            words = f"left-handed frame or singular, det = {det:.3g}; no rotation is nearest"
-            raise ValueError(f"matrix: {words}")
+            words = f"left-handed frame or singular, det = {det:.3g}; wanted det > 0, without which"
+            raise ValueError(f"matrix: {words} no rotation is nearest")
     return nearest_rotation(matrix)
 
 
@@ -88,12 +88,12 @@ def wahba(
     world = _checks.array_of_shape(world, body.shape, "world")
     w = checked_weights(weights, body[:, 0], "body")
     for name, rows in (("body", body), ("world", world)):
-        require_direction(rows.reshape(-1), name)
+        require_nonzero_and_finite(rows.reshape(-1), name)
     w, world, body = (scale_to_order_one(x) for x in (w, world, body))
     words = "wahba: these directions do not fix the attitude; two that are not parallel are needed"
     heavy, those, these = lax.stop_gradient((w, world, body))
-    # In one sum, a direction of small weight would lose its digits beside a direction of large
-    # weight.
+    # The first estimate comes from one sum over all directions, in which a direction of small
+    # weight would lose its digits beside one of large weight: here small weights are raised.
     closer = jnp.where(heavy > 0, jnp.maximum(heavy, _LIGHT * jnp.max(heavy)), 0)
     try:
         best = nearest_rotation(_weighted_outer_products(closer, those, these))
@@ -178,7 +178,9 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     [0.0, 1.0, 0.0]
     """
     a, b = _checks.array_of_shape(a, (3,), "a"), _checks.array_of_shape(b, (3,), "b")
-    a, b = (scale_to_order_one(require_direction(x, name)) for x, name in ((a, "a"), (b, "b")))
+    a, b = (
+        scale_to_order_one(require_nonzero_and_finite(x, name)) for x, name in ((a, "a"), (b, "b"))
+    )
     a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
     middle = a + b
     n2, normal = dot(middle, middle), cross(a, middle)
@@ -332,8 +334,8 @@ def nearest_rotation(b: Mat3) -> Mat3:
     kappa = 0.5 * (root * root - 1)
     rough = ((kappa + 1) * b + root * cofactors(b) - product(b, product(b.T, b))) / zeta
     q = matrix_to_quaternion(rough)
-    # The root of the quartic may have only half its digits; Newton steps on the group then give all
-    # digits.
+    # The root of the quartic may have only half its digits; Newton steps on the rotation group then
+    # give all digits.
     for _ in range(3):
         r = quaternion.to_matrix(q)
         turn = solve(_curvature_of_rotation_fit(r, b), 2 * vee(product(r.T, b)))

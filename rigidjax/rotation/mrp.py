@@ -13,12 +13,13 @@ from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import components, cross, dot, power_of_two_scale
-from rigidjax.rotation.validation import require_direction
+from rigidjax.rotation.validation import require_nonzero_and_finite
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
-    """Return σ = q_v/(1 + q_w), |σ| ≤ 1, of the canonical form of `q` (4,) unit; q and −q give the
-    same bits.
+    """Return the parameters σ = q_v/(1 + q_w) (3,), |σ| ≤ 1, of a unit quaternion `q` (4,), where
+    q_w ≥ 0 and q_v are the scalar and vector part of its canonical form; q and −q give the same
+    bits.
 
     >>> from_quaternion(jnp.array([-1.0, 0.0, 0.0, 0.0])).tolist()
     [-0.0, -0.0, -0.0]
@@ -69,12 +70,13 @@ def shadow(sigma: Vec3Like) -> Vec3:
     [-0.0, -2.0, -0.0]
     """
     return _shadow_unchecked(
-        require_direction(_checks.array_of_shape(sigma, (3,), "sigma"), "sigma")
+        require_nonzero_and_finite(_checks.array_of_shape(sigma, (3,), "sigma"), "sigma")
     )
 
 
 def switch(sigma: Vec3Like) -> Vec3:
-    """Return `sigma` (3,) if |σ| ≤ 1, else its shadow, the shorter turn. Switch between steps only.
+    """Return `sigma` (3,) if |σ| ≤ 1, else its shadow, which is the shorter turn. Call this
+    function only between two steps of a solver, because the parameters jump.
 
     >>> switch(jnp.array([0.0, 2.0, 0.0])).tolist()
     [-0.0, -0.5, -0.0]
@@ -94,7 +96,8 @@ def _shadow_unchecked(sigma: Vec3) -> Vec3:
 
 
 def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
-    """Return dσ/dt = ¼ [(1 − s) Ω + 2 σ × Ω + 2 σ (σ·Ω)], 1/s, s = |σ|², never singular (eq 3.160).
+    """Return the rates of the parameters σ at the angular velocity Ω, dσ/dt = ¼ [(1 − s) Ω + 2 σ ×
+    Ω + 2 σ (σ·Ω)], 1/s, with s = |σ|²; they are never singular (Schaub & Junkins, eq 3.160).
 
     **Arguments:** `sigma` (3,) dimensionless; `omega` (3,) rad/s, body frame.
 
@@ -108,8 +111,8 @@ def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
 
 
 def rates_to_omega(sigma: Vec3Like, rates: Vec3Like) -> Vec3:
-    """Return Ω = 4/(1 + s)² [(1 − s) σ̇ − 2 σ × σ̇ + 2 σ (σ·σ̇)], s = |σ|², body frame (Schaub &
-    Junkins, eq 3.164).
+    """Return the angular velocity, body frame, of the parameters σ and their rates σ̇ = dσ/dt: Ω =
+    4/(1 + s)² [(1 − s) σ̇ − 2 σ × σ̇ + 2 σ (σ·σ̇)], with s = |σ|² (Schaub & Junkins, eq 3.164).
 
     **Arguments:** `sigma` (3,) dimensionless; `rates` (3,) 1/s. **Returns:** (3,) rad/s.
 

@@ -51,7 +51,7 @@ from rigidjax.rotation.linalg3 import (
     power_of_two_scale,
 )
 from rigidjax.rotation.validation import (
-    require_direction,
+    require_nonzero_and_finite,
     require_rotation_matrix,
     require_turn_not_too_large,
     require_unit_quaternion,
@@ -63,9 +63,10 @@ _HINT = "one quaternion is (w, x, y, z), scalar first; batch with jax.vmap"
 def exp(v: Vec3Like) -> Quat:
     """Return the quaternion of a rotation vector: (cos θ/2, ½ v sin(θ/2)/(θ/2)), θ = |v|.
 
-    **Arguments:** `v` (3,) rotation vector, rad (notes, eqs 17, 18, with v = γ y). The angle is
-    known to ε|v|. **Returns:** (4,) of norm 1; value and derivatives are correct also at v = 0.
-    **Raises:** `ValueError` for NaN, and beyond 1/ε (see the head of this module).
+    **Arguments:** `v` (3,) rotation vector, rad (notes, eqs 17, 18, with v = γ y). The angle has an
+    error of ε|v|, where ε is the unit of round-off. **Returns:** (4,) of norm 1; value and
+    derivatives are correct also at v = 0. **Raises:** `ValueError` for NaN, and beyond 1/ε (see the
+    head of this module).
 
     >>> exp(jnp.array([0.0, 0.0, jnp.pi])).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -78,16 +79,16 @@ def exp(v: Vec3Like) -> Quat:
 def log(q: QuatLike) -> Vec3:
     """Return the shortest rotation vector of a quaternion, rad, |v| ≤ π.
 
-    **Arguments:** `q` (4,) of any length. **Returns:** v = 2 atan2(|q_v|, q_w) q_v/|q_v| (3,) of
-    `canonical(q)`. The derivative is that of q/|q|, by the inverse right Jacobian, and correct from
-    0 to π (Solà 2018, arXiv:1711.02508; the angle is halved twice to avoid cancellation and
-    branches). **Raises:** `ValueError` for zero or NaN.
+    **Arguments:** `q` (4,) of any length. **Returns:** v = 2 atan2(|q_v|, q_w) q_v/|q_v| (3,), with
+    the scalar part q_w and the vector part q_v of `canonical(q)`. The derivative is that of q/|q|,
+    by the inverse right Jacobian, and correct from 0 to π (Solà 2018, arXiv:1711.02508; the angle
+    is halved twice to avoid cancellation and branches). **Raises:** `ValueError` for zero or NaN.
 
     >>> abs(log(jnp.array([0.0, 0.0, 0.0, -1.0]))).round(6).tolist()
     [0.0, 0.0, 3.141593]
     """
     return quaternion_to_vector(
-        require_direction(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
+        require_nonzero_and_finite(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
     )
 
 
@@ -188,7 +189,7 @@ def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
     >>> about_axis(jnp.array([0.0, 0.0, 2.0]), jnp.pi).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    axis = require_direction(_checks.array_of_shape(axis, (3,), "axis"), "axis")
+    axis = require_nonzero_and_finite(_checks.array_of_shape(axis, (3,), "axis"), "axis")
     half = 0.5 * require_turn_not_too_large(
         _checks.array_of_shape(angle, (), "angle").astype(axis.dtype), "angle"
     )
@@ -238,7 +239,7 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
     True
     """
     p = _checks.array_of_shape(p, (4,), "p", hint=_HINT)
-    v = quaternion_to_vector(require_direction(multiply(conjugate(p), q), "p̄ q"))
+    v = quaternion_to_vector(require_nonzero_and_finite(multiply(conjugate(p), q), "p̄ q"))
     part = require_turn_not_too_large(
         _checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn"
     )
@@ -263,7 +264,9 @@ def normalise(q: QuatLike) -> Quat:
     >>> normalise(jnp.array([0.0, 4.0, 0.0, 0.0])).tolist()
     [0.0, 1.0, 0.0, 0.0]
     """
-    return to_unit_length(require_direction(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q"))
+    return to_unit_length(
+        require_nonzero_and_finite(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
+    )
 
 
 def canonical(q: QuatLike) -> Quat:
@@ -279,14 +282,14 @@ def canonical(q: QuatLike) -> Quat:
 def angle(q: QuatLike) -> Scalar:
     """Return the angle of a rotation, rad, in [0, π]; q and −q give the same bits.
 
-    **Arguments:** `q` (4,) of any length. The angle is 2 atan2(|q_v|, |q_w|). At the identity the
-    angle has no derivative: the derivative 0 is returned, the shortest subgradient. **Raises:**
-    `ValueError` for zero or NaN.
+    **Arguments:** `q` (4,) of any length. The angle is 2 atan2(|q_v|, |q_w|), with the scalar part
+    q_w and the vector part q_v. At the identity the angle has no derivative: the derivative 0 is
+    returned, the shortest subgradient. **Raises:** `ValueError` for zero or NaN.
 
     >>> round(float(angle(exp(jnp.array([0.0, 1e-9, 0.0]))) * 1e9), 9)
     1.0
     """
-    q = require_direction(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
+    q = require_nonzero_and_finite(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
     w, *u = components(power_of_two_scale(*components(q)) * q)
     n2 = dot_components(u, u)
     # At the identity the arguments of atan2 and of the root are replaced by ones: at zero the

@@ -14,11 +14,12 @@ from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import components, cross, dot, power_of_two_scale
-from rigidjax.rotation.validation import require_direction
+from rigidjax.rotation.validation import require_nonzero_and_finite
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
-    """Return the parameters g = q_v/q_w, infinite at a half turn; q and −q give the same bits.
+    """Return the parameters g = q_v/q_w of a quaternion with the scalar part q_w and the vector
+    part q_v; g is infinite at a half turn, and q and −q give the same bits.
 
     **Arguments:** `q` (4,), not zero, body → world. **Returns:** (3,) dimensionless. **Raises:**
     `ValueError` for zero or NaN.
@@ -26,7 +27,7 @@ def from_quaternion(q: QuatLike) -> Vec3:
     >>> from_quaternion(jnp.array([2.0, 0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 1.0]
     """
-    q = require_direction(quaternion.canonical(q), "q")
+    q = require_nonzero_and_finite(quaternion.canonical(q), "q")
     # The derivative squares the denominator: a q of any length is scaled first, so that nothing
     # overflows.
     q = power_of_two_scale(*components(q)) * q
@@ -75,8 +76,8 @@ def is_singular(q: QuatLike) -> Bool[Array, ""]:
 
 
 def omega_to_rates(g: Vec3Like, omega: Vec3Like) -> Vec3:
-    """Return dg/dt = ½ [Ω + g × Ω + g (g·Ω)], 1/s, of `g` (3,) and `omega` (3,) Ω, rad/s, body
-    frame (eq 3.130).
+    """Return the rates dg/dt = ½ [Ω + g × Ω + g (g·Ω)], 1/s, of the parameters `g` (3,) at the
+    angular velocity `omega` (3,) Ω, rad/s, body frame (Schaub & Junkins, eq 3.130).
 
     >>> omega_to_rates(jnp.zeros(3), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 1.0]
@@ -86,8 +87,8 @@ def omega_to_rates(g: Vec3Like, omega: Vec3Like) -> Vec3:
 
 
 def rates_to_omega(g: Vec3Like, rates: Vec3Like) -> Vec3:
-    """Return Ω = 2/(1 + |g|²) [ġ − g × ġ], rad/s, body frame, of `g` (3,) and `rates` (3,) ġ, 1/s
-    (eq 3.132).
+    """Return the angular velocity Ω = 2/(1 + |g|²) [ġ − g × ġ], rad/s, body frame, of the
+    parameters `g` (3,) and their `rates` (3,) ġ = dg/dt, 1/s (Schaub & Junkins, eq 3.132).
 
     >>> rates_to_omega(jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 2.0]

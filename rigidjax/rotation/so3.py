@@ -42,7 +42,8 @@ def exp(v: Vec3Like) -> Mat3:
     """Return the rotation by |v| about v: 1 + A hat v + B (hat v)² (notes, eqs 15, 17, 18).
 
     **Arguments:** `v` (3,) rotation vector, rad. A = sin θ/θ and B = (1 − cos θ)/θ² (Rodrigues
-    1840) are both computed from θ/2. The angle is known to ε|v|. **Raises:** as `quaternion.exp`.
+    1840) are both computed from θ/2. The angle θ = |v| has an error of ε|v|, where ε is the unit of
+    round-off. **Raises:** as `quaternion.exp`.
 
     >>> exp(jnp.array([0.0, 0.0, jnp.pi / 2])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
@@ -67,8 +68,9 @@ def left_jacobian(v: Vec3Like) -> Mat3:
     """Return the left Jacobian J_l, with exp(v + dv) = exp(J_l dv) exp(v) to first order: J_l dv is
     the small turn in the world frame.
 
-    **Arguments:** `v` (3,) rotation vector, rad. J_l = 1 + B hat v + C (hat v)², C = (θ − sin θ)/θ³
-    (Chirikjian 2012, doi:10.1007/978-0-8176-4944-9; Solà 2018, eq 145). **Raises:** as `exp`.
+    **Arguments:** `v` (3,) rotation vector, rad. J_l = 1 + B hat v + C (hat v)², with θ = |v|, B =
+    (1 − cos θ)/θ², C = (θ − sin θ)/θ³ (Chirikjian 2012, doi:10.1007/978-0-8176-4944-9; Solà 2018,
+    eq 145). **Raises:** as `exp`.
 
     >>> left_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -89,8 +91,8 @@ def right_jacobian(v: Vec3Like) -> Mat3:
 
 
 def left_jacobian_inverse(v: Vec3Like) -> Mat3:
-    """Return the inverse of the left Jacobian: 1 − ½ hat v + g (hat v)², with g = (1 − (θ/2)
-    cot(θ/2))/θ².
+    """Return the inverse of the left Jacobian: 1 − ½ hat v + g (hat v)², with θ = |v| and g = (1 −
+    (θ/2) cot(θ/2))/θ².
 
     **Arguments:** `v` (3,) rotation vector, rad, |v| < 2π (Solà 2018, eq 146).
 
@@ -103,8 +105,8 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
 
 
 def right_jacobian_inverse(v: Vec3Like) -> Mat3:
-    """Return the inverse of the right Jacobian: 1 + ½ hat v + g (hat v)², of `v` (3,), rad, |v| <
-    2π.
+    """Return the inverse of the right Jacobian of a rotation vector `v` (3,), rad, |v| < 2π: 1 + ½
+    hat v + g (hat v)², with g as in `left_jacobian_inverse`.
 
     >>> right_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -137,7 +139,7 @@ def _relative_rotation(a: Mat3, b: Mat3) -> Mat3:
     if _checks.is_known(between):
         _checks.require_finite(between, "aᵀb")
         large = jnp.abs(between).max() > 2
-        _checks.error_if(between, large, "aᵀb: has entries above 1; wanted two rotations, a and b")
+        _checks.error_if(between, large, "aᵀb: wanted rotations a and b, got entries above 1")
     return between
 
 

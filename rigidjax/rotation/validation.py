@@ -20,7 +20,7 @@ def rotation_tolerance(dtype: object) -> float:
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
-def require_direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
+def require_nonzero_and_finite(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
     """Return the vector `v` (n,), any unit. **Raises:** `ValueError` if it has no direction, that
     is, for zero, NaN and infinity, unless JAX traces it; the text `name` names the vector in the
     message.

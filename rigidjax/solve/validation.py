@@ -183,7 +183,7 @@ def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     if not _checks.is_known((rtol, atol)):
         return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
     # The tolerances are Python floats, because NumPy floats would promote a float32 run to float64.
-    rtol, atol = _checks.known_float(rtol, "rtol"), _checks.known_float(atol, "atol")
+    rtol, atol = _checks.python_float(rtol, "rtol"), _checks.python_float(atol, "atol")
     if not 0 < rtol < np.inf or not 0 <= atol < np.inf:
         raise ValueError(f"simulate: wanted rtol > 0 and atol >= 0, got rtol={rtol}, atol={atol}")
     floor = 100 * float(jnp.finfo(dtype).eps)

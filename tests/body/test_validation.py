@@ -137,7 +137,7 @@ def test_faults_agree_with_eigenvalues():
     tensors = np.einsum("nij,nj,nkj->nik", turns, moments, turns) * size[:, None, None]
     least, middle, largest = np.sort(moments).T
     broken = largest > least + middle
-    flat, bad, skew = validation._inertia_faults(
+    flat, bad, skew = validation._zero_impossible_asymmetric_flags(
         np, 0.5 * (tensors + tensors.swapaxes(1, 2)), allow_zero_moment=False
     )
     np.testing.assert_array_equal(bad | flat, broken)

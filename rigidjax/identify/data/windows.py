@@ -314,7 +314,7 @@ def _checked_start_deviation(value: object, name: str) -> float:
     without a prior about the measured state. `value` is the number of the user, and `name` what it
     is called in the error.
     """
-    number = _checks.known_float(value, name)
+    number = _checks.python_float(value, name)
     if not number > 0:
         raise ValueError(
             f"{name}: wanted a positive deviation, or infinity for a start that is free, got "

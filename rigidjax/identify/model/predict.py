@@ -127,7 +127,7 @@ def _tolerance_converter(name: str) -> Callable[[ScalarLike], Array]:
     tolerance is one number that JAX does not trace. A compiled program takes an array as an
     argument, so that another tolerance needs no new compilation.
     """
-    return lambda value: jnp.asarray(_checks.known_float(value, name), jnp.result_type(float))
+    return lambda value: jnp.asarray(_checks.python_float(value, name), jnp.result_type(float))
 
 
 class Adaptive(AbstractIntegrator):
