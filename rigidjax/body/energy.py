@@ -89,7 +89,7 @@ def kinetic_energy_of_matrix_rate(second_moment: Matrix, matrix_rate: Matrix) ->
     Array(1., dtype=float64)
     """
     s = _checks.array_of_shape(second_moment, (3, 3), "second_moment")
-    s = validation.check_symmetric(s, "second_moment")
+    s = validation.require_symmetric_or_nan(s, "second_moment")
     rate = _checks.array_of_shape(matrix_rate, (3, 3), "matrix_rate")
     return 0.5 * jnp.sum(product(rate, s) * rate)
 

@@ -117,7 +117,7 @@ class Inertia(eqx.Module):
     @property
     def moments(self) -> Vec3:
         """Return the principal moments I1 ≤ I2 ≤ I3, (3,), kg m²."""
-        return eigensystem(validation.check_symmetric(self.tensor, "inertia tensor"))[0]
+        return eigensystem(validation.require_symmetric_or_nan(self.tensor, "inertia tensor"))[0]
 
     def principal(self) -> tuple[Vec3, Quat]:
         """Return the principal moments, ascending, and the rotation principal axes → body axes.

@@ -60,7 +60,9 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
     (Array([1., 2., 3.], dtype=float64), Array([1., 0., 0., 0.], dtype=float64))
     """
     moments, axes = eigensystem(
-        validation.check_symmetric(_checks.array_of_shape(tensor, (3, 3), "tensor"), "tensor")
+        validation.require_symmetric_or_nan(
+            _checks.array_of_shape(tensor, (3, 3), "tensor"), "tensor"
+        )
     )
     return moments, _quaternion_of_small_turn(axes)
 
@@ -199,7 +201,9 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     >>> matrix_function(jnp.sqrt, 4.0 * jnp.eye(3))[0]
     Array([2., 0., 0.], dtype=float64)
     """
-    a = validation.check_symmetric(_checks.array_of_shape(tensor, (3, 3), "tensor"), "tensor")
+    a = validation.require_symmetric_or_nan(
+        _checks.array_of_shape(tensor, (3, 3), "tensor"), "tensor"
+    )
     _checks.require_function(function, "function", "number → number, written in jax.numpy")
     # The unit is a power of two near the largest entry, so that no product leaves the range of the
     # dtype. The exponent is reduced by one, because the power of two above the largest number of

@@ -97,10 +97,10 @@ def require_single_body(
     )
 
 
-def check_symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
-    """Return the matrix `a` (3, 3) if it is symmetric to round-off. A known matrix that is not
-    symmetric raises `ValueError`, and a traced one becomes NaN; the text `name` names the matrix in
-    the message.
+def require_symmetric_or_nan(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
+    """Return the matrix `a` (3, 3) if it is symmetric to round-off. **Raises:** `ValueError` if it
+    is not, unless JAX traces it; a traced matrix that is not symmetric becomes NaN. The text `name`
+    names the matrix in the message.
     """
     if _checks.is_known(a):
         return _require_symmetric(a, name)
