@@ -40,16 +40,19 @@ class AbstractScene(eqx.Module):
 
     @abc.abstractmethod
     def conserved(self, t: ScalarLike, state: PyTree) -> dict[str, Scalar]:
-        """Return the conserved quantities of the exact motion, by name; an empty `dict` if none is
-        known.
+        """Return the quantities that the exact motion conserves, by name, at the time `t`, s; an
+        empty `dict` if none is known.
         """
 
-    def field(self, t: ScalarLike, y: PyTree, args: object = None) -> Any:
-        """Return the vector field `(dx/dt, dv/dt)` as a `Point`, for `diffrax.ODETerm`."""
+    def field(self, t: ScalarLike, y: PyTree, args: object = None) -> Point:
+        """Return the vector field `(dx/dt, dv/dt)` as a `Point`, for `diffrax.ODETerm`; `args` is
+        not used.
+        """
         return Point(y.v, self.acceleration(t, y))
 
     def drift(self, ts: Float[Array, " times"], ys: PyTree) -> dict[str, Scalar]:
-        """Return, by name, the largest change of each conserved quantity from its first value.
+        """Return, by name, the largest absolute change of each conserved quantity from its value at
+        `ts[0]`.
 
         **Arguments:** `ts` (T,) times, s; `ys` the states at these times, with a leading axis T.
 
@@ -101,10 +104,11 @@ def checked_force_per_mass(value: NumbersLike, force: object) -> Vec3:
 
 
 def jump_times_within(*laws: object) -> Float[Array, " n"]:
-    """Return the jump times, s, of all `laws` that have an attribute `jump_times`.
+    """Return the times (n,), s, at which any of the `laws` (forces, torques, functions of time)
+    jumps or has a kink, as their attributes `jump_times` say, in no particular order.
 
-    A scene or torque that contains laws must pass the jump times of these laws on: the solver reads
-    the `jump_times` of the outermost scene or torque only.
+    A scene or torque that contains other laws must have the jump times of all of them, because the
+    solver reads the `jump_times` of the outermost scene or torque only.
     """
     jumps = (getattr(law, "jump_times", None) for law in laws)
     times = [jnp.asarray(times, float) for times in jumps if times is not None]
@@ -112,7 +116,7 @@ def jump_times_within(*laws: object) -> Float[Array, " n"]:
 
 
 def cast_like(x: Array, *values: Array) -> tuple[Array, ...]:
-    """Return `values`, constants of a scene, in the dtype of the state `x`: float32 stays
-    float32.
+    """Return `values`, constants of a scene, converted to the dtype of the state `x`, so that a
+    float32 solve stays in float32.
     """
     return tuple(value.astype(x.dtype) for value in values)

@@ -8,7 +8,8 @@ from rigidjax.frames.base import AbstractScene
 from rigidjax.frames.point import Point, require_point
 from rigidjax.rotation.linalg3 import components, dot_components
 
-# NIMA TR8350.2 (WGS84), table 3.1; ISO 80000-3 for the standard fall.
+# The rate of the Earth's rotation, rad/s: NIMA TR8350.2 (WGS84), table 3.1. Standard gravity, m/s²:
+# ISO 80000-3.
 RATE = 7.292115e-5
 GRAVITY = 9.80665
 
@@ -30,7 +31,9 @@ class Earth(AbstractScene):
     rate: Scalar
 
     def angular_velocity(self) -> Vec3:
-        """Return Ω = (0, Ω cos λ, Ω sin λ) (3,), rad/s, in the axes east, north, up."""
+        """Return the Earth's angular velocity (0, Ω cos λ, Ω sin λ) (3,), rad/s, in the axes east,
+        north, up, with the `rate` Ω and the `latitude` λ.
+        """
         north, up = self.rate * jnp.cos(self.latitude), self.rate * jnp.sin(self.latitude)
         return jnp.stack([jnp.zeros_like(north), north, up])
 
@@ -134,8 +137,8 @@ class Foucault(AbstractScene):
         return {"jacobi": self.place.jacobi_integral(state), "length": length}
 
     def start(self, east: ScalarLike, north: ScalarLike) -> Point:
-        """Return the bob at rest, at the horizontal distances `east` and `north`, m, from the
-        pivot.
+        """Return the state of the bob at rest, at the horizontal distances `east` and `north`, m,
+        from the pivot.
 
         >>> foucault(0.5, 10.0).start(6.0, 0.0).x.tolist()
         [6.0, 0.0, -8.0]
@@ -157,7 +160,7 @@ class Foucault(AbstractScene):
         named = dict(east=east, north=north, east_speed=east_speed, north_speed=north_speed)
         length, e, n, ve, vn = _checks.scalar_arrays_of_one_dtype(length=self.length, **named)
         below = length**2 - e * e - n * n
-        words = "foucault: the start lies beyond the length of the string"
+        words = "foucault: wanted a start below the pivot, got one beyond the length of the string"
         below = _checks.error_if(below, ~(below > 0), words)
         up = -jnp.sqrt(below)
         return Point(jnp.stack([e, n, up]), jnp.stack([ve, vn, -(e * ve + n * vn) / up]))

@@ -53,7 +53,7 @@ class InFrame(AbstractScene):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times, s, at which a force jumps or has a kink."""
+        """Return the times (n,), s, at which `inside` or `outside` jumps or has a kink."""
         return jump_times_within(self.inside, self.outside)
 
     def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
@@ -80,7 +80,8 @@ class InFrame(AbstractScene):
 
 
 def scene_of_force(force: object) -> AbstractScene:
-    """Return the scene that `simulate` solves for the motion of a particle under `force`.
+    """Return the scene (the equations of motion of a particle) that `simulate` solves for a
+    particle under `force`.
 
     `force` is a scene, which is returned unchanged; a `MovingFrame`, in which the particle moves
     freely; a force per mass `(t, state, body) → (3,)`, m/s²; or `None` for a free particle.
@@ -109,7 +110,8 @@ class FrameWrench(eqx.Module):
 
 
 class BodyInFrame(eqx.Module):
-    """Give the inertial torque, and for `Rigid` the inertial force, on a body in a moving frame S'.
+    """Compute the fictitious torque, and for `Rigid` the fictitious force, on a body in a moving
+    frame S'.
 
     Pass this to `simulate` as the torque of an `Attitude` or `Rigid` state in S'. Such a state has
     q', body → S', with the matrix Q'; Ω', the rate relative to S', in body axes; a `Rigid` state
@@ -140,12 +142,12 @@ class BodyInFrame(eqx.Module):
         require_frame(self.frame, "BodyInFrame")
         if self.torque is not None:
             _checks.require_function(
-                self.torque, "torque", "(t, state, body) → (3,), N m, or a law"
+                self.torque, "torque", "(t, state, body) → (3,), N m, or a Wrench"
             )
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times, s, at which the torque jumps or has a kink."""
+        """Return the times (n,), s, at which the real `torque` jumps or has a kink."""
         return jump_times_within(self.torque)
 
     def __call__(self, t: ScalarLike, state: PyTree, body: _inertia.Body) -> Vec3 | FrameWrench:

@@ -1,9 +1,7 @@
 """Compute with a moving frame at one instant: the kinematics of section 3 of the notes."""
 
-from typing import Any
-
 import equinox as eqx
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Vec3, Vector
@@ -32,10 +30,10 @@ class Instant(eqx.Module):
     origin_velocity: Vec3
     origin_acceleration: Vec3
 
-    def to_inertial(self, state: PyTree) -> Any:
+    def to_inertial(self, state: PyTree) -> PyTree:
         """Return `state`, which is given in S', transformed to S (notes, eqs 85, 88)."""
         _require_transformable(state)
-        turned = {}
+        turned: dict[str, Array] = {}
         if hasattr(state, "x"):
             x, rate = state.x, self.rate.astype(state.x.dtype)
             turned["x"] = self.origin.astype(x.dtype) + self.to_inertial_axes(x)
@@ -48,10 +46,10 @@ class Instant(eqx.Module):
             turned["omega"] = state.omega + rate
         return _replace_fields(state, turned)
 
-    def from_inertial(self, state: PyTree) -> Any:
+    def from_inertial(self, state: PyTree) -> PyTree:
         """Return `state`, which is given in S, transformed to S' (notes, eqs 86, 88)."""
         _require_transformable(state)
-        turned = {}
+        turned: dict[str, Array] = {}
         if hasattr(state, "x"):
             dtype = state.x.dtype
             x = self.from_inertial_axes(state.x - self.origin.astype(dtype))
@@ -95,16 +93,14 @@ class Instant(eqx.Module):
         return linalg3.cross(x, self.rate_change.astype(x.dtype))
 
     def translational_acceleration(self) -> Vec3:
-        """Return −Mᵀ d²X/dt² (3,), the inertial acceleration from an accelerated origin, axes of
-        S'.
+        """Return −Mᵀ d²X/dt² (3,), in the axes of S': the fictitious acceleration due to the
+        acceleration of the origin.
         """
         return -self.from_inertial_axes(self.origin_acceleration)
 
     def fictitious(self, x: Vector, v: Vector) -> Vec3:
-        """Return the sum of the four inertial accelerations (3,) at `x`, `v`, axes of S' (notes, eq
-        91).
-
-        The four are: centrifugal, Coriolis, Euler, and that from an accelerated origin.
+        """Return the sum of the four fictitious accelerations (3,) at `x` = x' and `v` = v', in the
+        axes of S' (notes, eq 91): centrifugal, Coriolis, Euler, and translational.
         """
         x, v = _checks.array_of_shape(x, (3,), "x"), _checks.array_of_shape(v, (3,), "v")
         turning = self.centrifugal(x) + self.coriolis(v) + self.euler_acceleration(x)
@@ -130,9 +126,9 @@ def _require_transformable(state: PyTree) -> None:
             _checks.array_of_shape(getattr(state, name), (size,), name, hint=hint)
 
 
-def _replace_fields(state: PyTree, fields: dict[str, Any]) -> Any:
-    """Return a copy of `state` in which the fields with the names in `fields` have the values in
-    `fields`.
+def _replace_fields(state: PyTree, fields: dict[str, Array]) -> PyTree:
+    """Return a copy of `state` with the new values in `fields`, which maps names of fields of the
+    state to arrays.
     """
     names = list(fields)
     return eqx.tree_at(lambda s: [getattr(s, n) for n in names], state, [fields[n] for n in names])

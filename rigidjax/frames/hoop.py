@@ -51,9 +51,8 @@ class Hoop(AbstractScene):
         return {"jacobi": jacobi, "radius": jnp.sqrt(x * x + z * z)}
 
     def side_push(self, state: Point) -> Scalar:
-        """Return the force per mass of the hoop on the bead along y, across the hoop's plane, m/s².
-
-        It is 2Ω v_x and balances the Coriolis acceleration.
+        """Return the force per mass, m/s², with which the hoop pushes the bead along y, across its
+        plane: 2Ω v_x, which balances the Coriolis acceleration.
 
         >>> float(hoop(1.0, 3.0).side_push(Point([0.0, 0, -1], [2.0, 0, 0])))
         12.0

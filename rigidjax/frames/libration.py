@@ -75,10 +75,10 @@ def libration_integral(state: PyTree, body: _inertia.Inertia, rate: ScalarLike) 
     n = _checks.array_of_shape(rate, (), "rate").astype(state.q.dtype)
     up, normal = (quaternion.rotate_inverse(state.q, axes[i]) for i in (0, 2))
 
-    def weigh_by_inertia(y: Vec3) -> Scalar:
+    def inertia_quadratic_form(y: Vec3) -> Scalar:
         return linalg3.dot(y, _inertia.apply(body.tensor, y))
 
     return 0.5 * (
-        weigh_by_inertia(state.omega)
-        + n * n * (3 * weigh_by_inertia(up) - weigh_by_inertia(normal))
+        inertia_quadratic_form(state.omega)
+        + n * n * (3 * inertia_quadratic_form(up) - inertia_quadratic_form(normal))
     )

@@ -35,7 +35,7 @@ class MovingFrame(eqx.Module):
 
     The numbers of a frame may be traced: motions in the frame can be differentiated with respect to
     them. **Raises:** `TypeError` for a `rotation` that cannot be called; `ValueError`, when the
-    frame is used, if `rotation` returns a known value that is no rotation.
+    frame is used, if `rotation` returns a value that is no rotation, unless JAX traces the value.
 
     >>> turntable = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
     >>> turntable.centrifugal([1.0, 0.0, 0.0], 0.3).tolist()
@@ -61,12 +61,12 @@ class MovingFrame(eqx.Module):
             _checks.require_function(origin, "origin", "of time to (3,)", hint=hint)
         if rate is not None:
             _checks.require_function(rate, "rate", "of time to (3,)")
-        self.rotation, self.origin = rotation_models.with_forward_solves(rotation), origin
+        self.rotation, self.origin = rotation_models.with_forward_mode_adjoints(rotation), origin
         self.rate = getattr(rotation, "rate", None) if rate is None else rate
 
     def matrix(self, t: ScalarLike) -> Mat3:
-        """Return the rotation matrix M(t) (3, 3), S' → S (notes, eq 85)."""
-        return rotation_models.matrix(self.rotation, _checks.checked_time(t))
+        """Return the rotation matrix M(t) (3, 3), S' → S, at the time `t`, s (notes, eq 85)."""
+        return rotation_models.rotation_matrix_at(self.rotation, _checks.checked_time(t))
 
     def at(self, t: ScalarLike) -> Instant:
         """Return the frame at time `t`, s, as an `Instant`: M, Ω, dΩ/dt, X, dX/dt and d²X/dt².
@@ -89,20 +89,21 @@ class MovingFrame(eqx.Module):
         t = _checks.checked_time(t)
         if self.rate is not None:
             return _checks.array_of_shape(self.rate(t), (3,), "rate").astype(t.dtype)
-        state = rotation_models.state_of(self.rotation, t)
+        state = rotation_models.rotation_value_at(self.rotation, t)
         if hasattr(state, "omega"):
             return state.omega.astype(t.dtype)
         m, m_dot = jax.jvp(self.matrix, (t,), (jnp.ones_like(t),))
         return linalg3.vee(linalg3.product(m.T, m_dot))
 
-    def to_inertial(self, state: PyTree, t: ScalarLike) -> Any:
+    def to_inertial(self, state: PyTree, t: ScalarLike) -> PyTree:
         """Return `state`, which is given in S', transformed to S; its type does not change.
 
         **Arguments:** `state` a `Point`, `Attitude` or `Rigid`, or any Module with `x` and `v`,
         with `q` and `omega`, or with all four fields; one state, not a batch. `t` the time, s. Then
 
-        x = X + M x',  v = dX/dt + M (v' + Ω × x')  (notes, eqs 85, 87, 88), q = q_M q',  Ω_body =
-        Ω'_body + (M')ᵀ Ω, both in body axes.
+        x = X + M x',  v = dX/dt + M (v' + Ω × x')  (notes, eqs 85, 87, 88),  q = q_M q',  Ω_body =
+        Ω'_body + Q'ᵀ Ω, where q_M is the quaternion of M, and Q' the matrix of q'; the body rates
+        Ω_body and Ω'_body, in S and in S', have components in body axes.
 
         For many states use `jax.vmap(frame.to_inertial)(states, times)`.
 
@@ -112,7 +113,7 @@ class MovingFrame(eqx.Module):
         """
         return self.at(t).to_inertial(state)
 
-    def from_inertial(self, state: PyTree, t: ScalarLike) -> Any:
+    def from_inertial(self, state: PyTree, t: ScalarLike) -> PyTree:
         """Return `state`, which is given in S, transformed to S': the inverse of `to_inertial`.
 
         **Arguments:** as for `to_inertial`. x' = Mᵀ(x − X), v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs
@@ -147,8 +148,8 @@ class MovingFrame(eqx.Module):
         return self.at(t).euler_acceleration(x)
 
     def translational_acceleration(self, t: ScalarLike) -> Vec3:
-        """Return −Mᵀ d²X/dt² (3,), m/s², axes of S': the inertial acceleration from an accelerated
-        origin.
+        """Return −Mᵀ d²X/dt² (3,), m/s², axes of S': the fictitious acceleration due to the
+        acceleration of the origin.
         """
         return self.at(t).translational_acceleration()
 
@@ -183,14 +184,14 @@ class MovingFrame(eqx.Module):
         return now.to_inertial_axes(a - now.fictitious(x, v))
 
     def force_from_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
-        """Return MᵀF (3,), axes of S', of a force or direction F = `force` (3,), axes of S (notes,
-        eq 91).
+        """Return the components MᵀF (3,) in the axes of S' of a force or direction F = `force`
+        (3,), which is given in the axes of S (notes, eq 91).
         """
         return linalg3.apply(self.matrix(t).T, _checks.array_of_shape(force, (3,), "force"))
 
     def force_to_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
-        """Return M f (3,), axes of S, of a force or direction f = `force` (3,), axes of S' (notes,
-        eq 85).
+        """Return the components M f (3,) in the axes of S of a force or direction f = `force` (3,),
+        which is given in the axes of S' (notes, eq 85).
         """
         return linalg3.apply(self.matrix(t), _checks.array_of_shape(force, (3,), "force"))
 
@@ -218,27 +219,30 @@ class MovingFrame(eqx.Module):
         >>> half.compose(half).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
-        both = _ComposedMotion(self, require_frame(inner, "inner"))
-        return MovingFrame(both.rotation, both.origin, both.rate)
+        motion = _ComposedMotion(self, require_frame(inner, "inner"))
+        return MovingFrame(motion.rotation, motion.origin, motion.rate)
 
     def inverse(self) -> "MovingFrame":
-        """Return the motion of S relative to S', as a frame with Mᵀ for M and −MᵀX for X.
+        """Return the frame that moves as S moves relative to S', with Mᵀ in place of M and −MᵀX in
+        place of X.
 
         `frame.compose(frame.inverse())` does not move.
         """
-        back = _InverseMotion(self)
-        return MovingFrame(back.rotation, back.origin, back.rate)
+        motion = _InverseMotion(self)
+        return MovingFrame(motion.rotation, motion.origin, motion.rate)
 
     def place(self, t: ScalarLike) -> Vec3:
-        """Return the origin X(t) (3,) of S', m, axes of S."""
+        """Return the position X(t) (3,), m, axes of S, of the origin of S'."""
         t = _checks.checked_time(t)
         if self.origin is None:
             return jnp.zeros(3, t.dtype)
         return _checks.array_of_shape(self.origin(t), (3,), "origin").astype(t.dtype)
 
 
-def require_frame(frame: object, name: str) -> Any:
-    """Return `frame` if it is a `MovingFrame`; raise `TypeError` for anything else."""
+def require_frame(frame: object, name: str) -> MovingFrame:
+    """Return `frame` if it is a `MovingFrame`; raise `TypeError` for anything else. `name` is the
+    name of the argument, for the message.
+    """
     hint = "make one from a rotation with MovingFrame(rotation)"
     return _checks.require_instance(
         frame, MovingFrame, name, requirement="a MovingFrame", hint=hint
@@ -246,8 +250,8 @@ def require_frame(frame: object, name: str) -> Any:
 
 
 class _ComposedMotion(eqx.Module):
-    """Describe the motion of a frame that moves relative to the moving frame `outer` as `inner`
-    states, seen from the inertial frame.
+    """Describe the motion, relative to the inertial frame, of a frame that moves relative to the
+    moving frame `outer` as `inner` does relative to an inertial frame.
 
     The methods `rotation`, `rate` and `origin` are functions of the time, s, for a `MovingFrame`:
     the rotation matrix (3, 3), the angular velocity (3,), rad/s, and the origin (3,), m.
@@ -256,16 +260,16 @@ class _ComposedMotion(eqx.Module):
     outer: MovingFrame
     inner: MovingFrame
 
-    def rotation(self, t: ScalarLike) -> Any:
+    def rotation(self, t: ScalarLike) -> Mat3:
         return linalg3.product(self.outer.matrix(t), self.inner.matrix(t))
 
-    def rate(self, t: ScalarLike) -> Any:
+    def rate(self, t: ScalarLike) -> Vec3:
         # The angular velocities of both frames are added, in the axes of the inner frame: this
         # needs no derivative of the product of the two rotations.
         carried = linalg3.apply(self.inner.matrix(t).T, self.outer.angular_velocity(t))
         return carried + self.inner.angular_velocity(t)
 
-    def origin(self, t: ScalarLike) -> Any:
+    def origin(self, t: ScalarLike) -> Vec3:
         return self.outer.place(t) + linalg3.apply(self.outer.matrix(t), self.inner.place(t))
 
 
@@ -278,11 +282,11 @@ class _InverseMotion(eqx.Module):
 
     frame: MovingFrame
 
-    def rotation(self, t: ScalarLike) -> Any:
+    def rotation(self, t: ScalarLike) -> Mat3:
         return self.frame.matrix(t).T
 
-    def rate(self, t: ScalarLike) -> Any:
+    def rate(self, t: ScalarLike) -> Vec3:
         return -linalg3.apply(self.frame.matrix(t), self.frame.angular_velocity(t))
 
-    def origin(self, t: ScalarLike) -> Any:
+    def origin(self, t: ScalarLike) -> Vec3:
         return -linalg3.apply(self.frame.matrix(t).T, self.frame.place(t))

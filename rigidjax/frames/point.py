@@ -1,7 +1,5 @@
 """Hold the state of a particle, without a body."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
@@ -34,9 +32,9 @@ class Point(eqx.Module):
         self.x, self.v = x.astype(dtype), v.astype(dtype)
 
 
-def require_point(state: PyTree, name: str = "state") -> Any:
-    """Return `state` if it has one position `x` and one velocity `v`; raise an error for anything
-    else.
+def require_point(state: PyTree, name: str = "state") -> PyTree:
+    """Return `state` if it has one position `x` (3,) and one velocity `v` (3,); raise an error for
+    anything else. `name` is the name of the argument, for the message.
     """
     if isinstance(state, type) or not (hasattr(state, "x") and hasattr(state, "v")):
         raise TypeError(f"{name}: wanted a Point(x, v), got {_checks.type_name(state)}")

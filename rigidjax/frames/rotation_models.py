@@ -35,7 +35,7 @@ class Uniform(eqx.Module):
         return so3.exp(t * self.omega.astype(t.dtype))
 
     def rate(self, t: ScalarLike) -> Vec3:
-        """Return the angular velocity Ω (3,), rad/s, which is constant."""
+        """Return the angular velocity Ω (3,), rad/s, axes of S', which does not depend on `t`."""
         return self.omega.astype(_checks.checked_time(t).dtype)
 
 
@@ -69,20 +69,20 @@ class AboutAxis(eqx.Module):
         )
 
     def rate(self, t: ScalarLike) -> Vec3:
-        """Return the angular velocity Ω (3,), rad/s: the unit axis times the time derivative of the
-        angle.
+        """Return the angular velocity Ω (3,), rad/s, axes of S', at the time `t`, s: the unit axis
+        times the derivative of the angle.
         """
         t = _checks.checked_time(t)
         _, speed = jax.jvp(self.angle, (t,), (jnp.ones_like(t),))
         return speed * self.axis.astype(t.dtype)
 
 
-def with_forward_solves(rotation: PyTree) -> Any:
+def with_forward_mode_adjoints(rotation: PyTree) -> PyTree:
     """Return the function of time `rotation` with each `diffrax.RecursiveCheckpointAdjoint` in it
     replaced by `diffrax.ForwardMode`.
 
-    dΩ/dt, the derivative of a frame's angular velocity Ω, is a forward-mode derivative, which
-    `diffrax.RecursiveCheckpointAdjoint` refuses.
+    The derivative of a frame's angular velocity is computed in forward mode, which is not possible
+    through a `diffrax.RecursiveCheckpointAdjoint`.
     """
 
     def reverse(part: PyTree) -> bool:
@@ -91,7 +91,7 @@ def with_forward_solves(rotation: PyTree) -> Any:
     return jax.tree.map(lambda p: dfx.ForwardMode() if reverse(p) else p, rotation, is_leaf=reverse)
 
 
-def state_of(rotation: PyTree, t: Array) -> Any:
+def rotation_value_at(rotation: PyTree, t: Array) -> PyTree:
     """Return the value of a frame's `rotation` at the time `t`, s: a matrix (3, 3), a quaternion
     (4,), or a state with `q` and `omega`.
 
@@ -100,13 +100,13 @@ def state_of(rotation: PyTree, t: Array) -> Any:
     return rotation.evaluate(t) if hasattr(rotation, "evaluate") else rotation(t)
 
 
-def matrix(rotation: PyTree, t: Array) -> Mat3:
+def rotation_matrix_at(rotation: PyTree, t: Array) -> Mat3:
     """Return the matrix M (3, 3), S' → S, of a frame's `rotation` at time `t`, s.
 
     `rotation` is a function of the time that returns a matrix (3, 3), a quaternion (4,) or a state
     with `q`; or it is a solution of `simulate`.
     """
-    value = state_of(rotation, t)
+    value = rotation_value_at(rotation, t)
     value = getattr(value, "q", value)
     shape = jnp.shape(value)
     if shape == (4,):
