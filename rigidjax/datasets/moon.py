@@ -24,7 +24,7 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.identify.model.charts import AbstractBodyChart
 from rigidjax.motion import Attitude
 from rigidjax.motion.torques import ChangingInertia, Chebyshev, GravityGradient, Sum, Tide
-from rigidjax.motion.torques.base import evaluate
+from rigidjax.motion.torques.base import evaluate_torque
 from rigidjax.rotation import euler
 from rigidjax.rotation.linalg3 import cross
 
@@ -268,7 +268,7 @@ class _LiquidCore(eqx.Module):
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: Inertia, own: Array) -> Array:
         whole = Inertia(body.tensor + self.tensor)
-        return evaluate(self.gravity, t, state, whole) + self.on_mantle(state, own)
+        return evaluate_torque(self.gravity, t, state, whole) + self.on_mantle(state, own)
 
 
 class _CoreAcceleration(eqx.Module):

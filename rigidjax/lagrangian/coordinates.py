@@ -14,7 +14,7 @@ from rigidjax._types import HasAttitude, Scalar, ScalarLike
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion import Attitude
-from rigidjax.motion.torques.base import Torque, require_law
+from rigidjax.motion.torques.base import Torque, require_torque
 from rigidjax.rotation import euler, linalg3
 
 
@@ -152,7 +152,7 @@ class EulerAngleTop(eqx.Module):
     def __init__(self, inertia: Inertia, torque: Torque | None = None):
         inertia = validation.require_single_body(inertia, Inertia, "inertia")
         if torque is not None:
-            require_law(torque)
+            require_torque(torque)
         if torque is not None and not hasattr(torque, "energy"):
             raise TypeError(
                 f"{type(torque).__name__} has no potential (no method energy(t, state, body)): "

@@ -12,9 +12,9 @@ from rigidjax.body.energy import angular_momentum, kinetic_energy
 from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.torques import AbstractTorque, CentralGravity
-from rigidjax.motion.torques.base import Torque, in_precision, length_or_zero, require_scene
+from rigidjax.motion.torques.base import Torque, in_precision, length_or_zero, require_compatible
 from rigidjax.motion.torques.composite import parts_of
-from rigidjax.motion.torques.states import FrozenLaw, freeze
+from rigidjax.motion.torques.states import FrozenLaw, freeze_own_states
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
 
@@ -25,8 +25,8 @@ def energy(
     torque: Torque | None = None,
     t: ScalarLike = 0.0,
 ) -> Scalar:
-    """Return the kinetic energy plus the potential of each torque and force, J: `½ m |v|² + ½ Ω·IΩ
-    + U`.
+    """Return the kinetic energy plus the potential energies of all torques and forces, J: `½ m |v|²
+    + ½ Ω·IΩ + U`, with the mass m, velocity v, body rate Ω, inertia I and the sum U of potentials.
 
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for torques that depend on
     time. Wheels add no energy, except for `ReactionWheels`. Under a torque with states of its own
@@ -38,12 +38,14 @@ def energy(
     >>> energy(rj.Inertia.from_principal(1.0, 1.0, 1.0), start, top)
     Array(10.31, dtype=float64)
     """
-    turning, parts, t = _state_and_torques(body, state, torque, t)
+    motion, parts, t = _checked_motion_torques_and_time(body, state, torque, t)
     for part in parts:
         if not hasattr(part, "energy"):
             words = f"energy: wanted torques with a potential, got {type(part).__name__}, which has"
-            raise TypeError(f"{words} no method energy(t, state, body); or take kinetic_energy")
-    return _total_energy(in_precision(body, turning.omega.dtype), turning, parts, t)
+            raise TypeError(
+                f"{words} no method energy(t, state, body); or take kinetic_energy alone"
+            )
+    return _total_energy(in_precision(body, motion.omega.dtype), motion, parts, t)
 
 
 def conserved(
@@ -61,7 +63,8 @@ def conserved(
 
     - `energy`, J, if every torque has a potential and no torque depends on time;
     - `momentum` (3,), kg m²/s, world frame, `R(IΩ + h)`, and `momentum_squared`, the Casimir `|IΩ +
-      h|²`, if there is no external torque (h is the momentum of the wheels);
+      h|²`, if there is no external torque (R is the attitude, I the inertia, Ω the body rate, and h
+      the momentum of the wheels);
     - `momentum_along_axis`, kg m²/s, if the only external torque has no component along a fixed
       axis of the world, such as the direction of gravity or of a field;
     - `linear_momentum` (3,), kg m/s, world frame, if no force acts on the body;
@@ -75,20 +78,20 @@ def conserved(
     >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))
     ['energy', 'momentum_squared']
     """
-    turning, parts, t = _state_and_torques(body, state, torque, t)
-    dtype = turning.omega.dtype
+    motion, parts, t = _checked_motion_torques_and_time(body, state, torque, t)
+    dtype = motion.omega.dtype
     body = in_precision(body, dtype)
     quantities: dict[str, Float[Array, "..."]] = {}
     if all(hasattr(part, "energy") and getattr(part, "steady", False) for part in parts):
-        quantities["energy"] = _total_energy(body, turning, parts, t)
-    outside = [part for part in parts if not hasattr(part, "internal_momentum")]
-    momentum = _total_angular_momentum(body, turning, parts, t)
-    if not outside:
+        quantities["energy"] = _total_energy(body, motion, parts, t)
+    external = [part for part in parts if not hasattr(part, "internal_momentum")]
+    momentum = _total_angular_momentum(body, motion, parts, t)
+    if not external:
         quantities["momentum_squared"] = dot(momentum, momentum)
-    if isinstance(turning, HasAttitude):
-        momentum = quaternion.rotate(turning.q, momentum)
-        axis = getattr(outside[0], "axis", None) if len(outside) == 1 else None
-        if not outside:
+    if isinstance(motion, HasAttitude):
+        momentum = quaternion.rotate(motion.q, momentum)
+        axis = getattr(external[0], "axis", None) if len(external) == 1 else None
+        if not external:
             quantities["momentum"] = momentum
         elif axis is not None:
             axis = axis.astype(dtype)
@@ -96,15 +99,17 @@ def conserved(
             quantities["momentum_along_axis"] = dot(momentum, axis) / jnp.where(
                 length > 0, length, 1
             )
-    if isinstance(turning, HasPose) and isinstance(body, MassProperties):
-        plain = [(part, part.law if isinstance(part, FrozenLaw) else part) for part in parts]
+    if isinstance(motion, HasPose) and isinstance(body, MassProperties):
+        parts_and_laws = [
+            (part, part.law if isinstance(part, FrozenLaw) else part) for part in parts
+        ]
         # A torque whose `feels` is `HasPose` may return a force as well.
-        turns = lambda law: isinstance(law, AbstractTorque) and law.feels is not HasPose  # noqa: E731
-        pushed = [part for part, law in plain if not turns(law)]
-        if not pushed:
-            quantities["linear_momentum"] = body.mass * turning.v
-        if all(isinstance(part, CentralGravity) for part in [*outside, *pushed]):
-            quantities["momentum_about_origin"] = body.mass * cross(turning.x, turning.v) + momentum
+        is_torque_only = lambda law: isinstance(law, AbstractTorque) and law.feels is not HasPose  # noqa: E731
+        forces = [part for part, law in parts_and_laws if not is_torque_only(law)]
+        if not forces:
+            quantities["linear_momentum"] = body.mass * motion.v
+        if all(isinstance(part, CentralGravity) for part in [*external, *forces]):
+            quantities["momentum_about_origin"] = body.mass * cross(motion.x, motion.v) + momentum
     return quantities
 
 
@@ -131,32 +136,32 @@ def drift(
     ts = _checks.array_of_rows(ts, (), "ts")
     if not ts.size:
         raise ValueError("ts: wanted at least one time, got none")
-    turning = motion_of(ys)
-    _checks.require_instance(turning, HasSpin, "ys", requirement="states with a leading time axis")
+    motion = motion_of(ys)
+    _checks.require_instance(motion, HasSpin, "ys", requirement="states with a leading time axis")
     for leaf in jax.tree.leaves(ys):
         if leaf.shape[:1] != ts.shape:
-            words = f"ys: wanted one row for each of {ts.shape[0]} times"
+            words = f"ys: wanted arrays with one row for each of the {ts.shape[0]} times in ts"
             raise ValueError(f"{words}, got shape {leaf.shape}")
-    at_all = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
-    kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(turning)
-    spin = jax.vmap(lambda t, y: _angular_momentum_size(body, y, torque, t))(ts, ys)
+    quantities = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
+    kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(motion)
+    momenta = jax.vmap(lambda t, y: _angular_momentum_magnitude(body, y, torque, t))(ts, ys)
     drifts = {}
-    for name, values in at_all.items():
-        away = _lengths_over_time(values - jax.lax.slice_in_dim(values, 0, 1))
+    for name, values in quantities.items():
+        distances = _magnitude_at_each_time(values - jax.lax.slice_in_dim(values, 0, 1))
         if name == "energy":
             scale = kinetic
         elif name in ("linear_momentum", "momentum_about_origin"):
-            scale = _lengths_over_time(values)
+            scale = _magnitude_at_each_time(values)
         else:
-            scale = spin**2 if name == "momentum_squared" else spin
+            scale = momenta**2 if name == "momentum_squared" else momenta
         scale = jnp.max(scale)
-        drifts[name] = jnp.max(away) / jnp.where(scale > 0, scale, 1)
+        drifts[name] = jnp.max(distances) / jnp.where(scale > 0, scale, 1)
     return drifts
 
 
-def _state_and_torques(
+def _checked_motion_torques_and_time(
     body: Body, state: PyTree, torque: Torque | None, t: ScalarLike
-) -> tuple[Any, tuple[Any, ...], Scalar]:
+) -> tuple[HasSpin, tuple[Any, ...], Scalar]:
     """Check a state, a torque and a time, and return the three things from which conserved
     quantities are computed: the state of motion (a `Spin`, `Attitude` or `Rigid`); a tuple of the
     single torques and forces; and the time, as a scalar array, s.
@@ -172,10 +177,10 @@ def _state_and_torques(
     - `t`: s, the time of the state
     """
     if isinstance(state, Coupled):
-        state, torque = state.motion, freeze(torque, state.own)
+        state, torque = state.motion, freeze_own_states(torque, state.own)
     parts = parts_of(torque)
     for part in parts or (None,):
-        require_scene(part, state, body)
+        require_compatible(part, state, body)
     return state, parts, _checks.array_of_shape(t, (), "t")
 
 
@@ -214,10 +219,11 @@ def _total_angular_momentum(
     return momentum
 
 
-def _angular_momentum_size(
+def _angular_momentum_magnitude(
     body: Body, state: PyTree, torque: Torque | None, t: ScalarLike
 ) -> Scalar:
-    """Return the length of the angular momentum of the body and of the wheels inside it, kg m²/s.
+    """Return the magnitude of the angular momentum of the body and of the wheels inside it, kg
+    m²/s.
 
     - `body`: an `Inertia` or `MassProperties`
     - `state`: the state of motion, or a `Coupled`: a state of motion together with the states of
@@ -225,14 +231,15 @@ def _angular_momentum_size(
     - `torque`: a torque, a force, a `Sum` of several, or `None`
     - `t`: s, the time
     """
-    state, parts, t = _state_and_torques(body, state, torque, t)
+    state, parts, t = _checked_motion_torques_and_time(body, state, torque, t)
     return length_or_zero(
         _total_angular_momentum(in_precision(body, state.omega.dtype), state, parts, t)
     )
 
 
-def _lengths_over_time(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:
-    """Return, for each time, the length of a vector or the absolute value of a number, (n,).
+def _magnitude_at_each_time(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:
+    """Return the magnitude of a quantity at each of n times, (n,): the length of a vector, or the
+    absolute value of a number.
 
     - `values`: (n, 3), a vector for each of n times; or (n,), a number for each time
     """

@@ -10,7 +10,12 @@ from rigidjax import _checks
 from rigidjax._types import HasSpin, ScalarLike
 from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.motion.torques.base import in_precision
-from rigidjax.motion.torques.states import freeze, has_states, initial_states, rates_of_own_states
+from rigidjax.motion.torques.states import (
+    contains_own_states,
+    freeze_own_states,
+    initial_own_states,
+    rates_of_own_states,
+)
 
 
 class Coupled(eqx.Module):
@@ -40,7 +45,7 @@ class Coupled(eqx.Module):
         )
         dtype = state0.omega.dtype
         t = _checks.array_of_shape(t, (), "t").astype(dtype)
-        own = initial_states(in_precision(torque, dtype), t, state0, in_precision(body, dtype))
+        own = initial_own_states(in_precision(torque, dtype), t, state0, in_precision(body, dtype))
         return Coupled(state0, own)
 
 
@@ -64,25 +69,25 @@ class CoupledEquations(eqx.Module):
         time = _checks.array_of_shape(t, (), "t").astype(dtype)
         law, body = in_precision(self.field, dtype), in_precision(self.body, dtype)
         own = rates_of_own_states(law, time, y.own, y.motion, body)
-        return Coupled(freeze(self.field, y.own)(t, y.motion, args), own)
+        return Coupled(freeze_own_states(self.field, y.own)(t, y.motion, args), own)
 
 
-def with_own_states(body: Body | None, state0: PyTree, torque: PyTree, t: ScalarLike) -> Any:
-    """Return the start of an integration: `state0` itself, or, if the torque has states of its own
-    (such as the speed of a wheel), a `Coupled` of `state0` and the initial values of the states of
-    the torque.
+def with_own_states(body: Body | None, state0: PyTree, torque: PyTree, t: ScalarLike) -> PyTree:
+    """Return the initial state of an integration: `state0` itself, or, if the torque has states of
+    its own (such as the speed of a wheel), a `Coupled` of `state0` and the initial values of the
+    states of the torque.
 
     - `body`: an `Inertia` or `MassProperties`
     - `state0`: a `Spin`, `Attitude` or `Rigid`; a `Coupled` is returned unchanged
     - `torque`: a torque, a force or `None`
     - `t`: s, the time of the start
     """
-    if isinstance(state0, Coupled) or not has_states(torque):
+    if isinstance(state0, Coupled) or not contains_own_states(torque):
         return state0
     return Coupled.start(body, state0, torque, t)
 
 
-def motion_of(y: PyTree) -> Any:
+def motion_of(y: PyTree) -> PyTree:
     """Return the state of motion (a `Spin`, `Attitude` or `Rigid`) in `y`, which is a `Coupled` (a
     state of motion together with the states of the torques), or is a state of motion itself.
     """

@@ -12,7 +12,7 @@ from rigidjax import _checks, _show, _types
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, ScalarLike, Vec3, Vectors
 from rigidjax.body.inertia import Inertia, MassProperties, apply, inverse
 from rigidjax.motion.coupled import Coupled
-from rigidjax.motion.torques.base import Torque, evaluate, force_and_torque, require_law
+from rigidjax.motion.torques.base import Torque, evaluate_torque, force_and_torque, require_torque
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.kernels import squared_quaternion_length
 from rigidjax.rotation.linalg3 import components, cross
@@ -95,9 +95,10 @@ class Rigid(eqx.Module):
 class EulerEquations(eqx.Module):
     """Evaluate Euler's equations `I dΩ/dt = IΩ × Ω + τ` as a vector field `f(t, y, args)`.
 
-    `inertia` is about the point that the body turns about; `torque` τ in the body frame, N m, or
-    `None`. Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau
-    and Lifshitz, Mechanics, eq 36.4. A known rod or point is refused.
+    `inertia` I is about the point that the body turns about; `torque` gives τ, N m, body frame, or
+    is `None`. Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`;
+    Landau and Lifshitz, Mechanics, eq 36.4. **Raises:** `ValueError` for the inertia of a rod or a
+    point, which has no inverse, unless JAX traces it.
     """
 
     inertia: Inertia
@@ -107,9 +108,9 @@ class EulerEquations(eqx.Module):
     def __init__(self, inertia: Inertia, torque: Torque | None = None):
         _checks.require_unbatched_instance(inertia, Inertia, "inertia", hint=_HINT)
         if torque is not None:
-            require_law(torque)
-        # Traced numbers are checked when a motion is computed: during a fit an optimiser may try
-        # numbers that no body has.
+            require_torque(torque)
+        # Numbers that JAX traces are checked only when a motion is computed: during a fit an
+        # optimiser may try numbers that no body has.
         self.inertia = inertia.require_invertible() if _checks.is_known(inertia.tensor) else inertia
         # The inverse is computed once per solve: a division inside the vector field costs 25 times
         # as much as the rest of the field.
@@ -117,9 +118,9 @@ class EulerEquations(eqx.Module):
         self.torque = torque
 
     def __call__(self, t: ScalarLike, y: HasSpin, args: object = None) -> Spin:
-        return Spin(self.rate_of(t, y))
+        return Spin(self.angular_acceleration(t, y))
 
-    def rate_of(self, t: ScalarLike, state: HasSpin) -> Vec3:
+    def angular_acceleration(self, t: ScalarLike, state: HasSpin) -> Vec3:
         """Return dΩ/dt (3,), rad/s², body frame: the derivative of the body rate under the torque
         of the equations.
 
@@ -128,12 +129,12 @@ class EulerEquations(eqx.Module):
         """
         torque = None
         if self.torque is not None:
-            torque = evaluate(self.torque, t, state, self.inertia)
-        return self.rate_under_torque(torque, state)
+            torque = evaluate_torque(self.torque, t, state, self.inertia)
+        return self.angular_acceleration_under(torque, state)
 
-    def rate_under_torque(self, torque: Vec3 | None, state: HasSpin) -> Vec3:
+    def angular_acceleration_under(self, torque: Vec3 | None, state: HasSpin) -> Vec3:
         """Return dΩ/dt = I⁻¹ (IΩ × Ω + τ), (3,), rad/s², body frame: the derivative of the body
-        rate under a known torque.
+        rate under the torque τ, which the caller gives.
 
         - `torque`: τ (3,), N m, body frame, or `None` for no torque
         - `state`: any state with a body rate Ω
@@ -160,7 +161,7 @@ class AttitudeEquations(eqx.Module):
         self.euler = EulerEquations(inertia, torque)
 
     def __call__(self, t: ScalarLike, y: HasAttitude, args: object = None) -> Attitude:
-        return Attitude(quaternion.rate(y.q, y.omega), self.euler.rate_of(t, y))
+        return Attitude(quaternion.rate(y.q, y.omega), self.euler.angular_acceleration(t, y))
 
 
 class NewtonEuler(eqx.Module):
@@ -188,13 +189,13 @@ class NewtonEuler(eqx.Module):
             acceleration = jnp.zeros_like(y.v)
         else:
             acceleration = force / self.body.mass.astype(y.v.dtype)
-        spin = self.euler.rate_under_torque(torque, y)
+        spin = self.euler.angular_acceleration_under(torque, y)
         return Rigid(y.v, acceleration, quaternion.rate(y.q, y.omega), spin)
 
 
 def project_to_group(state: State) -> State:
     """Return the state with its quaternion, if it has one, scaled to length 1; other numbers of the
-    state do not change. **Raises:** `ValueError` if the known quaternion is zero.
+    state do not change. **Raises:** `ValueError` if the quaternion is zero, unless JAX traces it.
 
     - `state`: a `Spin`, `Attitude`, `Rigid` or any other tree of arrays, or a `Coupled`: a state of
       motion together with the states of the torques

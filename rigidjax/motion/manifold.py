@@ -9,7 +9,6 @@ Solà, Deray and Atchuthan 2018, arXiv:1812.01537, right-⊕ and right-⊖.
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +28,7 @@ def dimension(state: PyTree) -> int:
     return max((place.stop for place in _slices_of_leaves(state)), default=0)
 
 
-def names(state: PyTree) -> tuple[str, ...]:
+def leaf_names(state: PyTree) -> tuple[str, ...]:
     """Return the names of the leaves (arrays) of `state`, such as "q" and "omega", in the order in
     which their numbers stand in the vector of a change of the state.
     """
@@ -47,7 +46,7 @@ def parts_by_name(
     - `change`: (..., n), the changes of all leaves one after another, n = `dimension(state)`
     """
     cut = (change[..., place] for place in _slices_of_leaves(state))
-    return dict(zip(names(state), cut, strict=True))
+    return dict(zip(leaf_names(state), cut, strict=True))
 
 
 def rotation_slices(state: PyTree) -> tuple[slice, ...]:
@@ -58,7 +57,7 @@ def rotation_slices(state: PyTree) -> tuple[slice, ...]:
     return tuple(place for place, turned in pairs if turned)
 
 
-def plus(state: PyTree, change: Float[Array, " n"]) -> Any:
+def plus(state: PyTree, change: Float[Array, " n"]) -> PyTree:
     """Return the state after a small change, `state ⊕ change`: q exp(δθ) for a quaternion q, the
     sum for any other leaf (array); exactly `state` if the change is zero.
 
@@ -67,10 +66,10 @@ def plus(state: PyTree, change: Float[Array, " n"]) -> Any:
       vector δθ (3,), rad, body frame
     """
 
-    def rotate(q: Array, part: Array) -> Array:
-        return quaternion.multiply(q, vector_to_quaternion(part))
+    def multiply_by_exp(q: Array, rotation_vector: Array) -> Array:
+        return quaternion.multiply(q, vector_to_quaternion(rotation_vector))
 
-    return _map_leaves(state, change, rotate, jnp.add)
+    return _apply_change_to_leaves(state, change, multiply_by_exp, jnp.add)
 
 
 def minus(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
@@ -95,15 +94,15 @@ def minus_small(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
     - `state`, `reference`: two trees of arrays with one structure
     """
 
-    def turn(q: Array, q0: Array) -> Array:
+    def small_rotation_vector(q: Array, q0: Array) -> Array:
         w, *u = components(quaternion.multiply(quaternion.conjugate(q0), q))
         twice = jnp.where(w < 0, -2.0, 2.0).astype(w.dtype)
         return jnp.stack([twice * part for part in u])
 
-    return _concatenate_over_leaves(state, reference, turn, jnp.subtract)
+    return _concatenate_over_leaves(state, reference, small_rotation_vector, jnp.subtract)
 
 
-def tangent(state: PyTree, change: Float[Array, " n"]) -> Any:
+def vector_to_tangent(state: PyTree, change: Float[Array, " n"]) -> PyTree:
     """Return the derivative of `plus(state, s change)` with respect to s at s = 0: a tree like
     `state`, which JAX takes as a tangent.
 
@@ -111,11 +110,12 @@ def tangent(state: PyTree, change: Float[Array, " n"]) -> Any:
     - `change`: (n,), the changes of all leaves one after another; for a quaternion, a rotation
       vector (3,), body frame
     """
-    return _map_leaves(state, change, quaternion.rate, lambda _, part: part)
+    return _apply_change_to_leaves(state, change, quaternion.rate, lambda _, part: part)
 
 
 def tangent_to_vector(state: PyTree, tangent_vector: PyTree) -> Float[Array, " n"]:
-    """Return the vector (n,) of the change whose tangent is given: the inverse of `tangent`.
+    """Return the vector (n,) of the change of `state` whose tangent is `tangent_vector`: the
+    inverse of `vector_to_tangent`.
 
     - `state`: a tree of arrays
     - `tangent_vector`: a tree like `state`, with the derivative of each leaf; dq (4,) for a
@@ -155,12 +155,12 @@ def _slices_of_leaves(state: PyTree) -> list[slice]:
     return out
 
 
-def _map_leaves(
+def _apply_change_to_leaves(
     state: PyTree,
     change: Array,
     of_quaternion: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
-) -> Any:
+) -> PyTree:
     """Return a state after a change, computed leaf by leaf: one function changes quaternions,
     another function changes all other arrays.
 

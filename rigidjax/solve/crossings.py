@@ -43,7 +43,7 @@ from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, with_own_states
 from rigidjax.motion.equations import project_to_group
-from rigidjax.motion.torques.base import missing_state_message
+from rigidjax.motion.torques.base import missing_state_part_message
 from rigidjax.solve import crossing_loop, validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
 from rigidjax.solve.adaptive_loop import result_of_body
@@ -245,7 +245,7 @@ def start_with_checked_condition(
     try:
         eqx.filter_eval_shape(value, event, body, t, state0)
     except AttributeError as wrong:
-        told = missing_state_message("condition", wrong)
+        told = missing_state_part_message("condition", wrong)
         if told is None:
             raise
         raise TypeError(told) from wrong

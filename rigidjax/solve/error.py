@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from rigidjax import _checks, _show
 from rigidjax._types import ScalarLike
-from rigidjax.motion.manifold import minus, names, parts_by_name
+from rigidjax.motion.manifold import leaf_names, minus, parts_by_name
 from rigidjax.solve import difference, validation
 from rigidjax.solve.linear_map import as_known
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
@@ -421,7 +421,7 @@ def _scales_by_name(ys: Any) -> dict[str, Array]:
     run.
     """
     sizes = {}
-    for name, leaf in zip(names(ys), jax.tree.leaves(ys), strict=True):
+    for name, leaf in zip(leaf_names(ys), jax.tree.leaves(ys), strict=True):
         name = name.removeprefix("motion.")
         most = largest_in_run(leaf)
         sizes[name] = jnp.ones_like(most) if name == "q" else jnp.maximum(most, _SMALL)

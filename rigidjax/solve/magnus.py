@@ -17,7 +17,7 @@ from rigidjax.exact.components3 import Four, Triple, add, cross
 from rigidjax.exact.diffrax_solver import field_of
 from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations, project_to_group
-from rigidjax.motion.torques.base import sees_attitude
+from rigidjax.motion.torques.base import may_read_attitude
 from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import quaternion_product
 from rigidjax.solve.components import join, split
@@ -162,7 +162,7 @@ def require_blind(law: Any) -> None:
 
     `law` is the torque; it says so by its member `feels`. `None` stands for no torque.
     """
-    if sees_attitude(law):
+    if may_read_attitude(law):
         raise TypeError(
             f"Magnus4: the torque {type(law).__name__} depends on the attitude, or does not say "
             "what it feels; only time and body rate may enter it: a law of your own says so by "

@@ -23,7 +23,7 @@ from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonE
 from rigidjax.motion.torques import ChangingInertia, Sum
 from rigidjax.motion.torques.base import in_precision
 from rigidjax.motion.torques.composite import parts_of, tensor_or_nan
-from rigidjax.motion.torques.states import freeze
+from rigidjax.motion.torques.states import freeze_own_states
 from rigidjax.rotation.linalg3 import apply, solve
 
 
@@ -88,7 +88,11 @@ class ByMomentum(eqx.Module):
         motion, own = motion_of(y), y.own if isinstance(y, Coupled) else ()
         dtype = motion.omega.dtype
         inner: Any = self.field.field if isinstance(self.field, CoupledEquations) else self.field
-        now = freeze(inner.law, own).tensor(jnp.asarray(t, dtype)) if own else inner.law.tensor(t)
+        now = (
+            freeze_own_states(inner.law, own).tensor(jnp.asarray(t, dtype))
+            if own
+            else inner.law.tensor(t)
+        )
         fixed = tensor_of(inner.body).astype(dtype)
         omega = new_rate(now.astype(dtype), fixed, motion.omega)
         return eqx.tree_at(lambda s: motion_of(s).omega, y, omega)

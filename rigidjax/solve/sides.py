@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.motion.torques.base import jumps_of, require_one_law
+from rigidjax.motion.torques.base import jump_times_of, require_unbatched_torque
 from rigidjax.motion.torques.inputs import Delayed, Lagged
 from rigidjax.motion.torques.piecewise import Held, Linear, Pulses, Tabulated
 from rigidjax.motion.torques.states import has_own_states
@@ -55,7 +55,7 @@ class Sided(eqx.Module):
         return type(self.law).__name__
 
     def __call__(self, t: Any, *args: Any) -> Any:
-        require_one_law(self.law)
+        require_unbatched_torque(self.law)
         with jax.named_scope(DECLARED):
             return self.law(self.seen(t), *args)
 
@@ -123,7 +123,7 @@ def _declares_jumps(node: Any) -> bool:
     if isinstance(node, type) or not hasattr(node, "jump_times"):
         return False
     if type(node).__module__.startswith("rigidjax."):
-        return isinstance(node, _OWN) and jumps_of(node).shape[0] > 0
+        return isinstance(node, _OWN) and jump_times_of(node).shape[0] > 0
     return True
 
 
@@ -133,7 +133,7 @@ def declared_jumps(field: Any) -> list[Array]:
     `field` is the vector field, a tree of which these parts are torque laws or functions of time.
     """
     parts = filter(_declares_jumps, jax.tree.leaves(field, is_leaf=_declares_jumps))
-    return [jumps for part in parts if (jumps := jnp.asarray(jumps_of(part))).shape[0]]
+    return [jumps for part in parts if (jumps := jnp.asarray(jump_times_of(part))).shape[0]]
 
 
 def on_sides(field: Any, sign: Any, sides: Any) -> Any:
@@ -149,7 +149,7 @@ def on_sides(field: Any, sign: Any, sides: Any) -> Any:
     def on_side(part: Any) -> Any:
         if not _declares_jumps(part):
             return part
-        jumps = jnp.asarray(jumps_of(part))
+        jumps = jnp.asarray(jump_times_of(part))
         own = next(stops, None) if jumps.shape[0] else None
         # A law with states of its own has kinks but no jumps, and later code looks for its class.
         # It is therefore not wrapped.

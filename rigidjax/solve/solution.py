@@ -18,7 +18,7 @@ from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.conserved import drift
 from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.manifold import dimension, minus_small, parts_by_name, plus, rotation_slices
-from rigidjax.motion.torques.states import require_stateless
+from rigidjax.motion.torques.states import require_no_own_states
 from rigidjax.solve.error import Error, estimate_error_of_run, largest_in_run
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, solve
 
@@ -163,7 +163,7 @@ class Solution(eqx.Module, Generic[State]):
         >>> rj.simulate(body, start, [0.0, 2.0]).transition_matrix()[1, 2].tolist()
         [0.0, 0.0, 1.0]
         """
-        require_stateless(self._setup.torque, "transition_matrix")
+        require_no_own_states(self._setup.torque, "transition_matrix")
         return _transition_matrix(self._setup, self.ts, self.ys)
 
     def evaluate(self, t: ScalarLike) -> State:

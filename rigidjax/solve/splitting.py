@@ -31,7 +31,7 @@ from rigidjax.exact.diffrax_solver import field_of
 from rigidjax.exact.principal_axes import combine_columns, components_along, principal_frame
 from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations
-from rigidjax.motion.torques.base import evaluate, sees_rate
+from rigidjax.motion.torques.base import evaluate_torque, may_read_rate
 from rigidjax.rotation import quaternion
 from rigidjax.solve.explicit import NestedInterpolation, cubic_rows, direction_and_length
 from rigidjax.solve.magnus import require_attitude
@@ -243,7 +243,7 @@ def frame_of(field: Any, y0: Any) -> Frame:
     """
     # If the torque reads the body rate, a kick is no exact flow, and the order would fall to 1.
     torque = require_attitude("Splitting", field, y0, "DormandPrince8").euler.torque
-    if sees_rate(torque):
+    if may_read_rate(torque):
         raise TypeError(
             f"Splitting: the torque {type(torque).__name__} depends on the body rate (damping, a "
             "flywheel), or does not say that it does not; only time and attitude may enter a kick: "
@@ -296,7 +296,7 @@ def compose(
         # rate.
         at = Attitude(q, jnp.full(3, jnp.nan, dtype))
         torque = components_along(
-            frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia)
+            frame.axes, evaluate_torque(field.euler.torque, t, at, field.euler.inertia)
         )
         return add(change, tuple(weight * a for a in torque))
 

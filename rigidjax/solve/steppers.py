@@ -23,7 +23,7 @@ from rigidjax.exact.principal_axes import combine_columns
 from rigidjax.motion import Attitude, Spin
 from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.equations import AttitudeEquations, EulerEquations
-from rigidjax.motion.torques.base import evaluate, sees_attitude
+from rigidjax.motion.torques.base import evaluate_torque, may_read_attitude
 from rigidjax.motion.torques.inputs import bind, delays_of
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.barrier import barrier
@@ -115,7 +115,7 @@ def cheapest(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
     `RungeKutta4`.
     """
     attitude = isinstance(field, AttitudeEquations)
-    blind = attitude and not sees_attitude(field.euler.torque)
+    blind = attitude and not may_read_attitude(field.euler.torque)
     return Magnus4() if blind else RungeKutta4()
 
 
@@ -256,7 +256,7 @@ def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
         def slope(t: Any, p: Triple) -> Triple:
             omega = barrier(rate(p))
             # The torque gets a `Spin`, a state without an attitude.
-            value = evaluate(law, t, Spin(jnp.stack(omega)), body)
+            value = evaluate_torque(law, t, Spin(jnp.stack(omega)), body)
             return add(cross(p, omega), split(value))
 
         dp, turn = change_and_turn(slope, rate, t, end, h, y[4:])
@@ -294,7 +294,7 @@ def _stepper_of_explicit_method(
             omega = barrier(matvec(weights, p))
             pushed = cross(p, omega)
             if law is not None:
-                value = evaluate(law, t, join((*q, *omega), state0), body)
+                value = evaluate_torque(law, t, join((*q, *omega), state0), body)
                 pushed = add(pushed, split(value))
             return (*half_product(q, omega), *pushed) if many else pushed
 

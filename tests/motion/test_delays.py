@@ -165,7 +165,7 @@ def test_linear_of_any_number_of_channels_under_jit_and_vmap():
 @pytest.mark.parametrize(
     ("call", "kind", "words"),
     [
-        (lambda: torques.Delayed(torques.Held([0.0, 1.0], [1.0, 2.0]), 1.0), ValueError, "delay: 1 s is as long as the record of 1 s"),
+        (lambda: torques.Delayed(torques.Held([0.0, 1.0], [1.0, 2.0]), 1.0), ValueError, "delay: wanted less than the 1 s of the record of the source, got 1"),
         (lambda: torques.Delayed(torques.InSpace(torques.Input("u")), 0.1), TypeError, "delay the Input itself"),
         (lambda: torques.Delayed(torques.Input("u"), np.nan), ValueError, "delay: contains NaN"),
         (lambda: rj.batch.rollout(BODY, spins(2), H, STEPS, Turn(torques.Delayed(torques.Input("u"), 0.7)), inputs={"u": ROWS}), ValueError, r"inputs\['u'\]: its delay of 0\.7 s is not shorter than the run of 0\.6 s"),

@@ -52,7 +52,7 @@ def test_of_point_masses_the_rest_is_the_next_degree(highest):
         away = np.linalg.norm(here - POINTS, axis=1)
         torque = 2.0 * np.sum(MASSES[:, None] * np.cross(POINTS, here) / away[:, None] ** 3, axis=0)
         potential = 2.0 * np.sum(MASSES * (1 / r - 1 / away))
-        found = base.evaluate(law, 0.0, STATE, BODY)
+        found = base.evaluate_torque(law, 0.0, STATE, BODY)
         energy = law.energy(0.0, STATE, BODY)
         wrong.append((np.linalg.norm(found - torque), abs(energy - potential)))
     # Twice as far: 2^(n + 1) times less of degree n, the first that is left out; two degrees mix.
@@ -77,7 +77,7 @@ def test_torque_potential_and_what_is_conserved():
         return LAW.energy(0.0, rj.Attitude(q, STATE.omega), BODY)
 
     slope = jax.grad(moved)(jnp.zeros(3))
-    np.testing.assert_allclose(base.evaluate(LAW, 0.0, STATE, BODY), -slope, rtol=1e-12)
+    np.testing.assert_allclose(base.evaluate_torque(LAW, 0.0, STATE, BODY), -slope, rtol=1e-12)
     _, rates = jax.jvp(
         lambda y: conserved(BODY, y, LAW), (STATE,), (AttitudeEquations(BODY, LAW)(0.0, STATE),)
     )
@@ -94,7 +94,7 @@ def test_derivatives_by_every_number_and_no_matrix_product(law):
         law, state, body = restore(numbers)
         # No body has a tensor that is not symmetric: with one, the torque is NaN.
         body = rj.Inertia(0.5 * (body.tensor + body.tensor.T))
-        return base.evaluate(law, 0.3, state, body)
+        return base.evaluate_torque(law, 0.3, state, body)
 
     check_grads(jax.jit(value), (numbers,), order=1, modes=["fwd"], eps=1e-6, rtol=1e-6, atol=1e-6)
     forward, reverse = (jax.jit(mode(value))(numbers) for mode in (jax.jacfwd, jax.jacrev))

@@ -16,7 +16,7 @@ from rigidjax import torques
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques import base
-from rigidjax.motion.torques.states import freeze
+from rigidjax.motion.torques.states import freeze_own_states
 
 LOCKED = rj.Inertia(np.array([[3.0, 0.1, -0.2], [0.1, 2.5, 0.3], [-0.2, 0.3, 2.0]]))
 AXES = np.array([[1.0, 0, 0], [0, 0.6, 0.8], [0, 0, 1.0]])
@@ -331,10 +331,10 @@ def made(**change):
         (lambda: rj.simulate(BODY, START, TS, Wrong("no")), TypeError, "state0 of Wrong: wanted an array"),
         (lambda: rj.simulate(BODY, START, TS, Wrong(())), ValueError, "state0 of Wrong: wanted a tree of arrays, got none"),
         (lambda: WHEELS(0.0, START, BODY), TypeError, "own"),
-        (lambda: base.evaluate(WHEELS, 0.0, START, BODY), TypeError, r"ReactionWheels has states of its own.*its states last"),
+        (lambda: base.evaluate_torque(WHEELS, 0.0, START, BODY), TypeError, r"ReactionWheels has states of its own.*its states last"),
         (lambda: rj.conserved(BODY, START, WHEELS), TypeError, "has states of its own"),
-        (lambda: freeze(WHEELS, ()), ValueError, "own: no states for ReactionWheels"),
-        (lambda: freeze(WHEELS, (1.0, 2.0)), ValueError, "own: the torque has 1 with states, got 2"),
+        (lambda: freeze_own_states(WHEELS, ()), ValueError, "own: wanted the states .* got no states for ReactionWheels"),
+        (lambda: freeze_own_states(WHEELS, (1.0, 2.0)), ValueError, "own: wanted one tree .* of the 1 parts .* got 2"),
         (lambda: torques.Flywheel(torques.Lagged(lambda t: jnp.ones(3), 1.0)), TypeError, "see ReactionWheels"),
         (lambda: torques.Lagged(1.0, 1.0), TypeError, "source: wanted a function of time"),
         (lambda: torques.Lagged(lambda t: t, 0.0), ValueError, "time: wanted a positive time"),

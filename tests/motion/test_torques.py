@@ -15,7 +15,7 @@ from rigidjax.motion import HasPose
 from rigidjax.motion.conserved import conserved, drift, energy
 from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
 from rigidjax.motion.torques import base
-from rigidjax.motion.torques.base import jumps_of
+from rigidjax.motion.torques.base import jump_times_of
 
 TENSOR = np.array([[1.0, 0.1, -0.05], [0.1, 1.6, 0.2], [-0.05, 0.2, 2.1]])
 INERTIA = rj.Inertia(TENSOR)
@@ -95,14 +95,16 @@ def _drag_by_hand():
 )  # fmt: skip
 def test_values_by_hand(law, state, wanted):
     base.require_state_type(law, state)
-    found = base.evaluate(law, 0.5, state, INERTIA)
+    found = base.evaluate_torque(law, 0.5, state, INERTIA)
     np.testing.assert_allclose(found, wanted, rtol=1e-14, atol=1e-15)
 
 
 def test_a_gravity_gradient_follows_its_orbit():
     moving, still = torques.GravityGradient(5.0, ORBIT), torques.GravityGradient(5.0, ORBIT(0.5))
-    found = base.evaluate(moving, 0.5, ATTITUDE, INERTIA)
-    np.testing.assert_allclose(found, base.evaluate(still, 0.5, ATTITUDE, INERTIA), rtol=1e-14)
+    found = base.evaluate_torque(moving, 0.5, ATTITUDE, INERTIA)
+    np.testing.assert_allclose(
+        found, base.evaluate_torque(still, 0.5, ATTITUDE, INERTIA), rtol=1e-14
+    )
     assert moving.axis is None and not moving.steady and still.steady
 
 
@@ -262,7 +264,7 @@ def test_derivatives_of_first_and_second_order(law, state):
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_at_rest_the_first_derivative_of_quadratic_laws_is_zero_not_nan(mode):
     law = torques.QuadraticDamping([0.3, 0.1, 0.2])
-    at_rest = mode(lambda w: base.evaluate(law, 0.0, rj.Spin(w), INERTIA))(jnp.zeros(3))
+    at_rest = mode(lambda w: base.evaluate_torque(law, 0.0, rj.Spin(w), INERTIA))(jnp.zeros(3))
     np.testing.assert_array_equal(at_rest, np.zeros((3, 3)))
     drag = torques.Drag(0.5, [0.1, 0.2, 0.3])
 
@@ -324,7 +326,7 @@ def test_jump_times_reach_the_front_door():
         torques.Damping([1.0, 1, 1]),
     )
     np.testing.assert_array_equal(law.jump_times, [0.0, 0.0, 1.0, 1.0, 2.0, 2.5, 3.0])
-    assert jumps_of(TOP).shape == (0,) and jumps_of(None).shape == (0,)
+    assert jump_times_of(TOP).shape == (0,) and jump_times_of(None).shape == (0,)
     assert torques.Sum(TOP, WHEEL).jump_times.shape == (0,)
 
 
@@ -372,7 +374,7 @@ def test_energy_adds_up():
         (lambda: torques.Sum([TOP, WHEEL]), r"got list; several go in a Sum: Sum\(a, b\)"),
         (lambda: torques.Sum(TOP, torques.Damping), r"wanted an object, got the class Damping; make Damping\(\.\.\.\)"),
         (lambda: base.require_state_type([TOP], ATTITUDE), r"torque: wanted a torque.*got list"),
-        (lambda: base.require_law([0.0, 0.0, 1.0]), r"got list; a constant one is ConstantTorque\(\["),
+        (lambda: base.require_torque([0.0, 0.0, 1.0]), r"got list; a constant one is ConstantTorque\(\["),
         (lambda: base.require_state_type(torques.Damping, SPIN), "torque: wanted an object, got the class Damping"),
         (lambda: torques.Damping([1.0, np.nan, 1.0]), "coefficient: contains NaN"),
         (lambda: torques.GravityGradient(1.0, np.zeros(3)), "position: .*got zero"),
@@ -381,8 +383,8 @@ def test_energy_adds_up():
         (lambda: base.require_state_type(torques.Sum(WHEEL, TOP), SPIN), "Sum needs.*HasAttitude"),
         (lambda: base.require_state_type(FALL, ATTITUDE), "UniformGravity needs a state with HasPose"),
         (lambda: NewtonEuler(BODY, TOP)(0.0, RIGID), "fixed point.*use UniformGravity"),
-        (lambda: base.evaluate(lambda t, s, b: torques.Wrench([0.0, 0, 1]), 0.0, SPIN, INERTIA), "wanted a Rigid state"),
-        (lambda: base.evaluate(lambda t, s, b: s.omega[:2], 0.0, SPIN, INERTIA), "body-frame N m"),
+        (lambda: base.evaluate_torque(lambda t, s, b: torques.Wrench([0.0, 0, 1]), 0.0, SPIN, INERTIA), "wanted a Rigid state"),
+        (lambda: base.evaluate_torque(lambda t, s, b: s.omega[:2], 0.0, SPIN, INERTIA), "body-frame N m"),
         (lambda: energy(INERTIA, SPIN, torques.Damping([1.0, 1, 1])), "wanted torques with a potential, got Damping"),
         (lambda: EulerEquations(rj.Inertia.from_principal(1.0, 1.0, 0.0)), "a principal moment is zero.*rod"),
         (lambda: NewtonEuler(rj.MassProperties(1.0, np.zeros(3), np.diag([0.0, 0, 1.0]))), "moment is zero"),

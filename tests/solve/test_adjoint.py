@@ -10,7 +10,7 @@ from once import once
 
 import rigidjax as rj
 from rigidjax.motion.equations import AttitudeEquations
-from rigidjax.motion.torques.base import jumps_of
+from rigidjax.motion.torques.base import jump_times_of
 from rigidjax.solve import adaptive, adaptive_loop, adjoint, batching
 
 Q = np.array([0.8, -0.2, 0.4, 0.4]) / np.linalg.norm([0.8, -0.2, 0.4, 0.4])
@@ -47,7 +47,7 @@ def run(name, ts, p, weights, max_steps=100_000):
     torque = scenes(law)[name]
     field = AttitudeEquations(rj.Inertia(tensor), torque)
     y0 = rj.Attitude(jnp.asarray(Q) + start[:4], jnp.array([1.3, 0.7, -1.6]) + start[4:])
-    jumps = jumps_of(torque)
+    jumps = jump_times_of(torque)
     out = adaptive(
         rj.solvers.DormandPrince8(), field, ts, y0, rtol=1e-10, atol=1e-12, jumps=jumps,
         max_steps=max_steps,
@@ -202,7 +202,7 @@ def test_more_times_in_a_step_than_it_looks_at(monkeypatch):
         y0 = rj.Attitude(jnp.asarray(Q) + p[9:13], jnp.array([1.3, 0.7, -1.6]) + p[13:])
         out = adaptive(
             rj.solvers.DormandPrince8(), field, ts, y0, rtol=1e-4, atol=1e-6,
-            jumps=jumps_of(torque), max_steps=300,
+            jumps=jump_times_of(torque), max_steps=300,
         )  # fmt: skip
         return (weights * jnp.sin(jnp.concatenate([out.ys.q, out.ys.omega], 1))).sum(), out
 

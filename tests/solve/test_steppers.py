@@ -9,7 +9,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax.motion.equations import AttitudeEquations
-from rigidjax.motion.torques.base import sees_attitude, sees_rate
+from rigidjax.motion.torques.base import may_read_attitude, may_read_rate
 from rigidjax.solve import components, explicit, fixed
 from rigidjax.solve.equal_steps import roll_steps
 from rigidjax.solve.steppers import stepper_of
@@ -62,8 +62,8 @@ class SaysRateFree(rj.torques.AbstractTorque):
     ids=lambda law: type(law).__name__,
 )
 def test_a_law_says_what_it_looks_at(law, attitude, rate):
-    assert sees_attitude(law) is attitude
-    assert sees_rate(law) is rate
+    assert may_read_attitude(law) is attitude
+    assert may_read_rate(law) is rate
 
 
 @pytest.mark.parametrize("law", [Unsaid(), rj.torques.Sum(PUSH, Unsaid())], ids=["one", "sum"])

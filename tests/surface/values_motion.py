@@ -20,7 +20,7 @@ from rigidjax.motion.equations import (
     NewtonEuler,
     project_to_group,
 )
-from rigidjax.motion.torques.states import freeze
+from rigidjax.motion.torques.states import freeze_own_states
 from rigidjax.rotation import quaternion as q4
 
 STATE = (v.vector, v.vector, v.quaternion, v.vector)
@@ -292,7 +292,7 @@ way(
     lambda u, big, y, t: (
         laws.Lagged(Quadratic(u), big).rate(t, y, None, None),
         laws.Lagged(Quadratic(u), big).state0(t, None, None),
-        freeze(laws.Lagged(Quadratic(u), big), (y,))(t),
+        freeze_own_states(laws.Lagged(Quadratic(u), big), (y,))(t),
     ),
     (scale(-5, 5), scale(-5, 5), scale(-5, 5), between(-3, 3)), lag,
 )  # fmt: skip
@@ -428,8 +428,8 @@ way(
     "equations_of_motion Spin Attitude",
     lambda i, c, q, w: (
         EulerEquations(rj.Inertia(i), laws.ConstantTorque(c))(0.0, rj.Spin(w)),
-        EulerEquations(rj.Inertia(i), laws.ConstantTorque(c)).rate_of(0.0, rj.Spin(w)),
-        EulerEquations(rj.Inertia(i)).rate_under_torque(c, rj.Spin(w)),
+        EulerEquations(rj.Inertia(i), laws.ConstantTorque(c)).angular_acceleration(0.0, rj.Spin(w)),
+        EulerEquations(rj.Inertia(i)).angular_acceleration_under(c, rj.Spin(w)),
         AttitudeEquations(rj.Inertia(i), laws.InSpace(c))(0.0, rj.Attitude(q, w)),
         rj.equations_of_motion(rj.Inertia(i), rj.Attitude(q, w), laws.InSpace(c))(
             0.0, rj.Attitude(q, w), None),

@@ -25,7 +25,7 @@ from rigidjax.identify.sensors import (
     Velocity,
 )
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.manifold import names, plus
+from rigidjax.motion.manifold import leaf_names, plus
 from rigidjax.rotation import quaternion, so3
 from rigidjax.rotation.fitting import nearest_rotation
 
@@ -186,7 +186,7 @@ def reference_of(recordings: Sequence[Recording], state_type: type) -> Reference
     typical = jnp.asarray([_typical_rate(r) for r in recordings], dtype)
     sizes = {"x": length, "v": length * typical, "q": jnp.ones_like(typical), "omega": typical}
     state = states[state_type]
-    units = [sizes[name] for name in names(state)]
+    units = [sizes[name] for name in leaf_names(state)]
     return ReferenceStates(state, typical, jnp.repeat(jnp.stack(units, -1), 3, -1))
 
 

@@ -20,7 +20,7 @@ from rigidjax.identify.data.recording import Reading, Recording, recording_of
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.sensors.states import StateSensor
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.manifold import minus_small, names, parts_by_name
+from rigidjax.motion.manifold import leaf_names, minus_small, parts_by_name
 from rigidjax.motion.torques.inputs import delays_of
 
 
@@ -125,7 +125,7 @@ class Windows(eqx.Module):
         each part of the state, of a prediction that the state stays constant in each window.
         """
         if self.noise is not None:
-            return jnp.asarray(np.repeat([self.noise[kind] for kind in names(self.starts)], 3))
+            return jnp.asarray(np.repeat([self.noise[kind] for kind in leaf_names(self.starts)], 3))
         squares = np.mean(np.asarray(held_errors(self.starts, self.wanted)) ** 2, (0, 1))
         each = np.sqrt(np.mean(squares.reshape(-1, 3), 1))
         return jnp.asarray(np.repeat(np.where(each == 0, 1.0, each), 3))
@@ -265,7 +265,7 @@ def windows(
     kind = jnp.result_type(float)
     arrays = jax.tree.map(lambda a: np.asarray(a, kind), states)
     samples = {k: np.asarray(v, kind) for k, v in inputs.items()}
-    kinds = names(states)
+    kinds = leaf_names(states)
     if noise is not None:
         noise = _checked_by_kind(noise, kinds, "noise", _checks.positive_float)
     if starts is not None:
@@ -331,7 +331,7 @@ def _require_finite_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str,
     - `states`: a `Spin`, `Attitude` or `Rigid` with a leading axis (T,).
     - `inputs`: a dict of name → samples (T, *k), each sample an array of shape k.
     """
-    rows = dict(zip(names(states), jax.tree.leaves(states), strict=True))
+    rows = dict(zip(leaf_names(states), jax.tree.leaves(states), strict=True))
     rows |= {f"inputs[{k!r}]": v for k, v in inputs.items()}
     for name, value in rows.items():
         if np.shape(value)[:1] != times.shape:
@@ -440,6 +440,6 @@ def starts_of_windows(
     clusters = jnp.asarray(np.arange(count) * min(stretches, count) // count, jnp.int32)
     weight = None
     if windows.start_deviation is not None:
-        wide = np.repeat([windows.start_deviation[kind] for kind in names(windows.starts)], 3)
+        wide = np.repeat([windows.start_deviation[kind] for kind in leaf_names(windows.starts)], 3)
         weight = jnp.asarray(np.broadcast_to(scales / wide, units.shape).astype(dtype))
     return ReferenceStates(windows.starts, rate, units), weight, clusters

@@ -31,7 +31,7 @@ from rigidjax.identify.model.terms import scene_from_row, torque_of_scene
 from rigidjax.identify.model.walks import Drift, broadcast_to_shape, drifting_values
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import project_to_group
-from rigidjax.motion.manifold import names, plus
+from rigidjax.motion.manifold import leaf_names, plus
 
 
 class Belief(eqx.Module):
@@ -129,7 +129,7 @@ def first_belief(
     start = project_to_group(start)
     deviations = {"attitude": attitude, "rate": rate, "position": position, "velocity": velocity}
     words = {"x": "position", "v": "velocity", "q": "attitude", "omega": "rate"}
-    kind, wanted = type(start).__name__, [words[part] for part in names(start)]
+    kind, wanted = type(start).__name__, [words[part] for part in leaf_names(start)]
     for name, value in deviations.items():
         if name not in wanted and value is not None:
             raise ValueError(f"{name}: a {kind} has none; leave it out")

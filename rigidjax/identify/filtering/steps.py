@@ -31,9 +31,14 @@ from rigidjax.identify.model.walks import Drift
 from rigidjax.identify.sensors import AbstractSensor, Gyro, SensorInput
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import project_to_group
-from rigidjax.motion.manifold import dimension, rotation_slices, tangent, tangent_to_vector
+from rigidjax.motion.manifold import (
+    dimension,
+    rotation_slices,
+    tangent_to_vector,
+    vector_to_tangent,
+)
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
-from rigidjax.motion.torques.base import Torque, in_precision, require_law, tensor_of
+from rigidjax.motion.torques.base import Torque, in_precision, require_torque, tensor_of
 from rigidjax.motion.torques.composite import parts_of
 from rigidjax.rotation.kernels import to_unit_length
 from rigidjax.rotation.linalg3 import cross
@@ -180,7 +185,7 @@ class Dynamics(eqx.Module):
         still = tuple(jnp.zeros_like(w) for w in x.walks)
 
         def column(unit: Array) -> Array:
-            along = tangent(moving, unit[:size])
+            along = vector_to_tangent(moving, unit[:size])
             moved = push(ExtendedState(along.motion, along.torques, still), unit[size:])
             return tangent_to_vector(after, moved)[:size]
 
@@ -289,7 +294,7 @@ def linearise_readings(
     """
     dtype = x.motion.omega.dtype
     t = stop.t.astype(dtype)
-    basis = jax.vmap(lambda e: tangent(x, e))(jnp.eye(dimension(x), dtype=dtype))
+    basis = jax.vmap(lambda e: vector_to_tangent(x, e))(jnp.eye(dimension(x), dtype=dtype))
     out = []
     for index, (value, mask) in enumerate(zip(stop.values, stop.masks, strict=True)):
         sensor = in_precision(dynamics.scene.sensors[index], dtype)
@@ -442,7 +447,7 @@ def sample(
     )
     require_process(process)
     if torque is not None:
-        require_law(torque)
+        require_torque(torque)
     require_known_torque(torque)
     times = _checks.array_of_rows(ts, (), "ts")
     if times.shape[0] < 2:

@@ -52,9 +52,9 @@ from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.manifold import dimension
-from rigidjax.motion.torques.base import AbstractForce, Torque, require_law
+from rigidjax.motion.torques.base import AbstractForce, Torque, require_torque
 from rigidjax.motion.torques.composite import parts_of
-from rigidjax.motion.torques.inputs import delays_of, inputs_of
+from rigidjax.motion.torques.inputs import delays_of, input_names_of
 
 # In one step of the filter the body turns by at most this angle, rad. For this angle the error of
 # the classical Runge–Kutta method of order 4 is 5e-8 of the angle.
@@ -205,7 +205,7 @@ class Model(eqx.Module):
         free = (free,) if isinstance(free, str) else free  # pyright: ignore[reportAssignmentType]
         _require_argument_types(charts, free, loss, prior, integrator)
         if torque is not None:
-            require_law(torque)
+            require_torque(torque)
             require_known_torque(torque)
         if process is not None:
             require_process(process)
@@ -719,7 +719,7 @@ def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) 
     - `inputs`: for each recording a dict of name → samples or function of time.
     """
     for number, of_one in enumerate(inputs):
-        missing = [name for name in inputs_of(torque) if name not in of_one]
+        missing = [name for name in input_names_of(torque) if name not in of_one]
         if missing:
             raise ValueError(
                 f"torque: it reads {', '.join(map(repr, missing))}, and recording {number} has "
@@ -734,7 +734,7 @@ def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
 
     An input is a logged quantity such as a motor command. The `torque` may be `None`.
     """
-    missing = [name for name in inputs_of(torque) if name not in windows.inputs]
+    missing = [name for name in input_names_of(torque) if name not in windows.inputs]
     if missing:
         have = ", ".join(map(repr, windows.inputs)) or "none"
         raise ValueError(
@@ -777,7 +777,7 @@ def _sampled_inputs_read(torque: Torque | None, recording: Recording) -> list[st
 
     No name is returned if the `torque` is `None`.
     """
-    return [name for name in inputs_of(torque) if not callable(recording.inputs[name])]
+    return [name for name in input_names_of(torque) if not callable(recording.inputs[name])]
 
 
 def _require_even_times(torque: Torque | None, recording: Recording, number: int) -> None:

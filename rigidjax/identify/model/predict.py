@@ -24,7 +24,7 @@ from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, CoupledEquations, with_own_states
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import bind
-from rigidjax.motion.torques.states import freeze
+from rigidjax.motion.torques.states import freeze_own_states
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
 from rigidjax.solve.components import split
 from rigidjax.solve.equal_steps import advance, roll_steps
@@ -330,7 +330,7 @@ def sensor_inputs(
     def input_at(t: Array, state: PyTree) -> SensorInput:
         if not isinstance(state, Coupled):
             return SensorInput(t, state, body, field)
-        return SensorInput(t, state.motion, body, freeze(field, state.own), state.own)
+        return SensorInput(t, state.motion, body, freeze_own_states(field, state.own), state.own)
 
     return times, states, input_at
 

@@ -16,9 +16,9 @@ from rigidjax.identify.data.reference_states import rates
 from rigidjax.identify.model.charts import BASIS, Bodies
 from rigidjax.identify.model.model import Model
 from rigidjax.motion import Spin
-from rigidjax.motion.torques.base import Torque, evaluate
+from rigidjax.motion.torques.base import Torque, evaluate_torque
 from rigidjax.motion.torques.inputs import bind
-from rigidjax.motion.torques.states import has_states
+from rigidjax.motion.torques.states import contains_own_states
 
 
 def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[Float[Array, " n"]]:
@@ -114,7 +114,9 @@ def depends_on_rate_only(torque: Torque | None) -> bool:
     """Return whether a `torque` depends on time and body rate alone, and has no states of its own;
     true for `None`.
     """
-    return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
+    return torque is None or (
+        getattr(torque, "feels", None) is HasSpin and not contains_own_states(torque)
+    )
 
 
 def balance_of_momentum(
@@ -159,4 +161,4 @@ def _torques_at(torque: Torque, t: ArrayLike, w: ArrayLike) -> Array:
     inertia takes its place.
     """
     body = Inertia(jnp.eye(3))
-    return jax.vmap(lambda time, omega: evaluate(torque, time, Spin(omega), body))(t, w)
+    return jax.vmap(lambda time, omega: evaluate_torque(torque, time, Spin(omega), body))(t, w)

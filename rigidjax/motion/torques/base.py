@@ -24,7 +24,7 @@ from rigidjax._types import (
     Vector,
 )
 from rigidjax.body.inertia import Body, Inertia, MassProperties, tensor_of as tensor_of
-from rigidjax.motion.torques.states import FrozenLaw, require_frozen
+from rigidjax.motion.torques.states import FrozenLaw, require_frozen_states
 
 
 class Wrench(eqx.Module):
@@ -107,27 +107,35 @@ class AbstractTimeTorque(AbstractTorque):
 
     @property
     def steady(self) -> bool:
-        """Return whether no vector is a function of time."""
+        """Return whether the torque is the same at all times: none of the vectors in its fields is
+        a function of time.
+        """
         return not any(callable(part) for part in vars(self).values())
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times, s, at which a vector jumps or has a kink."""
-        return jumps_of_parts(self)
+        """Return the times (n,), s, at which a vector in a field of the torque jumps or has a kink,
+        in ascending order.
+        """
+        return jump_times_of_fields(self)
 
 
-# A user's own callable Module need not subclass anything.
+# Any callable is a torque: a user's own Module need not subclass anything.
 Torque = AbstractTorque | AbstractForce | Callable[[Any, Any, Any], Any]
 
-# The states that a torque may act on, the smallest first.
-LADDER = (HasSpin, HasAttitude, HasPose)
-# A hint for gravity.
-WORLD = "a vector in world axes, such as [0, 0, -9.81]"
+# The type of a state, as a torque declares it in `feels`.
+StateType = type
+# A vector (3,), world frame, along which a torque has no component.
+AxisWithoutTorque = Vec3
+# The types of the states that a torque may act on, the smallest state first.
+STATE_TYPES_BY_SIZE = (HasSpin, HasAttitude, HasPose)
+# The advice at the end of a message about a wrong vector of gravity.
+GRAVITY_HINT = "a vector in world axes, such as [0, 0, -9.81]"
 
 
-def require_law(torque: object, name: str = "torque") -> None:
-    """Raise `TypeError` unless `torque` is an object that can be called as a torque, `(t, state,
-    body)`.
+def require_torque(torque: object, name: str = "torque") -> None:
+    """Raise `TypeError` unless `torque` can be called as a torque or force, with the arguments `(t,
+    state, body)`.
 
     - `torque`: any object that a user gave as a torque or force
     - `name`: the name of the argument, for the message
@@ -145,21 +153,22 @@ def require_law(torque: object, name: str = "torque") -> None:
             f"{name}: wanted a torque or force of rigidjax.torques, or a callable (t, state, "
             f"body), got {type(torque).__name__}{advice}"
         )
-    if not isinstance(torque, eqx.Module):  # A torque with states takes these, too.
+    # The arguments of a Module are not checked: a torque with states of its own takes them as well.
+    if not isinstance(torque, eqx.Module):
         _checks.require_function(torque, name, "(t, state, body) → torque (3,), N m, body frame")
 
 
-def sees_attitude(torque: Torque | None) -> bool:
+def may_read_attitude(torque: Torque | None) -> bool:
     """Return whether a torque, or any torque in a `Sum`, may read the attitude of the body. The
     attribute `feels` tells: a torque with `feels = HasSpin` reads the body rate only, and a torque
     without this attribute may read anything; `None` reads nothing.
     """
     if hasattr(torque, "parts"):
-        return any(sees_attitude(part) for part in torque.parts)  # pyright: ignore
+        return any(may_read_attitude(part) for part in torque.parts)  # pyright: ignore
     return torque is not None and getattr(torque, "feels", None) is not HasSpin
 
 
-def sees_rate(torque: Torque | None) -> bool:
+def may_read_rate(torque: Torque | None) -> bool:
     """Return whether a torque may read the body rate: true unless the torque is `None` or declares
     `rate_free = True`.
     """
@@ -170,7 +179,7 @@ def require_state_type(torque: Torque, state: object) -> None:
     """Raise `TypeError` unless `torque` can be called, and `state` has the parts (body rate,
     attitude, position) that the torque declares in `feels`.
     """
-    require_law(torque)
+    require_torque(torque)
     feels = getattr(torque, "feels", None)
     if feels is not None and not isinstance(state, feels):
         raise TypeError(
@@ -179,25 +188,25 @@ def require_state_type(torque: Torque, state: object) -> None:
         )
 
 
-def require_scene(law: Torque | None, state: object, body: object) -> None:
-    """Raise an error unless the arguments can be evaluated together.
+def require_compatible(torque: Torque | None, state: object, body: object) -> None:
+    """Raise an error unless `torque` can be evaluated for this state of motion and this body.
 
-    - `law`: a torque or force, or `None`; a torque with states of its own must have their values
-      inserted (see `freeze`)
+    - `torque`: a torque or force, or `None`; a torque with states of its own must have their values
+      inserted (see `freeze_own_states`)
     - `state`: one state of motion with the parts that the torque reads
     - `body`: one `Inertia` or `MassProperties`
     """
-    _checks.require_unbatched_instance(
-        state, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid"
-    )
-    if law is not None:
-        require_state_type(law, state)
-        require_frozen(law)
-        require_one_law(law.law if isinstance(law, FrozenLaw) else law)
-    _checks.require_unbatched_instance(body, (Inertia, MassProperties), "body")
+    _checks.require_single(state, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid")
+    if torque is not None:
+        require_state_type(torque, state)
+        require_frozen_states(torque)
+        require_unbatched_torque(torque.law if isinstance(torque, FrozenLaw) else torque)
+    _checks.require_single(body, (Inertia, MassProperties), "body")
 
 
-def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
+def evaluate_torque(
+    torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
+) -> Vec3:
     """Return the value (3,), N m, body frame, of a torque at one time. **Raises:** `TypeError` for
     a force, which needs a `Rigid`.
 
@@ -216,32 +225,33 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
 
 
 def force_and_torque(
-    law: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
+    model: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> tuple[Vec3 | None, Vec3]:
     """Evaluate a torque or force model at one time, and return two things: the force (3,) on the
     centre of mass, N, world frame, or `None` for a pure torque; and the torque (3,) about the
     centre of mass, N m, body frame.
 
-    - `law`: a callable (t, state, body) that returns a torque (3,) or a `Wrench`
+    - `model`: a callable (t, state, body) that returns a torque (3,) or a `Wrench`
     - `t`: s, the time
-    - `state`: the state of motion, with the parts that `law` reads; its precision is that of the
+    - `state`: the state of motion, with the parts that `model` reads; its precision is that of the
       result
     - `body`: an `Inertia` or `MassProperties`
     """
-    require_scene(law, state, body)
+    require_compatible(model, state, body)
     dtype = state.omega.dtype
     t = _checks.array_of_shape(t, (), "t").astype(dtype)
-    name = f"torque {getattr(law, 'law_name', type(law).__name__)}"
+    name = f"torque {getattr(model, 'law_name', type(model).__name__)}"
     # A table in float64 must not turn a float32 solve into a float64 solve, nor stop the solve
     # under strict promotion.
     try:
-        result = in_precision(law, dtype)(t, state, in_precision(body, dtype))
-    except AttributeError as wrong:
-        told = missing_state_message(name, wrong)
-        if told is None:
+        result = in_precision(model, dtype)(t, state, in_precision(body, dtype))
+    except AttributeError as error:
+        message = missing_state_part_message(name, error)
+        if message is None:
             raise
-        hint = "; a subclass of AbstractTorque declares the state that it reads by feels"
-        raise TypeError(told + hint) from wrong
+        hint = "; a subclass of AbstractTorque declares the state that it reads by feels, such as"
+        hint += " feels = HasAttitude"
+        raise TypeError(message + hint) from error
     # The test is not by class: torques of moving frames do not import this module, and return
     # forces of another class.
     if hasattr(result, "force"):
@@ -251,54 +261,54 @@ def force_and_torque(
 
 
 # For each field that a state of motion may lack: the name of the quantity, and a state that has it.
-_HIGHER = {
+_QUANTITY_AND_STATE_OF_FIELD = {
     "q": ("attitude", "Attitude(q, omega)"),
     "x": ("position", "Rigid(x, v, q, omega)"),
     "v": ("velocity", "Rigid(x, v, q, omega)"),
 }
 
 
-def missing_state_message(caller: str, error: AttributeError) -> str | None:
-    """Return the message for a user's function that read a part which its state lacks, such as the
-    attitude of a `Spin`; return `None` for any other error.
+def missing_state_part_message(caller: str, error: AttributeError) -> str | None:
+    """Return the message for a user's function that reads a part which its state does not have,
+    such as the attitude of a `Spin`; return `None` if the error has another cause.
 
     - `caller`: the name of the function, for the message
     - `error`: the `AttributeError` that the function raised
     """
-    if error.name not in _HIGHER or not isinstance(error.obj, HasSpin):
+    if error.name not in _QUANTITY_AND_STATE_OF_FIELD or not isinstance(error.obj, HasSpin):
         return None
-    what, higher = _HIGHER[error.name]
-    has_none = f"the {what}, and {type(error.obj).__name__} has none"
-    return f"{caller} looks at state.{error.name}, {has_none}: start from {higher}"
+    quantity, state_with_field = _QUANTITY_AND_STATE_OF_FIELD[error.name]
+    has_none = f"the {quantity}, and {type(error.obj).__name__} has none"
+    return f"{caller} looks at state.{error.name}, {has_none}: start from {state_with_field}"
 
 
-def require_one_law(law: Torque) -> None:
-    """Raise `ValueError` if a field of the torque `law` has the shape of many torques, such as in a
-    batch made by `jax.vmap`.
+def require_unbatched_torque(torque: Torque) -> None:
+    """Raise `ValueError` if an array in a field of `torque` has the shape of many torques, such as
+    in a batch made by `jax.vmap`. A torque that a user defined is not checked.
     """
-    if not type(law).__module__.startswith(__package__ or ""):
+    if not type(torque).__module__.startswith(__package__ or ""):
         return
-    for field in dataclasses.fields(law):  # pyright: ignore[reportArgumentType]
-        value, kind = getattr(law, field.name), field.type
+    for field in dataclasses.fields(torque):  # pyright: ignore[reportArgumentType]
+        value, kind = getattr(torque, field.name), field.type
         if eqx.is_array(value) and not isinstance(value, kind):  # pyright: ignore[reportArgumentType]
             raise ValueError(
-                f"torque {type(law).__name__}: {field.name} has the shape {value.shape}, which is "
-                "not that of one torque; for one torque per body use jax.vmap, or torque_axes=0 in "
-                "rigidjax.batch"
+                f"torque {type(torque).__name__}: {field.name} has the shape {value.shape}, which "
+                "is not that of one torque; for one torque per body use jax.vmap, or torque_axes=0 "
+                "in rigidjax.batch"
             )
 
 
-def in_precision(tree: PyTree, dtype: DTypeLike) -> Any:
+def in_precision(tree: PyTree, dtype: DTypeLike) -> PyTree:
     """Return `tree` (any tree of arrays and other objects) with every floating-point array
     converted to `dtype`; integers, functions and other objects do not change.
     """
 
-    def cast(leaf: PyTree) -> Any:
+    def convert_floats(leaf: PyTree) -> PyTree:
         if eqx.is_array_like(leaf) and hasattr(leaf, "dtype"):
             return leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
         return leaf
 
-    return jax.tree.map(cast, tree)
+    return jax.tree.map(convert_floats, tree)
 
 
 def vector_at(source: PyTree, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:
@@ -329,17 +339,17 @@ def number_converter(name: str) -> Callable[[Any], Array]:
     return lambda value: _checks.finite_array(value, (), name)
 
 
-def source_converter(name: str) -> Callable[[Any], Any]:
+def vector_or_function_converter(name: str) -> Callable[[Any], Array | Callable[[Any], Any]]:
     """Return a function that checks a value and converts it to a vector (3,), or leaves it
     unchanged if it is a function of time to such a vector, for `equinox.field(converter=…)`; `name`
     is the name of the field, for messages.
     """
-    return lambda value: constant_or_callable(value, name)
+    return lambda value: checked_vector_or_function(value, name)
 
 
-def constant_or_callable(source: object, name: str, size: int = 3) -> Any:
-    """Return a quantity that is constant or depends on time, checked: a function of time is
-    returned unchanged, and anything else as a vector (size,) of finite numbers.
+def checked_vector_or_function(source: object, name: str, size: int = 3) -> Any:
+    """Check a quantity that is constant or depends on time, and return it: a function of time
+    unchanged, anything else as a vector (size,) of finite numbers.
 
     - `source`: a function of time to (size,), or the numbers
     - `name`: the name of the quantity, for messages
@@ -350,35 +360,35 @@ def constant_or_callable(source: object, name: str, size: int = 3) -> Any:
     return _checks.finite_array(source, (size,), name)
 
 
-def jumps_of(source: object) -> Float[Array, " n"]:
-    """Return the times (n,), s, at which a torque or a function of time jumps or has a kink, as its
-    attribute `jump_times` says; an empty array if it has none.
+def jump_times_of(source: object) -> Float[Array, " n"]:
+    """Return the times (n,), s, at which `source`, a torque or a function of time, jumps or has a
+    kink: its attribute `jump_times`, or an empty array if it has no such attribute.
     """
     times = getattr(source, "jump_times", None)
     return jnp.zeros(0) if times is None else times
 
 
-def jumps_in(*sources: object) -> Float[Array, " n"]:
+def sorted_jump_times_of(*sources: object) -> Float[Array, " n"]:
     """Return the times (n,), s, at which any of the `sources` (torques or functions of time) jumps
     or has a kink, in ascending order.
     """
-    times = [found for source in sources if (found := jumps_of(source)).shape[0]]
+    times = [jumps for source in sources if (jumps := jump_times_of(source)).shape[0]]
     if len(times) < 2:
         return times[0] if times else jnp.zeros(0)
     dtype = jnp.result_type(*times)
-    return jnp.sort(jnp.concatenate([found.astype(dtype) for found in times]))
+    return jnp.sort(jnp.concatenate([jumps.astype(dtype) for jumps in times]))
 
 
-def jumps_of_parts(law: object) -> Float[Array, " n"]:
-    """Return the times (n,), s, at which any field of the torque `law`, such as a function of time
-    or another torque inside it, jumps or has a kink, in ascending order.
+def jump_times_of_fields(torque: object) -> Float[Array, " n"]:
+    """Return the times (n,), s, at which any field of `torque`, such as a function of time or
+    another torque inside it, jumps or has a kink, in ascending order.
     """
-    return jumps_in(*vars(law).values())
+    return sorted_jump_times_of(*vars(torque).values())
 
 
-def unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array, "n 3"]:
-    """Return an array (count, 3) of directions, one a row. **Raises:** `ValueError` if a known row
-    is not a unit vector.
+def checked_unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array, "n 3"]:
+    """Return an array (count, 3) of directions, one in each row. **Raises:** `ValueError` if a row
+    is not a unit vector, unless JAX traces the numbers.
 
     - `value`: the directions, as an array or nested lists
     - `name`: the name of the argument, for messages
@@ -393,8 +403,8 @@ def unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array, "n 3"]:
 
 
 def row_count(value: NumbersLike, name: str, item: str) -> int:
-    """Return the number of rows of an array (R, 3), such as the number of wheels from their axes.
-    **Raises:** `ValueError` for another shape, or without rows.
+    """Return the number R of rows of an array (R, 3): the number of wheels from their axes, for
+    example. **Raises:** `ValueError` for another shape, or for an array without rows.
 
     - `value`: the array, or nested lists
     - `name`: the name of the argument, for messages
@@ -406,9 +416,9 @@ def row_count(value: NumbersLike, name: str, item: str) -> int:
     return shape[0]
 
 
-def broadcast_to_each(value: NumbersLike, count: int, name: str) -> Array:
-    """Return a quantity that is the same for all items (wheels, rotors), as a scalar array, or that
-    has one number for each item, as an array (count,); the shape of `value` decides.
+def scalar_or_one_each(value: NumbersLike, count: int, name: str) -> Array:
+    """Return the value of a property of several items (wheels, rotors): a scalar array if `value`
+    is one number, which holds for all items, or an array (count,) of one number for each item.
 
     - `value`: one number, or `count` numbers
     - `count`: the number of items
@@ -420,8 +430,8 @@ def broadcast_to_each(value: NumbersLike, count: int, name: str) -> Array:
 
 
 def length_or_zero(v: Vec3) -> Scalar:
-    """Return the length |v| of a vector (3,), any unit, with the derivative 0 at v = 0; this
-    derivative is right where |v| is a factor, as in |v| v.
+    """Return the length |v| of a vector (3,), any unit, with the derivative 0 at v = 0, where the
+    true derivative does not exist; derivatives of a product such as |v| v are then right.
     """
     v = _checks.array_of_shape(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]

@@ -52,7 +52,7 @@ class Chebyshev(eqx.Module):
         self.step = _checks.require_positive(step, "step", "a positive length, s").astype(dtype)
 
     def __call__(self, t: ScalarLike) -> Any:
-        """Return the value at `t` (s), (k,)."""
+        """Return the value (k,) at the time `t`, s; NaN outside of the intervals."""
         count, _, terms = self.coefficients.shape
         place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
         i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 1)

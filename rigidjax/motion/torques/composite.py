@@ -36,7 +36,7 @@ class Sum(eqx.Module):
         if not parts:
             raise ValueError("Sum: wanted at least one torque; for a free body give torque=None")
         for part in parts:
-            base.require_law(part, "Sum")
+            base.require_torque(part, "Sum")
             if isinstance(part, ChangingInertia) and len(parts) > 1:
                 raise TypeError(
                     "Sum: ChangingInertia divides all torques by the inertia at time t: put "
@@ -45,27 +45,27 @@ class Sum(eqx.Module):
         self.parts = parts
 
     @property
-    def feels(self) -> type:
-        """Return the largest state that a part needs."""
-        rungs = [getattr(part, "feels", base.LADDER[0]) for part in self.parts]
-        order = lambda r: base.LADDER.index(r) if r in base.LADDER else len(base.LADDER)  # noqa: E731
-        return max(rungs, key=order)
+    def feels(self) -> base.StateType:
+        """Return the type of the largest state that a part needs, such as `HasAttitude`."""
+        types = base.STATE_TYPES_BY_SIZE
+        needed = [getattr(part, "feels", types[0]) for part in self.parts]
+        return max(needed, key=lambda kind: types.index(kind) if kind in types else len(types))
 
     @property
     def rate_free(self) -> bool:
-        """Return whether no part depends on the body rate."""
-        return all(not base.sees_rate(part) for part in self.parts)
+        """Return whether the sum does not depend on the body rate, because no part does."""
+        return all(not base.may_read_rate(part) for part in self.parts)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the jump times of all parts, s, in order."""
-        return base.jumps_in(*self.parts)
+        """Return the times (n,), s, at which any part jumps or has a kink, in ascending order."""
+        return base.sorted_jump_times_of(*self.parts)
 
     def __call__(self, t: ScalarLike, state: PyTree, body: Body) -> Vec3 | base.Wrench:
         forces, torque = [], None
         for part in self.parts:
-            force, more = base.force_and_torque(part, t, state, body)
-            torque = more if torque is None else torque + more
+            force, part_torque = base.force_and_torque(part, t, state, body)
+            torque = part_torque if torque is None else torque + part_torque
             forces += [] if force is None else [force]
         if not forces:
             return torque  # pyright: ignore[reportReturnType]
@@ -116,27 +116,31 @@ class ChangingInertia(eqx.Module):
 
     def __init__(self, inertia: Callable[..., Any], torque: base.Torque | None = None):
         if hasattr(inertia, "feels"):
-            base.require_law(inertia, "inertia")
+            base.require_torque(inertia, "inertia")
         else:
             _checks.require_function(inertia, "inertia", "of time to (3, 3), kg m²")
             require_no_jumps(inertia, "inertia")
         self.inertia = inertia
         if torque is not None:
-            base.require_law(torque)
+            base.require_torque(torque)
         self.torque = torque
 
     @property
-    def feels(self) -> type:
-        """Return the smallest state that the inertia and the torque inside act on."""
-        rungs = [getattr(part, "feels", HasSpin) for part in (self.inertia, self.torque)]
-        return max(rungs, key=base.LADDER.index)
+    def feels(self) -> base.StateType:
+        """Return the type of the smallest state that both the inertia and the torque inside can
+        read, such as `HasAttitude`.
+        """
+        needed = [getattr(part, "feels", HasSpin) for part in (self.inertia, self.torque)]
+        return max(needed, key=base.STATE_TYPES_BY_SIZE.index)
 
-    jump_times = property(base.jumps_of_parts)
+    jump_times = property(base.jump_times_of_fields)
 
     def tensor(self, t: ScalarLike, state: PyTree = None, body: Body | None = None) -> Mat3:
-        """Return I, (3, 3), kg m²; a function of time needs no `state` and `body`."""
-        seen = (t, state, body) if hasattr(self.inertia, "feels") else (t,)
-        inertia = self.inertia(*seen)
+        """Return the inertia tensor I (3, 3), kg m², body frame, at the time `t`, s. If `inertia`
+        is a function of time, `state` and `body` are not used.
+        """
+        arguments = (t, state, body) if hasattr(self.inertia, "feels") else (t,)
+        inertia = self.inertia(*arguments)
         inertia = inertia.tensor if isinstance(inertia, Inertia) else inertia
         return _checks.array_of_shape(inertia, (3, 3), "inertia(t)")
 
@@ -172,8 +176,8 @@ class ChangingInertia(eqx.Module):
 
 
 def tensor_or_nan(tensor: Mat3) -> Mat3:
-    """Return `tensor` (3, 3), kg m², if it is the inertia tensor of a body; otherwise return NaN,
-    which ends a run of a solver.
+    """Return `tensor` (3, 3), kg m², if a body can have this inertia tensor; otherwise return NaN
+    in all its entries, which ends a run of a solver.
     """
     return jnp.where(is_physical_inertia(tensor), tensor, jnp.full_like(tensor, jnp.nan))
 
@@ -183,8 +187,8 @@ class Tide(eqx.Module):
     deform.
 
     `I = I₀ − κ (μ/r³)(u uᵀ − ⅓) + ⅓ κ (Ω Ωᵀ − ⅓ Ω² − n² (e_z e_zᵀ − ⅓))` with the inertia I₀ of
-    the body and `u = Rᵀr/r`, both of a time `delay` ago. For
-    `ChangingInertia`, which adds İΩ: `ChangingInertia(Tide(…), torque)`.
+    the body, the body rate Ω, and `u = Rᵀr/r` from the attitude R and the position r a time `delay`
+    ago. `ChangingInertia` takes a tide and adds İΩ: `ChangingInertia(Tide(…), torque)`.
 
     **Arguments:** `response` κ = k₂R⁵/G, kg m² s², of a Love number k₂ and a radius R; `delay` s;
     `mu` G M of the point mass, m³/s²; `position` r (3,) m, world frame, from the body to it:
@@ -204,7 +208,7 @@ class Tide(eqx.Module):
     response: Scalar = eqx.field(converter=base.number_converter("response"))
     delay: Scalar = eqx.field(converter=base.number_converter("delay"))
     mu: Scalar = eqx.field(converter=base.number_converter("mu"))
-    position: Any = eqx.field(converter=base.source_converter("position"))
+    position: Any = eqx.field(converter=base.vector_or_function_converter("position"))
     mean_rate: Scalar = eqx.field(converter=base.number_converter("mean_rate"), default=0.0)
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: Body) -> Mat3:

@@ -32,15 +32,17 @@ class UniformGravity(base.AbstractForce):
     feels: ClassVar[type] = HasPose
     steady: ClassVar[bool] = True
     gravity: Float[Array, "3"] = eqx.field(
-        converter=base.vector_converter("gravity", hint=base.WORLD)
+        converter=base.vector_converter("gravity", hint=base.GRAVITY_HINT)
     )
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
-        """Return the potential energy, J: `U = −m g·x`, zero at the world's origin."""
+        """Return the potential energy, J: `U = −m g·x`, which is zero at the world's origin."""
         return -body.mass * dot(self.gravity, state.x)
 
     def internal_momentum(self, t: ScalarLike) -> Vec3:
-        """Return zero, N m s: gravity has no torque on the body and no momentum inside."""
+        """Return zero (3,), N m s: no momentum is inside the body. This method tells `conserved`
+        that gravity has no torque about the centre of mass.
+        """
         return jnp.zeros_like(self.gravity)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
@@ -66,12 +68,12 @@ class CentralGravity(base.AbstractForce):
     mu: Float[Array, ""] = eqx.field(converter=base.number_converter("mu"))
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
-        """Return the potential energy, J, which is zero at infinity."""
-        r, up, pull, trace = _direction_and_inertia_along(state, body.inertia.tensor)
+        """Return the potential energy U of the body, J, which is zero at infinity."""
+        r, up, pull, trace = _distance_direction_inertia_and_trace(state, body.inertia.tensor)
         return -(self.mu / r) * (body.mass + 0.5 * (trace - 3 * dot(up, pull)) / r / r)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
-        r, up, pull, trace = _direction_and_inertia_along(state, body.inertia.tensor)
+        r, up, pull, trace = _distance_direction_inertia_and_trace(state, body.inertia.tensor)
         strength, along = self.mu / r / r, dot(up, pull)
         # The force is −∂U/∂x in body axes: the sum of a vector along r̂ and a vector along I r̂.
         radial = -strength * (body.mass + 1.5 * (trace - 5 * along) / r / r)
@@ -79,17 +81,20 @@ class CentralGravity(base.AbstractForce):
         return base.Wrench(quaternion.rotate(state.q, force), cross(3 * strength / r * up, pull))
 
 
-def _direction_and_inertia_along(state: HasPose, tensor: Mat3) -> tuple[Scalar, Vec3, Vec3, Scalar]:
+def _distance_direction_inertia_and_trace(
+    state: HasPose, inertia_tensor: Mat3
+) -> tuple[Scalar, Vec3, Vec3, Scalar]:
     """Return the four quantities of MacCullagh's formula for gravity from the world's origin: the
     distance r of the centre of mass from the origin, m; the unit vector r̂ from the origin to the
     body, (3,), body axes; I r̂, (3,), kg m²; and the trace of I, kg m².
 
     - `state`: a state with the position of the centre of mass (m, world frame) and the attitude
-    - `tensor`: I (3, 3), kg m², body frame, about the centre of mass
+    - `inertia_tensor`: I (3, 3), kg m², body frame, about the centre of mass
     """
     r = jnp.sqrt(dot(state.x, state.x))
     up = quaternion.rotate_inverse(state.q, state.x / r)
-    return r, up, apply(tensor, up), tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
+    trace = inertia_tensor[0, 0] + inertia_tensor[1, 1] + inertia_tensor[2, 2]
+    return r, up, apply(inertia_tensor, up), trace
 
 
 class Drag(base.AbstractForce):
@@ -158,24 +163,24 @@ class Rotors(base.AbstractForce):
     ):
         count = base.row_count(positions, "positions", "rotor")
         self.positions = _checks.finite_array(positions, (count, 3), "positions")
-        self.directions = base.unit_rows(directions, "directions", count)
+        self.directions = base.checked_unit_rows(directions, "directions", count)
         self.spins = _checks.finite_array(spins, (count,), "spins")
         if _checks.is_known(self.spins) and (abs(np.asarray(self.spins)) != 1).any():
             raise ValueError(f"spins: wanted 1 or -1 for each rotor, got {np.asarray(self.spins)}")
         self.thrust, self.drag = (
-            base.broadcast_to_each(thrust, count, "thrust"),
-            base.broadcast_to_each(drag, count, "drag"),
+            base.scalar_or_one_each(thrust, count, "thrust"),
+            base.scalar_or_one_each(drag, count, "drag"),
         )
-        self.speeds = base.constant_or_callable(speeds, "speeds", count)
+        self.speeds = base.checked_vector_or_function(speeds, "speeds", count)
 
-    jump_times = property(base.jumps_of_parts)
+    jump_times = property(base.jump_times_of_fields)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         n = base.vector_at(self.speeds, t, "speeds", self.spins.shape[0]).astype(self.spins.dtype)
         square = n * n
         lift, twist = self.thrust * square, self.spins * self.drag * square
-        # The sum is written out rotor by rotor: there are few rotors, and in a batch array sums are
-        # slow.
+        # The sum is written out rotor by rotor: there are few rotors, and in a batch of bodies
+        # `jnp.sum` is slow.
         force, torque = jnp.zeros(3, lift.dtype), jnp.zeros(3, lift.dtype)
         for i in range(self.spins.shape[0]):
             along = self.directions[i]

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float, PyTree
 from rigidjax import _checks
 from rigidjax._types import NumbersLike, ScalarLike
 from rigidjax.body.inertia import Body
-from rigidjax.motion.torques.base import jumps_of
+from rigidjax.motion.torques.base import jump_times_of
 from rigidjax.motion.torques.piecewise import Held
-from rigidjax.motion.torques.states import has_states
+from rigidjax.motion.torques.states import contains_own_states
 
 Law = TypeVar("Law")
 
@@ -43,9 +43,9 @@ class Input(eqx.Module):
 
 
 class _ConstantFunction(eqx.Module):
-    """Evaluate to one `value` at every time. This function of time takes the place of an `Input` (a
-    signal in a torque that has a name, and whose values the caller gives) while its value is
-    constant, such as during one step.
+    """Return one `value` at every time. This function of time takes the place of an `Input` (a
+    signal that a torque reads by its name, and whose values the caller gives) while the value of
+    the input is constant, such as during one step.
     """
 
     value: Array
@@ -79,30 +79,30 @@ class Delayed(eqx.Module):
 
     def __init__(self, source: object, delay: ScalarLike):
         source = _checks.require_function(source, "source", "of time")
-        if has_states(source):
-            words = "has states, whose past is not kept; delay its input"
-            words += ": Lagged(Delayed(source, delay), time)"
-            raise TypeError(f"Delayed: {type(source).__name__} {words}")
+        if contains_own_states(source):
+            words = "wanted a source without states of its own, whose past values are not kept, got"
+            advice = "delay its input: Lagged(Delayed(source, delay), time)"
+            raise TypeError(f"Delayed: {words} {type(source).__name__}; {advice}")
         self.delay = _checks.finite_array(delay, (), "delay").astype(jnp.result_type(float))
         if isinstance(source, Delayed):
             source, self.delay = source.source, self.delay + source.delay
-        if not isinstance(source, Input) and inputs_of(source):
-            words = "reads an Input; delay the Input itself, inside it"
-            raise TypeError(f"Delayed: {type(source).__name__} {words}")
+        if not isinstance(source, Input) and input_names_of(source):
+            words = f"wanted a source that reads no Input, got {type(source).__name__}"
+            raise TypeError(f"Delayed: {words}; delay the Input itself, inside the source")
         self.source = source
         times = getattr(source, "times", None)
         if times is not None and _checks.is_known((times, self.delay)):
             length = float(times[-1] - times[0])
             if abs(float(self.delay)) >= length:
-                words = f"{float(self.delay):.6g} s is as long as the record of {length:.6g} s"
-                raise ValueError(f"delay: {words} or longer; is it in seconds?")
+                words = f"wanted less than the {length:.6g} s of the record of the source"
+                raise ValueError(f"delay: {words}, got {float(self.delay):.6g}; is it in seconds?")
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times, s, at which the value jumps: the jump times of the source plus the
-        delay.
+        """Return the times (n,), s, at which the value jumps or has a kink: those of the source
+        plus the delay.
         """
-        times = jumps_of(self.source)
+        times = jump_times_of(self.source)
         return times + self.delay.astype(times.dtype)
 
     def __call__(self, t: ScalarLike) -> Any:
@@ -119,7 +119,8 @@ class Lagged(eqx.Module):
     **Arguments:** `source` u, a function of time such as `Held(times, values)`, or `Input("u")`;
     `time` T, s, > 0: one number, or one for each channel, which may be free in a fit; `start` y at
     the start, or `None` for u at the start. If u jumps from 0 to 1, y is `1 − exp(−t/T)` (Åström
-    and Murray, Feedback Systems). **Raises:** `ValueError` for a known time that is not positive.
+    and Murray, Feedback Systems). **Raises:** `ValueError` for a time that is not positive,
+    unless JAX traces it.
 
     >>> push = rj.torques.InSpace(Lagged(lambda t: jnp.array([0.0, 0.0, 1.0]), 0.5, jnp.zeros(3)))
     >>> body, start = rj.Inertia(jnp.eye(3)), rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
@@ -133,31 +134,33 @@ class Lagged(eqx.Module):
 
     def __init__(self, source: object, time: NumbersLike, start: NumbersLike | None = None):
         self.source = _checks.require_function(source, "source", "of time")
-        kind = jnp.result_type(float)
+        dtype = jnp.result_type(float)
         time = _checks.check_if_known(
-            _checks.require_positive, _checked_channels(time, "time"), "time", "a positive time, s"
+            _checks.require_sign, _finite_nonempty_array(time, "time"), "time", "a positive time, s"
         )
-        self.time = time.astype(kind)
-        self.start = None if start is None else _checked_channels(start, "start").astype(kind)
+        self.time = time.astype(dtype)
+        self.start = None if start is None else _finite_nonempty_array(start, "start").astype(dtype)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times, s, at which the source jumps: at these times the value has a kink."""
-        return jumps_of(self.source)
+        """Return the times (n,), s, at which the source jumps: the value then has a kink."""
+        return jump_times_of(self.source)
 
     def state0(self, t: ScalarLike, state: PyTree, body: Body) -> Array:
-        """Return the value y at the start: the field `start`, or, without it, the value of the
-        source at the time `t`, s.
+        """Return the value y of the lag at the start, the initial value of its own state: the field
+        `start`, or the value of the source at the time `t`, s, if `start` is `None`.
         """
         return self.source(t) if self.start is None else self.start
 
     def rate(self, t: ScalarLike, own: Array, state: PyTree, body: Body) -> Array:
-        """Return dy/dt = (u − y)/T, in the unit of the source u per second, for the value y = `own`
-        at the time `t`, s; `state` and `body` are not used.
+        """Return dy/dt = (u − y)/T, the derivative of the lag's own state y = `own` with respect to
+        time, in the unit of the source u per second, at the time `t`, s; `state` and `body` are not
+        used.
         """
         wanted = _checks.numeric_array(self.source(t), "source(t)").astype(own.dtype)
         if wanted.shape != own.shape:
-            raise ValueError(f"Lagged: start has the shape {own.shape}, the source {wanted.shape}")
+            words = f"start has the shape {own.shape}, values of the source have {wanted.shape}"
+            raise ValueError(f"Lagged: wanted one shape for both, but {words}")
         return (wanted - own) / self.time
 
     def __call__(self, t: ScalarLike, own: Array) -> Array:
@@ -168,8 +171,8 @@ def require_no_jumps(source: PyTree, name: str) -> None:
     """Raise `TypeError` if `source`, a function of time or a tree of them, holds samples constant
     between times: a torque that uses the derivative of its source would lose the jumps.
 
-    An `Input` is checked when it has a value: `bind` may give it a smooth function of time. The
-    text `name` names the argument in the message.
+    An `Input` is checked only when it has a value, because `bind` may give it a smooth function of
+    time. The text `name` names the argument in the message.
     """
     jumping = (Held, _ConstantFunction)
     nodes = jax.tree.leaves(source, is_leaf=lambda node: isinstance(node, jumping))
@@ -186,17 +189,17 @@ def require_no_jumps(source: PyTree, name: str) -> None:
             )
 
 
-def _checked_channels(value: NumbersLike, name: str) -> Array:
-    """Return one number, or one number for each channel (component) of a signal, as an array of
-    finite numbers. **Raises:** `ValueError` for an empty array or, unless JAX traces the numbers,
-    for a number that is not finite.
+def _finite_nonempty_array(value: NumbersLike, name: str) -> Array:
+    """Return `value` as an array, of any shape, of finite numbers: one number, or one for each
+    channel (component) of a signal. **Raises:** `ValueError` for an empty array or, unless JAX
+    traces the numbers, for a number that is not finite.
 
     - `value`: the numbers
     - `name`: the name of the argument, for messages
     """
     array = _checks.numeric_array(value, name)
     if not array.size:
-        raise ValueError(f"{name}: wanted one number, or one a channel, got none")
+        raise ValueError(f"{name}: wanted one number, or one for each channel, got none")
     return _checks.check_if_known(_checks.require_finite, array, name)
 
 
@@ -227,11 +230,11 @@ def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
     values, later = inputs if isinstance(inputs, InputRow) else (inputs, None)
     queue = list(later or ())
 
-    def value(node: PyTree) -> Any:
+    def with_value(node: PyTree) -> Any:
         if _is_delayed_input(node):
             if later is not None:
                 return _ConstantFunction(jnp.asarray(queue.pop(0)))
-            bound = value(node.source)
+            bound = with_value(node.source)
             return bound if isinstance(bound, _ConstantFunction) else Delayed(bound, node.delay)
         if not isinstance(node, Input):
             return node
@@ -241,7 +244,9 @@ def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
         bound = values[node.name]
         return bound if callable(bound) else _ConstantFunction(jnp.asarray(bound))
 
-    return jax.tree.map(value, law, is_leaf=lambda n: isinstance(n, Input) or _is_delayed_input(n))
+    return jax.tree.map(
+        with_value, law, is_leaf=lambda n: isinstance(n, Input) or _is_delayed_input(n)
+    )
 
 
 def _is_delayed_input(node: PyTree) -> bool:
@@ -252,25 +257,25 @@ def _is_delayed_input(node: PyTree) -> bool:
     return isinstance(node, Delayed) and isinstance(node.source, Input)
 
 
-def delays_of(law: PyTree) -> list[tuple[str, Array]]:
-    """Return a pair for each delayed input of the torque `law`, in the order of these inputs in the
-    torque: the name of the input; and its delay, a scalar array, s.
+def delays_of(torque: PyTree) -> list[tuple[str, Array]]:
+    """Return a pair for each delayed input of `torque`, in the order of these inputs in the torque:
+    the name of the input, and its delay, a scalar array, s.
     """
-    nodes = jax.tree.leaves(law, is_leaf=_is_delayed_input)
+    nodes = jax.tree.leaves(torque, is_leaf=_is_delayed_input)
     return [(node.source.name, node.delay) for node in nodes if _is_delayed_input(node)]
 
 
-def inputs_of(law: PyTree) -> list[str]:
-    """Return the names of the inputs (`Input`) that the torque `law` reads, each name once."""
-    nodes = jax.tree.leaves(law, is_leaf=lambda node: isinstance(node, Input))
+def input_names_of(torque: PyTree) -> list[str]:
+    """Return the names of the inputs (`Input`) that `torque` reads, each name once."""
+    nodes = jax.tree.leaves(torque, is_leaf=lambda node: isinstance(node, Input))
     return list(dict.fromkeys(node.name for node in nodes if isinstance(node, Input)))
 
 
-def require_inputs(law: PyTree, inputs: object) -> Mapping[str, Any]:
+def require_inputs(torque: PyTree, inputs: object) -> Mapping[str, Any]:
     """Return `inputs` as a mapping from names to values, empty for `None`. **Raises:** `ValueError`
-    unless the names are exactly the names of the inputs (`Input`) that the torque `law` reads.
+    unless the names are exactly the names of the inputs (`Input`) that `torque` reads.
     """
-    read, mapping = inputs_of(law), {} if inputs is None else inputs
+    read, mapping = input_names_of(torque), {} if inputs is None else inputs
     if not isinstance(mapping, Mapping):
         raise TypeError(f"inputs: wanted arrays by name, got {type(mapping).__name__}")
     if set(read) != set(mapping):

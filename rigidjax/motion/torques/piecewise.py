@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, NumbersLike, Scalar, ScalarLike, Vec3
@@ -29,8 +29,8 @@ class _Table(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times (n,) of the table, s: at each of them the quantity jumps, or its slope
-        jumps.
+        """Return the times (n,) of the table, s, at each of which the quantity jumps or has a
+        kink.
         """
         return self.times
 
@@ -99,12 +99,12 @@ class Tabulated(AbstractTorque):
 
     def __init__(self, times: Times, torques: Rows):
         self.times, self.torques = _checked_times_and_rows(
-            "times", times, "torques", torques, extra=0
+            "times", times, "torques", torques, times_beyond_rows=0
         )
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times of the rows, s: the torque has a kink or a jump at each."""
+        """Return the times (n,) of the rows, s, at each of which the torque jumps or has a kink."""
         return self.times
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
@@ -136,17 +136,17 @@ class Pulses(AbstractTorque):
 
     def __init__(self, edges: Times, torques: Rows):
         self.edges, self.torques = _checked_times_and_rows(
-            "edges", edges, "torques", torques, extra=1
+            "edges", edges, "torques", torques, times_beyond_rows=1
         )
 
     @property
     def jump_times(self) -> Float[Array, " edges"]:
-        """Return the edges, s: the torque jumps at each."""
+        """Return the edges (n + 1,), s, the times at which the torque jumps."""
         return self.edges
 
     @property
     def impulse(self) -> Vec3:
-        """Return the whole impulse ∫ τ dt, (3,), N m s, body frame."""
+        """Return the angular impulse of all pieces together, ∫ τ dt, (3,), N m s, body frame."""
         return jnp.sum((self.edges[1:] - self.edges[:-1])[:, None] * self.torques, axis=0)
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
@@ -158,7 +158,7 @@ class Pulses(AbstractTorque):
         return jnp.where(inside, value, jnp.zeros_like(value))
 
 
-def _index_of_row_at(times: Float[Array, " n"], t: Scalar) -> Any:
+def _index_of_row_at(times: Float[Array, " n"], t: Scalar) -> Int[Array, ""]:
     """Return the index of the row of a table that applies at the time `t`, s: the last row whose
     time is not after t, or −1 before the first row. At a jump this is the row that begins.
 
@@ -187,36 +187,46 @@ def _interpolate_linearly(
 
 
 def _checked_times_and_rows(
-    name: str, times: NumbersLike, other: str, values: NumbersLike, extra: int | None = None
+    times_name: str,
+    times: NumbersLike,
+    rows_name: str,
+    values: NumbersLike,
+    times_beyond_rows: int | None = None,
 ) -> tuple[Array, Array]:
     """Check a table of a quantity over time, and return two things as arrays of finite numbers: the
     times, increasing, s; and the rows, which are the values of the quantity.
 
-    - `name`: the name of the argument `times`, for messages
+    - `times_name`: the name of the argument `times`, for messages
     - `times`: (n,) s, the times of the rows, or the edges of intervals with a constant value
-    - `other`: the name of the argument `values`, for messages
+    - `rows_name`: the name of the argument `values`, for messages
     - `values`: the rows
-    - `extra`: `None` for n rows of any shape. A number m wants n − m rows of shape (3,): 0 for a
-      row at each time, 1 for a row in each interval between two times.
+    - `times_beyond_rows`: how many times there are more than rows, which then have the shape (3,):
+      0 for a row at each time, 1 for a row in each interval between two times. `None` allows n rows
+      of any shape.
     """
-    edges, rows = _checks.array_of_rows(times, (), name), _checks.numeric_array(values, other)
+    edges, rows = (
+        _checks.array_of_rows(times, (), times_name),
+        _checks.numeric_array(values, rows_name),
+    )
     count = edges.shape[0]
     if count < 2:
-        raise ValueError(f"{name}: wanted at least 2 times, shape (n,), got {edges.shape}")
-    if extra is None and rows.shape[:1] != edges.shape:
-        raise ValueError(f"{other}: wanted a row for each of {count} times, got {rows.shape}")
-    if extra is not None and rows.shape != (count - extra, 3):
+        raise ValueError(f"{times_name}: wanted at least 2 times, shape (n,), got {edges.shape}")
+    if times_beyond_rows is None and rows.shape[:1] != edges.shape:
+        raise ValueError(f"{rows_name}: wanted a row for each of {count} times, got {rows.shape}")
+    if times_beyond_rows is not None and rows.shape != (count - times_beyond_rows, 3):
         lines = "n times go with n rows (constant pieces: Pulses)"
         pieces = "n constant pieces have n + 1 edges (Tabulated draws lines between n rows)"
-        advice = pieces if extra else lines
-        words = f"{other}: wanted {count - extra} rows of 3"
+        advice = pieces if times_beyond_rows else lines
+        words = f"{rows_name}: wanted {count - times_beyond_rows} rows of 3"
         raise ValueError(f"{words}, got shape {rows.shape}; {advice}")
-    edges, rows = _checks.require_finite(edges, name), _checks.require_finite(rows, other)
-    ordered = _checks.array_module(edges).asarray(edges)
+    edges, rows = _checks.require_finite(edges, times_name), _checks.require_finite(rows, rows_name)
+    ordered = _checks.namespace(edges).asarray(edges)
     falling = ordered[1:] <= ordered[:-1]
     where = ""
     if _checks.is_known(falling) and falling.any():
-        where = f"; {name}[{int(np.argmax(falling)) + 1}] is not above the one before"
-    edges = _checks.error_if(edges, falling.any(), f"{name}: wanted increasing times, s{where}")
+        where = f"; {times_name}[{int(np.argmax(falling)) + 1}] is not above the one before"
+    edges = _checks.error_if(
+        edges, falling.any(), f"{times_name}: wanted increasing times, s{where}"
+    )
     dtype = jnp.result_type(edges, rows)
     return edges.astype(dtype), rows.astype(dtype)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasPose, Scalar, ScalarLike, Vec3
+from rigidjax._types import HasAttitude, HasPose, Quat, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
 from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
@@ -43,16 +43,20 @@ class HeavyTop(base.AbstractTorque):
     mass: Float[Array, ""] = eqx.field(converter=base.number_converter("mass"))
     com: Float[Array, "3"] = eqx.field(converter=base.vector_converter("com"))
     gravity: Float[Array, "3"] = eqx.field(
-        converter=base.vector_converter("gravity", hint=base.WORLD)
+        converter=base.vector_converter("gravity", hint=base.GRAVITY_HINT)
     )
 
     @property
-    def axis(self) -> Vec3:
-        """Return gravity, world frame: the torque has no component along gravity."""
+    def axis(self) -> base.AxisWithoutTorque:
+        """Return a vector (3,), world frame, along which the torque has no component: gravity g,
+        m/s².
+        """
         return self.gravity
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
-        """Return the potential energy, J: `U = −m g·Rc`, zero where c is level with the pivot."""
+        """Return the potential energy, J: `U = −m g·Rc`, which is zero where the centre of mass is
+        level with the fixed point.
+        """
         return -self.mass * dot(self.com, quaternion.rotate_inverse(state.q, self.gravity))
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
@@ -95,51 +99,51 @@ class GravityGradient(base.AbstractTimeTorque):
 
     def __init__(self, mu: ScalarLike, position: object, harmonics: Sequence[ArrayLike] = ()):
         self.mu = _checks.finite_array(mu, (), "mu")
-        self.position = base.constant_or_callable(position, "position")
+        self.position = base.checked_vector_or_function(position, "position")
         self.harmonics = tuple(
             _checks.finite_array(row, (2 * n + 1,), f"harmonics: degree {n}")
             for n, row in enumerate(harmonics, 3)
         )
         at: Any = self.position
         if not callable(at) and _checks.is_known(at) and not np.asarray(at).any():
-            words = "the vector between the body and the central body"
+            words = "the vector from the body to the point mass"
             raise ValueError(f"position: wanted {words}, got zero")
 
     @property
-    def axis(self) -> Vec3 | None:
-        """Return the position, world frame, if it is constant: the torque has no component along
-        the position.
+    def axis(self) -> base.AxisWithoutTorque | None:
+        """Return a vector (3,), world frame, along which the torque has no component: the position
+        of the point mass, m, if it is constant; `None` otherwise.
         """
         source: Any = self.position
         return None if callable(source) else source
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Scalar:
-        """Return the potential energy of the attitude, J: `U = (μ/2r³)(3 u·Iu − Tr I) − Σ (μ/rⁿ⁺¹)
-        Hₙ(u)`.
+        """Return the part of the potential energy that depends on the attitude, J: `U = (μ/2r³)(3
+        u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`.
         """
         tensor = tensor_of(body)
-        u, strength, slopes = self._point_mass_in_body(t, state)
+        u, strength, slopes = self._direction_strength_and_harmonic_gradients(t, state)
         trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
         potential = 0.5 * strength * (3 * dot(u, apply(tensor, u)) - trace)
         for n, slope in enumerate(slopes, 3):
-            potential = potential - dot(u, slope) / n  # Euler: u·∇H = n H
+            potential = potential - dot(u, slope) / n  # Euler's theorem: u·∇Hₙ = n Hₙ
         return potential
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Vec3:
-        u, strength, slopes = self._point_mass_in_body(t, state)
+        u, strength, slopes = self._direction_strength_and_harmonic_gradients(t, state)
         pull = 3 * strength * apply(tensor_of(body), u)
         for slope in slopes:
             pull = pull - slope
         return cross(u, pull)
 
-    def _point_mass_in_body(
+    def _direction_strength_and_harmonic_gradients(
         self, t: ScalarLike, state: HasAttitude
     ) -> tuple[Vec3, Scalar, list[Vec3]]:
-        """Return three things about a far point mass that attracts the body: the unit vector u (3,)
-        towards it, in body axes; μ/r³, 1/s², with its gravitational parameter μ (the gravitational
-        constant times its mass) and its distance r; and a list with μ/rⁿ⁺¹ times the gradient (3,)
-        at u of Hₙ, the solid harmonic of degree n of the body's own gravity, for each degree n = 3,
-        4, … that is given.
+        """Return three things about a far point mass that attracts the body: its direction, a unit
+        vector u (3,), body axes; the strength μ/r³ of its gravity gradient, 1/s², with its
+        gravitational parameter μ (the gravitational constant times its mass) and its distance r;
+        and a list with μ/rⁿ⁺¹ times the gradient (3,) at u of Hₙ, the solid harmonic of degree n of
+        the body's own gravity, for each degree n = 3, 4, … that is given.
 
         - `t`: s, the time
         - `state`: a state with the attitude of the body
@@ -169,8 +173,8 @@ def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]
     """
     x, y, z = components(u)
     zero = jnp.zeros_like(z)
-    # Real and imaginary parts of rⁿ Pₙₘ exp(imλ), m = 0 … n + 1, of this degree and of the degree
-    # before it.
+    # The real and imaginary parts of rⁿ Pₙₘ exp(imλ) for m = 0 … n + 1: of this degree n (`here`),
+    # and of the degree n − 1 (`before`).
     before, here = [(zero, zero)] * 2, [(jnp.ones_like(z), zero), (zero, zero)]
     out = []
     for n in range(1, len(harmonics) + 3):
@@ -187,7 +191,7 @@ def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]
 
 
 def _solid_harmonic_gradient(
-    coefficients: Sequence[Scalar], n: int, lower: Sequence[tuple[Scalar, Scalar]]
+    coefficients: Sequence[Scalar], n: int, lower_harmonics: Sequence[tuple[Scalar, Scalar]]
 ) -> Vec3:
     """Return the gradient (3,) at one point of the solid harmonic Hₙ = Σ rⁿ Pₙₘ
     (C cos mλ + S sin mλ), a sum over m = 0, …, n, with the associated Legendre functions Pₙₘ of z/r
@@ -195,16 +199,20 @@ def _solid_harmonic_gradient(
 
     - `coefficients`: the 2n + 1 numbers Cn0, Cn1, Sn1, Cn2, Sn2, …
     - `n`: the degree
-    - `lower`: for m = 0, 1, …, n the real and imaginary parts of rⁿ⁻¹ Pₙ₋₁,ₘ exp(imλ), the solid
-      harmonics of the degree below, at the point; zero for m = n
+    - `lower_harmonics`: for m = 0, 1, …, n the real and imaginary parts of rⁿ⁻¹ Pₙ₋₁,ₘ exp(imλ),
+      the solid harmonics of degree n − 1, at the point; zero for m = n
     """
     zonal = coefficients[0]
-    along, flat_x, flat_y = n * zonal * lower[0][0], -zonal * lower[1][0], -zonal * lower[1][1]
+    along, flat_x, flat_y = (
+        n * zonal * lower_harmonics[0][0],
+        -zonal * lower_harmonics[1][0],
+        -zonal * lower_harmonics[1][1],
+    )
     for m in range(1, n + 1):
         c, s = coefficients[2 * m - 1 : 2 * m + 1]
-        (a, b), (p, q) = lower[m - 1], lower[m + 1] if m < n else (0.0, 0.0)
+        (a, b), (p, q) = lower_harmonics[m - 1], lower_harmonics[m + 1] if m < n else (0.0, 0.0)
         half = 0.5 * (n + m) * (n + m - 1)
-        along = along + (n + m) * (c * lower[m][0] + s * lower[m][1])
+        along = along + (n + m) * (c * lower_harmonics[m][0] + s * lower_harmonics[m][1])
         flat_x = flat_x + c * (half * a - 0.5 * p) + s * (half * b - 0.5 * q)
         flat_y = flat_y - c * (half * b + 0.5 * q) + s * (half * a + 0.5 * p)
     return jnp.stack([flat_x, flat_y, along])
@@ -226,24 +234,26 @@ class MagneticDipole(base.AbstractTimeTorque):
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True
     moment: Float[Array, "3"] = eqx.field(converter=base.vector_converter("moment"))
-    field: eqx.Module | Float[Array, "3"] = eqx.field(converter=base.source_converter("field"))
+    field: eqx.Module | Float[Array, "3"] = eqx.field(
+        converter=base.vector_or_function_converter("field")
+    )
 
     @property
-    def axis(self) -> Vec3 | None:
-        """Return the field, world frame, if it is constant: the torque has no component along the
-        field.
+    def axis(self) -> base.AxisWithoutTorque | None:
+        """Return a vector (3,), world frame, along which the torque has no component: the magnetic
+        field, T, if it is constant; `None` otherwise.
         """
         source: Any = self.field
         return None if callable(source) else source
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
         """Return the potential energy, J: `U = −m·RᵀB`."""
-        return -dot(self.moment, self._field_in_body(t, state))
+        return -dot(self.moment, self._magnetic_field_in_body(t, state))
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
-        return cross(self.moment, self._field_in_body(t, state))
+        return cross(self.moment, self._magnetic_field_in_body(t, state))
 
-    def _field_in_body(self, t: ScalarLike, state: HasAttitude) -> Vec3:
+    def _magnetic_field_in_body(self, t: ScalarLike, state: HasAttitude) -> Vec3:
         """Return the magnetic field (3,), T, body axes, at the time `t`, s, from the attitude of
         `state`.
         """
@@ -275,14 +285,14 @@ class FromPotential(base.AbstractTorque):
         self.potential = _checks.require_function(potential, "potential", "q → U, J")
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
-        """Return the potential energy, J."""
-        return self._potential_at(state.q)
+        """Return the potential energy U(q), J, at the attitude q of `state`."""
+        return self._potential_energy_at(state.q)
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
-        slope = jax.grad(self._potential_at)(state.q)
+        slope = jax.grad(self._potential_energy_at)(state.q)
         return -0.5 * quaternion.multiply(quaternion.conjugate(state.q), slope)[1:]
 
-    def _potential_at(self, q: Array) -> Scalar:
+    def _potential_energy_at(self, q: Quat) -> Scalar:
         """Return the potential energy, J, at the attitude `q` (4,), a quaternion. **Raises:** an
         error if the user's function does not return one number.
         """

@@ -31,7 +31,7 @@ class RandomTorque(AbstractTorque):
     density: Float[Array, "3"]
 
     def __init__(self, density: NumbersLike):
-        self.density = density_of(density)
+        self.density = checked_spectral_density(density)
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         return jnp.zeros_like(self.density)
@@ -58,7 +58,7 @@ class CorrelatedTorque(AbstractTorque):
     time: Scalar
 
     def __init__(self, density: NumbersLike, time: NumbersLike):
-        self.density = density_of(density)
+        self.density = checked_spectral_density(density)
         number = _checks.array_of_shape(time, (), "time").astype(self.density.dtype)
         self.time = _checks.require_positive(number, "time", "a positive correlation time, s")
 
@@ -71,17 +71,17 @@ class CorrelatedTorque(AbstractTorque):
         return jnp.zeros_like(self.density)
 
 
-def density_of(value: NumbersLike, name: str = "density", size: int = 3) -> Array:
-    """Return the spectral density (size,) of a white noise, one number for each axis, from one
-    number for all axes or `size` numbers. **Raises:** `ValueError` for a density below zero.
+def checked_spectral_density(value: NumbersLike, name: str = "density", size: int = 3) -> Array:
+    """Check the spectral density of a white noise, and return it with one number for each axis,
+    (size,). **Raises:** `ValueError` for a density below zero.
 
-    - `value`: the number or numbers
+    - `value`: one number for all axes, or `size` numbers
     - `name`: the name of the argument, for messages
     - `size`: the number of axes
     """
     density = _checks.numeric_array(value, name)
     if density.shape not in ((), (size,)):
-        raise ValueError(f"{name}: wanted one number or {size}, got shape {density.shape}")
+        raise ValueError(f"{name}: wanted one number or {size} numbers, got shape {density.shape}")
     density = jnp.broadcast_to(density, (size,)).astype(density.dtype)
     return _checks.require_positive(
         density, name, "a finite number that is not below zero", allow_zero=True

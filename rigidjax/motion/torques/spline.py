@@ -69,7 +69,7 @@ class Series(eqx.Module):
         )
 
     def __call__(self, t: ScalarLike) -> Any:
-        """Return the value at `t` (s), () or (k,)."""
+        """Return the value at the time `t`, s; its shape, () or (k,), is that of one sample."""
         n = self.values.shape[0]
         place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
         # `jnp.where` is used, not `jnp.clip`: exactly at an end, `jnp.clip` has half the
@@ -81,16 +81,16 @@ class Series(eqx.Module):
         # Without the barrier, XLA on CPU reads the table again for every number that is computed
         # from the rows.
         s, (left, right, out, into) = barrier((s, rows))
-        # Cubic Hermite form, from the left value.
+        # The cubic polynomial in Hermite form, expanded at the left sample.
         bend = 3.0 * (right - left) - 2.0 * out - into
         twist = 2.0 * (left - right) + out + into
         return left + s * (out + s * (bend + s * twist))
 
 
 def _numbers_in_full_precision(value: NumbersLike, name: str) -> Any:
-    """Return numbers as an array: of NumPy in float64 if JAX does not trace them, because the times
-    of a log have more than the seven digits of float32; of JAX in its default precision if JAX
-    traces them.
+    """Return numbers as an array with all their digits: as a NumPy array of float64 unless JAX
+    traces them, because the times of a log have more than the seven digits of float32; as an array
+    of JAX in its default precision if JAX traces them.
 
     - `value`: the numbers
     - `name`: the name of the argument, for messages
@@ -126,7 +126,8 @@ def _spline_slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *chan
 class Wheel(eqx.Module):
     """Describe the momentum of a wheel about a fixed axis whose speed was logged: `h = J s(t) a`.
 
-    Pass a wheel to `Flywheel`: a known internal momentum determines the absolute inertia of a body.
+    Pass a wheel to `Flywheel`: if the momentum of a wheel is known, a fit determines the absolute
+    inertia of a body, not its ratios alone.
 
     **Arguments:** `inertia` J, kg m², about the axis; `axis` (3,) a, body frame, unit; `speed` s,
     rad/s, relative to the body, a callable Module of time such as `Series(times, speeds)`; `delay`
@@ -161,20 +162,23 @@ class Wheel(eqx.Module):
         off = ~(abs(x * x + y * y + z * z - 1) < 2e-6)
         direction = _checks.error_if(direction, off, f"axis: wanted a unit vector (3,){got}")
         _checks.require_function(speed, "speed", "of time to rad/s")
-        kind = jnp.result_type(float)
-        self.inertia = _checks.finite_array(inertia, (), "inertia").astype(kind)
-        self.axis, self.speed = direction.astype(kind), speed
+        dtype = jnp.result_type(float)
+        self.inertia = _checks.finite_array(inertia, (), "inertia").astype(dtype)
+        self.axis, self.speed = direction.astype(dtype), speed
         self.delay = (
-            None if delay is None else _checks.finite_array(delay, (), "delay").astype(kind)
+            None if delay is None else _checks.finite_array(delay, (), "delay").astype(dtype)
         )
-        self.tilt = None if tilt is None else _checks.finite_array(tilt, (2,), "tilt").astype(kind)
+        self.tilt = None if tilt is None else _checks.finite_array(tilt, (2,), "tilt").astype(dtype)
 
     @property
     def direction(self) -> Vec3:
-        """Return the axis with its tilt, a unit vector."""
+        """Return the direction of the wheel's axis after its tilt, a unit vector (3,), body
+        frame.
+        """
         if self.tilt is None:
             return self.axis
-        # The nearest of ±x, ±y and ±z determines the two directions across.
+        # The coordinate axis that is nearest to the axis of the wheel determines the two directions
+        # across it.
         next_one = jnp.roll(jnp.eye(3, dtype=self.axis.dtype), 1, axis=1)
         first = next_one[jnp.argmax(jnp.abs(self.axis))]
         first = first - dot(first, self.axis) * self.axis

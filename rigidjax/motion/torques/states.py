@@ -2,8 +2,8 @@
 state of the body.
 
 Such a torque has `state0`, the initial states, and `rate`, the derivative of the states; the states
-are the last argument of the torque. `freeze` inserts the states: for the rest of the library the
-result is a plain torque.
+are the last argument of the torque. `freeze_own_states` inserts the states: for the rest of the
+library the result is a plain torque.
 """
 
 from collections.abc import Callable
@@ -20,14 +20,14 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Body
 
 Tree = TypeVar("Tree")
-# The members of a torque that depend on its states.
-_OF_STATES = ("energy", "internal_momentum")
+# The methods of a torque that take the values of its own states as their last argument.
+_MEMBERS_THAT_TAKE_STATES = ("energy", "internal_momentum")
 
 
 class FrozenLaw(eqx.Module):
     """Wrap a torque or function of time `law` that has states of its own (such as the speed of a
     wheel), with the values `own` of these states inserted, so that it can be called without them;
-    `freeze` makes it.
+    `freeze_own_states` makes it.
     """
 
     law: Any
@@ -37,12 +37,12 @@ class FrozenLaw(eqx.Module):
         return self.law(*args, self.own[0])
 
     def __getattr__(self, name: str) -> Any:
-        # The members of the torque (`feels`, `jump_times`, …) are handed on, except the members
-        # that belong to states.
+        # All members of the torque (`feels`, `jump_times`, …) are members of this object as well,
+        # except `state0` and `rate`: it has no states that somebody must integrate.
         if name.startswith("_") or name in ("law", "own", "state0", "rate"):
             raise AttributeError(name)
         attribute = getattr(self.law, name)
-        return FrozenLaw(attribute, self.own) if name in _OF_STATES else attribute
+        return FrozenLaw(attribute, self.own) if name in _MEMBERS_THAT_TAKE_STATES else attribute
 
 
 def has_own_states(node: object) -> bool:
@@ -53,79 +53,84 @@ def has_own_states(node: object) -> bool:
     return not isinstance(node, type) and hasattr(node, "state0") and hasattr(node, "rate")
 
 
-def has_states(law: PyTree) -> bool:
-    """Return whether the torque `law`, or any torque or function of time inside it, has states of
-    its own, such as the speed of a wheel.
+def contains_own_states(torque: PyTree) -> bool:
+    """Return whether `torque`, or any torque or function of time inside it, has states of its own,
+    such as the speed of a wheel.
     """
-    return any(map(has_own_states, jax.tree.leaves(law, is_leaf=_has_states_or_is_frozen)))
+    return any(map(has_own_states, jax.tree.leaves(torque, is_leaf=_has_states_or_is_frozen)))
 
 
-def require_stateless(law: PyTree, user: str) -> None:
-    """Raise `ValueError` if the torque `law` has states of its own, such as the speed of a wheel,
-    which the caller does not integrate; the text `user` names the caller in the message.
+def require_no_own_states(torque: PyTree, caller: str) -> None:
+    """Raise `ValueError` if `torque` has states of its own, such as the speed of a wheel, which the
+    calling function does not integrate. The text `caller` names this function in the message.
     """
-    if has_states(law):
+    if contains_own_states(torque):
         raise ValueError(
-            f"{user}: wanted a torque without states of its own, got one that has some (such as "
+            f"{caller}: wanted a torque without states of its own, got one that has some (such as "
             "ReactionWheels or Lagged); integrate rigidjax.equations_of_motion with "
             "diffrax.diffeqsolve and diffrax.Event"
         )
 
 
-def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
-    """Return the torque `law` with the states `own` inserted, so that it can be called as a torque
-    without states.
+def freeze_own_states(torque: Tree, own: tuple[PyTree, ...]) -> Tree:
+    """Return `torque`, or a tree that contains a torque (such as a vector field), with the values
+    `own` of its own states inserted, so that it can be called without them.
 
-    `own` holds the states of each part of `law` that has states, in the order of these parts in
-    `law`, inner parts first.
+    `own` holds the states of each part of `torque` that has states, in the order of these parts in
+    `torque`, inner parts first.
     """
     queue = list(own)
-    if not queue and not has_states(law):
-        return law
+    if not queue and not contains_own_states(torque):
+        return torque
 
-    def own_of(node: PyTree) -> Any:
+    def next_states(node: PyTree) -> PyTree:
         if not queue:
-            raise ValueError(f"own: no states for {type(node).__name__}")
+            words = "wanted the states of each part of the torque that has states of its own"
+            raise ValueError(f"own: {words}, got no states for {type(node).__name__}")
         return queue.pop(0)
 
-    frozen = _insert_states(law, own_of)
+    frozen = _insert_states(torque, next_states)
     if queue:
-        raise ValueError(f"own: the torque has {len(own) - len(queue)} with states, got {len(own)}")
+        count = len(own) - len(queue)
+        words = f"wanted one tree of states for each of the {count} parts of the torque with states"
+        raise ValueError(f"own: {words}, got {len(own)}; are they of another torque?")
     return frozen
 
 
-def initial_states(law: PyTree, t: ScalarLike, state: PyTree, body: Body) -> tuple[Any, ...]:
+def initial_own_states(
+    torque: PyTree, t: ScalarLike, state: PyTree, body: Body
+) -> tuple[PyTree, ...]:
     """Return the initial states of a torque, as a tuple with a tree of arrays for each part of the
     torque that has states of its own (inner parts first), in the precision of the state of the
     body.
 
-    - `law`: the torque
+    - `torque`: the torque
     - `t`: s, the time of the start
     - `state`: the state of motion at the start
     - `body`: an `Inertia` or `MassProperties`
     """
     states: list[Any] = []
 
-    def initial_state_of(node: PyTree) -> Any:
+    def initial_state_of(node: PyTree) -> PyTree:
         here = node.state0(t, state, body) if callable(node.state0) else node.state0
-        own = _checked_numbers(here, f"state0 of {type(node).__name__}", state.omega.dtype)
+        own = _cast_numeric_leaves(here, f"state0 of {type(node).__name__}", state.omega.dtype)
         if not jax.tree.leaves(own):
             raise ValueError(f"state0 of {type(node).__name__}: wanted a tree of arrays, got none")
         states.append(own)
         return own
 
-    _insert_states(law, initial_state_of)
+    _insert_states(torque, initial_state_of)
     return tuple(states)
 
 
 def rates_of_own_states(
-    law: PyTree, t: ScalarLike, own: tuple[Any, ...], state: PyTree, body: Body
-) -> tuple[Any, ...]:
+    torque: PyTree, t: ScalarLike, own: tuple[PyTree, ...], state: PyTree, body: Body
+) -> tuple[PyTree, ...]:
     """Return the derivatives with respect to time of the states that a torque has of its own, as a
     tuple of trees like `own`. **Raises:** `ValueError` for a derivative whose shape is not that of
     the state.
 
-    - `law`: the torque
+    - `torque`: the torque
     - `t`: s, the time
     - `own`: for each part of the torque that has states, inner parts first, a tree with their
       values
@@ -134,47 +139,48 @@ def rates_of_own_states(
     """
     queue, rates = list(own), []
 
-    def rate_of_node(node: PyTree) -> Any:
+    def rate_of_node(node: PyTree) -> PyTree:
         here = queue.pop(0)
         name = f"rate of {type(node).__name__}"
-        rate = _checked_numbers(node.rate(t, here, state, body), name, state.omega.dtype)
+        rate = _cast_numeric_leaves(node.rate(t, here, state, body), name, state.omega.dtype)
         wanted, shapes = (jax.tree.map(jnp.shape, tree) for tree in (here, rate))
         if wanted != shapes:
             raise ValueError(f"{name}: wanted arrays as in state0, {wanted}, got {shapes}")
         rates.append(rate)
         return here
 
-    _insert_states(law, rate_of_node)
+    _insert_states(torque, rate_of_node)
     return tuple(rates)
 
 
-def require_frozen(law: PyTree) -> None:
-    """Raise `TypeError` if the torque `law` has states of its own, such as the speed of a wheel,
-    but is called without the values of these states.
+def require_frozen_states(torque: PyTree) -> None:
+    """Raise `TypeError` if `torque` has states of its own, such as the speed of a wheel, whose
+    values are not inserted (see `freeze_own_states`).
     """
-    if has_own_states(law):
+    if has_own_states(torque):
         words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate and "
         words += "identify.fit integrate them; elsewhere call it with its states last"
-        raise TypeError(f"{type(law).__name__} {words}: law(t, state, body, own)")
+        raise TypeError(f"{type(torque).__name__} {words}: torque(t, state, body, own)")
 
 
-def _insert_states(tree: PyTree, own_of: Callable[[Any], Any]) -> Any:
+def _insert_states(torque: PyTree, states_of: Callable[[PyTree], PyTree]) -> PyTree:
     """Return a torque in which each torque with states of its own (such as the speed of a wheel) is
     replaced by a `FrozenLaw`: this torque together with the values of its states.
 
-    - `tree`: the torque, or a tree of torques
-    - `own_of`: a function (torque) that returns the values of the states of one torque. If a torque
-      contains another one, the function is called for the inner torque first.
+    - `torque`: the torque, or a tree of torques
+    - `states_of`: a function (torque) that returns the values of the states of one torque. If a
+      torque contains another one, the function is called for the inner torque first.
     """
 
     def is_leaf(node: PyTree) -> bool:
-        return node is not tree and _has_states_or_is_frozen(node)
+        return node is not torque and _has_states_or_is_frozen(node)
 
-    def insert_in_node(node: PyTree) -> Any:
-        return _insert_states(node, own_of) if node is not tree and has_own_states(node) else node
+    def insert_in_node(node: PyTree) -> PyTree:
+        inner = node is not torque and has_own_states(node)
+        return _insert_states(node, states_of) if inner else node
 
-    inserted = jax.tree.map(insert_in_node, tree, is_leaf=is_leaf)
-    return FrozenLaw(inserted, (own_of(inserted),)) if has_own_states(tree) else inserted
+    inserted = jax.tree.map(insert_in_node, torque, is_leaf=is_leaf)
+    return FrozenLaw(inserted, (states_of(inserted),)) if has_own_states(torque) else inserted
 
 
 def _has_states_or_is_frozen(node: PyTree) -> bool:
@@ -184,9 +190,9 @@ def _has_states_or_is_frozen(node: PyTree) -> bool:
     return isinstance(node, FrozenLaw) or has_own_states(node)
 
 
-def _checked_numbers(tree: PyTree, name: str, dtype: DTypeLike) -> Any:
-    """Return a tree of arrays after a check that each array holds numbers, with each array
-    converted to `dtype`.
+def _cast_numeric_leaves(tree: PyTree, name: str, dtype: DTypeLike) -> PyTree:
+    """Return a tree of arrays with each array converted to `dtype`, after a check that each array
+    holds numbers.
 
     - `tree`: the states of a user's torque, or their derivatives, as the torque returned them
     - `name`: the name of the tree, for messages

@@ -17,7 +17,7 @@ from rigidjax.body.inertia import Inertia, MassProperties, OneBody, tensor_of, w
 from rigidjax.body.symmetric3 import outer
 from rigidjax.motion.torques import base
 from rigidjax.motion.torques.inputs import require_no_jumps
-from rigidjax.motion.torques.states import has_states
+from rigidjax.motion.torques.states import contains_own_states
 from rigidjax.rotation.linalg3 import cross
 
 # The torque of a motor falls to zero over this fraction of the top speed of the wheel.
@@ -46,8 +46,8 @@ class Flywheel(base.AbstractTimeTorque):
     momentum: eqx.Module | Float[Array, "3"]
 
     def __init__(self, momentum: object):
-        self.momentum = base.constant_or_callable(momentum, "momentum")
-        if has_states(momentum):
+        self.momentum = base.checked_vector_or_function(momentum, "momentum")
+        if contains_own_states(momentum):
             raise TypeError(
                 "Flywheel: wanted a momentum whose derivative with respect to time is known, got "
                 "one with states; see ReactionWheels"
@@ -55,11 +55,11 @@ class Flywheel(base.AbstractTimeTorque):
         require_no_jumps(momentum, "momentum")
 
     def internal_momentum(self, t: ScalarLike) -> Vec3:
-        """Return the wheels' momentum h at `t`, (3,), N m s, body frame."""
+        """Return the momentum h (3,) of the wheels at the time `t`, s, N m s, body frame."""
         return base.vector_at(self.momentum, t, "momentum")
 
     def energy(self, t: ScalarLike, state: HasSpin, body: object) -> Scalar:
-        """Return zero, J: h × Ω does no work."""
+        """Return the potential energy of the wheels, J, which is zero: h × Ω does no work."""
         return jnp.zeros((), state.omega.dtype)
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
@@ -140,19 +140,21 @@ class ReactionWheels(base.AbstractTorque):
         turn_over: ScalarLike = 1.0,
     ):
         count = base.row_count(axes, "axes", "wheel")
-        self.axes = base.unit_rows(axes, "axes", count)
+        self.axes = base.checked_unit_rows(axes, "axes", count)
         inertia = _checks.finite_array(inertia, (count,), "inertia")
         self.inertia = _checks.check_if_known(_checks.require_positive, inertia, "inertia", "> 0")
         self.speeds = _checks.finite_array(speeds, (count,), "speeds")
-        self.motor = None if motor is None else base.constant_or_callable(motor, "motor", count)
+        self.motor = (
+            None if motor is None else base.checked_vector_or_function(motor, "motor", count)
+        )
         words = "(t, state, speeds) → torques (R,), N m"
         self.feedback = (
             None if feedback is None else _checks.require_function(feedback, "feedback", words)
         )
-        self.max_torque = _checked_one_or_each(max_torque, count, "max_torque", "> 0")
-        self.max_speed = _checked_one_or_each(max_speed, count, "max_speed", "> 0")
-        self.viscous = _checked_one_or_each(viscous, count, "viscous", "≥ 0")
-        self.coulomb = _checked_one_or_each(coulomb, count, "coulomb", "≥ 0")
+        self.max_torque = _checked_wheel_property(max_torque, count, "max_torque", "> 0")
+        self.max_speed = _checked_wheel_property(max_speed, count, "max_speed", "> 0")
+        self.viscous = _checked_wheel_property(viscous, count, "viscous", "≥ 0")
+        self.coulomb = _checked_wheel_property(coulomb, count, "coulomb", "≥ 0")
         turn_over = _checks.finite_array(turn_over, (), "turn_over")
         self.turn_over = _checks.check_if_known(
             _checks.require_positive, turn_over, "turn_over", "> 0"
@@ -164,11 +166,13 @@ class ReactionWheels(base.AbstractTorque):
         parts = (self.motor, self.feedback, self.viscous, self.coulomb)
         return all(part is None for part in parts)
 
-    jump_times = property(base.jumps_of_parts)
+    jump_times = property(base.jump_times_of_fields)
 
     def without_wheels(self, body: OneBody) -> OneBody:
-        """Return the `body`, an `Inertia` or `MassProperties` with locked wheels, minus `Σ J a
-        aᵀ`.
+        """Return the body with the inertia I − Σ J a aᵀ, from which the moments of the wheels about
+        their axes are subtracted.
+
+        - `body`: an `Inertia` or `MassProperties` whose inertia I includes the locked wheels
         """
         body = validation.require_single_body(body, (Inertia, MassProperties), "body")
         rows = (j * outer(a, a) for j, a in zip(self.inertia, self.axes, strict=True))
@@ -236,7 +240,7 @@ class ReactionWheels(base.AbstractTorque):
         """Return the momentum of the wheels Σ h a, (3,), N m s, body frame, with the axes a of the
         wheels and their axial momenta h = `own` (R,), N m s.
         """
-        return self._sum_along_axes(own)
+        return self._vector_sum_over_wheels(own)
 
     def energy(self, t: ScalarLike, state: HasSpin, body: object, own: Array) -> Scalar:
         """Return the kinetic energy of the wheels about their axes, Σ h²/2J, J, with their axial
@@ -245,22 +249,22 @@ class ReactionWheels(base.AbstractTorque):
         return jnp.sum(own * own / (2.0 * self.inertia))
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object, own: Array) -> Vec3:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return cross(self._sum_along_axes(own), state.omega) - self._sum_along_axes(
+        return cross(self._vector_sum_over_wheels(own), state.omega) - self._vector_sum_over_wheels(
             self.torques_of(t, own, state)
         )
 
-    def _sum_along_axes(self, numbers: Array) -> Vec3:
+    def _vector_sum_over_wheels(self, axial_components: Float[Array, " wheels"]) -> Vec3:
         """Return the vector Σ xᵢ aᵢ (3,), body frame, a sum over the R wheels, with the unit
         vectors aᵢ along their axes.
 
-        - `numbers`: x (R,), one number for each wheel, such as its momentum, N m s, or its torque,
-          N m
+        - `axial_components`: x (R,), one number for each wheel, such as its momentum, N m s, or its
+          torque, N m
         """
-        # The sum is written out wheel by wheel: there are few wheels, and in a batch array sums are
-        # slow.
-        total = jnp.zeros(3, numbers.dtype)
+        # The sum is written out wheel by wheel: there are few wheels, and in a batch of bodies
+        # `jnp.sum` is slow.
+        total = jnp.zeros(3, axial_components.dtype)
         for i in range(self.axes.shape[0]):
-            total = total + numbers[i] * self.axes[i]
+            total = total + axial_components[i] * self.axes[i]
         return total
 
 
@@ -271,7 +275,7 @@ def _smooth_step(x: Array) -> Array:
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))
 
 
-def _checked_one_or_each(
+def _checked_wheel_property(
     value: NumbersLike | None, count: int, name: str, requirement: str
 ) -> Array | None:
     """Return a property of the wheels, such as the largest torque, checked: a scalar array if it is
@@ -284,7 +288,7 @@ def _checked_one_or_each(
     """
     if value is None:
         return None
-    numbers = base.broadcast_to_each(value, count, name)
+    numbers = base.scalar_or_one_each(value, count, name)
     return _checks.check_if_known(
         _checks.require_positive, numbers, name, requirement, zero=requirement == "≥ 0"
     )
