@@ -196,12 +196,14 @@ def require_compatible(torque: Torque | None, state: object, body: object) -> No
     - `state`: one state of motion with the parts that the torque reads
     - `body`: one `Inertia` or `MassProperties`
     """
-    _checks.require_single(state, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid")
+    _checks.require_unbatched_instance(
+        state, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid"
+    )
     if torque is not None:
         require_state_type(torque, state)
         require_frozen_states(torque)
         require_unbatched_torque(torque.law if isinstance(torque, FrozenLaw) else torque)
-    _checks.require_single(body, (Inertia, MassProperties), "body")
+    _checks.require_unbatched_instance(body, (Inertia, MassProperties), "body")
 
 
 def evaluate_torque(
@@ -339,7 +341,7 @@ def number_converter(name: str) -> Callable[[Any], Array]:
     return lambda value: _checks.finite_array(value, (), name)
 
 
-def vector_or_function_converter(name: str) -> Callable[[Any], Array | Callable[[Any], Any]]:
+def vector_or_function_converter(name: str) -> Callable[[Any], Any]:
     """Return a function that checks a value and converts it to a vector (3,), or leaves it
     unchanged if it is a function of time to such a vector, for `equinox.field(converter=…)`; `name`
     is the name of the field, for messages.

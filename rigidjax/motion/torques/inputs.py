@@ -136,7 +136,10 @@ class Lagged(eqx.Module):
         self.source = _checks.require_function(source, "source", "of time")
         dtype = jnp.result_type(float)
         time = _checks.check_if_known(
-            _checks.require_sign, _finite_nonempty_array(time, "time"), "time", "a positive time, s"
+            _checks.require_positive,
+            _finite_nonempty_array(time, "time"),
+            "time",
+            "a positive time, s",
         )
         self.time = time.astype(dtype)
         self.start = None if start is None else _finite_nonempty_array(start, "start").astype(dtype)

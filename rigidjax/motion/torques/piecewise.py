@@ -220,7 +220,7 @@ def _checked_times_and_rows(
         words = f"{rows_name}: wanted {count - times_beyond_rows} rows of 3"
         raise ValueError(f"{words}, got shape {rows.shape}; {advice}")
     edges, rows = _checks.require_finite(edges, times_name), _checks.require_finite(rows, rows_name)
-    ordered = _checks.namespace(edges).asarray(edges)
+    ordered = _checks.array_module(edges).asarray(edges)
     falling = ordered[1:] <= ordered[:-1]
     where = ""
     if _checks.is_known(falling) and falling.any():
