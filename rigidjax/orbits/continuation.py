@@ -10,17 +10,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.orbits import differential_correction as correction
-from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing, index_of_held, orbit_of
+from rigidjax.orbits.differential_correction import (
+    PeriodicOrbit,
+    index_of_held,
+    numbers_at_crossing,
+    orbit_of,
+)
 
 if TYPE_CHECKING:
     from rigidjax.orbits.reversible_scene import AbstractReversible
 
-# The largest number of steps in the search for a branch point.
+# The search for a branch point takes at most this number of steps.
 _MOST = 60
 
 
@@ -51,23 +56,25 @@ def family(
     >>> [round(float(p), 3) for p in found.period]
     [2.712, 2.811]
     """
-    start, index = crossing(orbit), index_of_held(hold)
+    start, index = numbers_at_crossing(orbit), index_of_held(hold)
     length = np.shape(values)
     if len(length) != 1 or length[0] < 1:
         raise ValueError(f"values: wanted shape (N,), values of {hold}, got shape {length}")
     values = _checks.require_finite(_checks.array_of_shape(values, length, "values"), "values")
     values = values.astype(start.dtype)
     held = 0.5 * values if hold == "period" else values
-    numbers, left = _members_at_values(scene, start, held, index, correction.usual_tolerance(start))
+    numbers, residuals = _members_at_values(
+        scene, start, held, index, correction.usual_tolerance(start)
+    )
     where = lambda i: f" at {hold} = {values[i]:.9g}"  # noqa: E731
     advice = "; take smaller steps, or the family turns back there: hold another of x, z, vy, "
-    lost = _is_lost(start, numbers, left)
+    lost = _is_lost(start, numbers, residuals)
     return _orbits_unless_lost(
-        numbers, lost, where, "family: lost", advice + "period, or use follow"
+        numbers, lost, where, "family: lost the family", advice + "period, or use follow"
     )
 
 
-def _is_lost(start: Array, numbers: Array, left: Array) -> Array:
+def _is_lost(start: Array, numbers: Array, residuals: Array) -> Bool[Array, " members"]:
     """Return booleans (N,), one for each of the N members of a family of periodic orbits: whether
     Newton's method failed there, or went to an orbit of less than half or more than twice the
     period of the member before it.
@@ -75,16 +82,16 @@ def _is_lost(start: Array, numbers: Array, left: Array) -> Array:
     - `start`: (4,) the numbers x, z, v_y, T/2 of the orbit before the first member: its position,
       its velocity and half of its period T, where it crosses y = 0 at a right angle.
     - `numbers`: (N, 4) the numbers x, z, v_y, T/2 of the members.
-    - `left`: (N,) the largest of |y|, |v_x| and |v_z| of each member after half a period; Newton's
-      method failed if it is NaN or above the usual tolerance.
+    - `residuals`: (N,) the largest of |y|, |v_x| and |v_z| of each member after half a period;
+      Newton's method failed if it is NaN or above the usual tolerance.
     """
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
-    return ~((left <= correction.usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
+    return ~((residuals <= correction.usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
 
 
 def _orbits_unless_lost(
-    numbers: Array, is_lost: Array, place: Callable[[int], str], message: str, advice: str
+    numbers: Array, is_lost: Array, describe_member: Callable[[int], str], message: str, advice: str
 ) -> PeriodicOrbit:
     """Return the N members of a family as one `PeriodicOrbit` with a leading axis, or raise an
     error if a member is lost (if Newton's method did not find it).
@@ -92,20 +99,21 @@ def _orbits_unless_lost(
     - `numbers`: (N, 4) the numbers x, z, v_y, T/2 of the members: position, velocity and half of
       the period T, where an orbit crosses y = 0 at a right angle.
     - `is_lost`: (N,) true for each member that is lost.
-    - `place`: a function that returns, for the index of the first lost member, the words that name
-      it in the message; it is called only if `is_lost` is known, and not traced as within
-      `jax.jit`.
-    - `message`, `advice`: the words of the error before and after this place.
+    - `describe_member`: a function that returns, for the index of the first lost member, the words
+      that name this member in the error; it is called only if `is_lost` is known, and not traced as
+      within `jax.jit`.
+    - `message`, `advice`: the words of the error before and after the words that name the member.
     """
     known = _checks.is_known(is_lost) and bool(is_lost.any())
-    words = message + (place(int(np.argmax(np.asarray(is_lost)))) if known else "") + advice
+    member = describe_member(int(np.argmax(np.asarray(is_lost)))) if known else ""
+    words = message + member + advice
     return jax.vmap(orbit_of)(_checks.error_if(numbers, is_lost.any(), words))
 
 
 @eqx.filter_jit
 def _members_at_values(
     scene: "AbstractReversible", start: Array, held_values: Array, index: int, tolerance: float
-) -> Any:
+) -> tuple[Array, Array]:
     """Return two arrays: the numbers x, z, v_y, T/2 (N, 4) of the members of a family of periodic
     orbits, one for each of N held values; and the largest residual (N,) of each, |y|, |v_x| or
     |v_z| after half a period.
@@ -123,21 +131,21 @@ def _members_at_values(
     free = np.delete(np.arange(4), index)
     still = jax.tree.map(lambda n: lax.stop_gradient(n) if eqx.is_array(n) else n, scene)
 
-    def step(previous: Array, value: Scalar) -> Any:
+    def next_member(previous: Array, value: Scalar) -> tuple[Array, tuple[Array, Array]]:
         # The start of Newton's method is not differentiated: the converged orbit does not depend on
         # the start.
         previous, aim = lax.stop_gradient(previous), lax.stop_gradient(value)
         guess = previous[free] + _derivative_along_family(still, previous, index) * (
             aim - previous[index]
         )
-        root, left = correction.correct_orbit(index, tolerance, scene, guess, value)
+        root, largest = correction.correct_orbit(index, tolerance, scene, guess, value)
         numbers = correction.insert_held(root, value, index)
-        return numbers, (numbers, left)
+        return numbers, (numbers, largest)
 
     # The guess is corrected first: the tangent of the family exists only at an exact member.
     held_now = lax.stop_gradient(start[index])
     root, _ = correction.correct_orbit(index, tolerance, still, start[free], held_now)
-    _, out = lax.scan(step, correction.insert_held(root, start[index], index), held_values)
+    _, out = lax.scan(next_member, correction.insert_held(root, start[index], index), held_values)
     return out
 
 
@@ -157,7 +165,7 @@ def family_slope(
     >>> round(float(hill.family_slope(orbit).period), 3)
     12.076
     """
-    change = _orbit_derivative(scene, crossing(orbit), index_of_held(hold))
+    change = _orbit_derivative(scene, numbers_at_crossing(orbit), index_of_held(hold))
     turned = ~jnp.isfinite(change.period)
     words = f"family_slope: the family has a fold in {hold} here; take another of x, z, vy, period"
     return _checks.error_if(change, turned, words)
@@ -173,7 +181,7 @@ def _derivative_along_family(
     right angle.
 
     - `scene`: the equations of motion.
-    - `numbers`: (4,) those four numbers of the orbit at which the derivatives are taken.
+    - `numbers`: (4,) the numbers x, z, v_y, T/2 of the orbit at which the derivatives are taken.
     - `index`: the index, 0 to 3, of the number with respect to which the other three are
       differentiated.
     """
@@ -221,25 +229,27 @@ def follow(
     `periodic_orbit` first. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) with the
     number of members found before the family was lost.
     """
-    start, index = crossing(orbit), index_of_held(rising)
+    start, index = numbers_at_crossing(orbit), index_of_held(rising)
     length = _checks.array_of_shape(step, (), "step").astype(start.dtype)
     bad = ~(jnp.isfinite(length) & (length != 0))
     length = _checks.error_if(length, bad, "step: wanted a number that is not 0")
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"count: wanted the number of members, an integer ≥ 1, got {count!r}")
     tolerance = correction.usual_tolerance(start)
-    numbers, left = _follow_family(scene, start, length, count, index, tolerance)
+    numbers, residuals = _follow_family(scene, start, length, count, index, tolerance)
     moved = jnp.diff(jnp.concatenate([start[None], numbers]), axis=0)
     far = jnp.sqrt(jnp.sum(moved * moved, axis=1)) > 2 * jnp.abs(length)
-    lost = _is_lost(start, numbers, left) | far
+    lost = _is_lost(start, numbers, residuals) | far
     where = lambda i: f" after {i} of {count} members"  # noqa: E731
-    return _orbits_unless_lost(numbers, lost, where, "follow: lost", "; take smaller steps")
+    return _orbits_unless_lost(
+        numbers, lost, where, "follow: lost the family", "; take smaller steps"
+    )
 
 
 @eqx.filter_jit
 def _follow_family(
     scene: "AbstractReversible", start: Array, step: Array, count: int, index: int, tolerance: float
-) -> Any:
+) -> tuple[Array, Array]:
     """Return two arrays for the next N = `count` members of a family of periodic orbits, at equal
     steps of arclength: their numbers x, z, v_y, T/2 (N, 4); and the largest residual (N,) of each,
     |y|, |v_x| or |v_z| after half a period.
@@ -258,7 +268,7 @@ def _follow_family(
     def residual(numbers: Array) -> Array:
         return correction.periodicity_residual(scene, numbers)
 
-    def tangent(matrix: Array, previous: Array) -> Array:
+    def unit_tangent(matrix: Array, previous: Array) -> Array:
         """Return the unit tangent (4,) of the family at a member, in the direction that has a
         positive product with `previous`.
 
@@ -271,15 +281,17 @@ def _follow_family(
         along = jnp.linalg.solve(rows, jnp.zeros(4, start.dtype).at[3].set(1))
         return along / jnp.sqrt(jnp.sum(along * along))
 
-    def next_member(carry: PyTree, _member: None) -> Any:
+    def next_member(
+        carry: tuple[Array, Array], _member: None
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         last, before = carry
         _, matrix = correction.value_and_jacobian(residual, last)
-        along = tangent(matrix, before)
+        along = unit_tangent(matrix, before)
 
         def across(numbers: Array) -> Array:
             return jnp.append(residual(numbers), jnp.sum(along * (numbers - last)) - step)
 
-        root = correction.newton(across, last + step * along, tolerance)
+        root = correction.newton_root(across, last + step * along, tolerance)
         return (root, along), (root, jnp.max(jnp.abs(residual(root))))
 
     first = jnp.zeros(4, start.dtype).at[index].set(1)
@@ -335,7 +347,7 @@ def bifurcation(
     value = _checks.python_float(value, "value")
     if not np.isfinite(value):
         raise ValueError(f"value: wanted a finite number, got {value}")
-    a, b = (float(crossing(one)[place]) for one in (orbit, other))
+    a, b = (float(numbers_at_crossing(one)[place]) for one in (orbit, other))
     left, right = (scene.periodic_orbit(one, hold=hold) for one in (orbit, other))
     orbits = {a: left, b: right}
 
@@ -356,12 +368,13 @@ def bifurcation(
 
 
 def _stability_index(scene: "AbstractReversible", orbit: PeriodicOrbit, index: int) -> float:
-    """Return one stability index ν = ½(λ + 1/λ) of a periodic orbit as a Python float, where λ is
-    an eigenvalue of the monodromy matrix; raise `ValueError` if the index is complex.
+    """Return one stability index ν = ½(λ + 1/λ) of a periodic orbit as a Python float, and raise
+    `ValueError` if the index is complex.
 
-    `index`, 0 or 1, selects one of the two stability indices of the `orbit` in the `scene`.
+    λ and 1/λ are two eigenvalues of the monodromy matrix other than the pair 1, 1 that every orbit
+    has. `index`, 0 or 1, selects one of the two stability indices of the `orbit` in the `scene`.
     """
-    stability = np.asarray(_stability_of_orbit(scene, orbit))[index]
+    stability = np.asarray(_compiled_stability_indices(scene, orbit))[index]
     if abs(stability.imag) > 1e-9 * max(1.0, abs(stability)):
         words = "the stability indices are complex at a member between the orbits"
         raise ValueError(f"bifurcation: {words}; give orbits nearer to each other")
@@ -369,9 +382,13 @@ def _stability_index(scene: "AbstractReversible", orbit: PeriodicOrbit, index: i
 
 
 @eqx.filter_jit
-def _stability_of_orbit(scene: "AbstractReversible", orbit: PeriodicOrbit) -> Array:
+def _compiled_stability_indices(
+    scene: "AbstractReversible", orbit: PeriodicOrbit
+) -> Complex[Array, "2"]:
     """Return both stability indices ν = ½(λ + 1/λ) (2,) of a periodic `orbit`, complex, the larger
-    real part first, by a compiled program. Here λ, 1/λ are the two pairs of eigenvalues of the
-    monodromy matrix other than 1, 1, and `scene` has the equations of motion.
+    real part first, by a compiled program.
+
+    λ and 1/λ are the two pairs of eigenvalues of the monodromy matrix other than 1, 1. The `scene`
+    has the equations of motion.
     """
     return scene.stability_indices(orbit)

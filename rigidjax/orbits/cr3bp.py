@@ -18,8 +18,9 @@ from rigidjax.orbits.reversible_scene import AbstractReversible
 from rigidjax.rotation.linalg3 import components
 
 
-def smallest_distance(dtype: DTypeLike) -> float:
-    """Return the distance r = eps^0.4 at which a run ends, since the attraction loses its digits.
+def smallest_accurate_distance(dtype: DTypeLike) -> float:
+    """Return the distance r = eps^0.4 from a body below which the attraction loses too many digits,
+    so that a run ends there.
 
     eps is the machine epsilon of `dtype`. Positions have rounding errors of about eps, so that the
     relative error of the attraction at r is about eps/r = eps^0.6.
@@ -118,18 +119,22 @@ class ThreeBody(AbstractReversible):
             shapes = f"{columns.shape} and {rows.shape}; give the axes, not a mesh"
             raise ValueError(f"zero_velocity: wanted xs (N,) and ys (M,), got {shapes}")
 
-        def value(x: Scalar, y: Scalar) -> Scalar:
+        def doubled_potential(x: Scalar, y: Scalar) -> Scalar:
             return 2 * self.potential(jnp.stack([x, y, jnp.zeros_like(x)]))
 
-        along = jax.vmap(value, (0, None))
+        along = jax.vmap(doubled_potential, (0, None))
         return jax.vmap(along, (None, 0))(columns, rows.astype(columns.dtype))
 
-    def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+    def approach(
+        self, t: ScalarLike, state: Point
+    ) -> tuple[Float[Array, "distances=2"], Float[Array, "collision_distances=2"]]:
         """Return two arrays (2,): the distances from both bodies; and the distances that count as a
         collision.
         """
         gaps = jnp.stack(self.distances(state.x))
-        return gaps, jnp.maximum(self.radii.astype(gaps.dtype), smallest_distance(gaps.dtype))
+        return gaps, jnp.maximum(
+            self.radii.astype(gaps.dtype), smallest_accurate_distance(gaps.dtype)
+        )
 
     @property
     def lagrange_points(self) -> Float[Array, "5 3"]:
@@ -193,7 +198,7 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
     (Earth–Moon 0.01215…); `radii` (2,) the radii of the two bodies in units of the distance between
     them. A run that comes closer to a body than its radius ends with a message that says the body,
     the time and the distance. For radii of zero a run ends at the distance where rounding spoils
-    the attraction (`smallest_distance`). **Raises:** `ValueError` for μ outside (0, ½]
+    the attraction (`smallest_accurate_distance`). **Raises:** `ValueError` for μ outside (0, ½]
     (`EquinoxRuntimeError` under `jit`). Source: notes, eq 91, with a uniform Ω = (0, 0, 1);
     Szebehely 1967, Theory of Orbits.
 
@@ -245,12 +250,14 @@ class Hill(AbstractReversible):
         speed = jnp.sum(state.v * state.v)
         return 3 * x * x - z * z + 2 / jnp.sqrt(x * x + y * y + z * z) - speed
 
-    def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
+    def approach(
+        self, t: ScalarLike, state: Point
+    ) -> tuple[Float[Array, "distances=1"], Float[Array, "collision_distances=1"]]:
         """Return two arrays (1,): the distance from the small body; and the distance that counts as
         a collision.
         """
         gap = jnp.sqrt(jnp.sum(state.x * state.x, keepdims=True))
-        least = jnp.maximum(self.radius.astype(gap.dtype), smallest_distance(gap.dtype))
+        least = jnp.maximum(self.radius.astype(gap.dtype), smallest_accurate_distance(gap.dtype))
         return gap, least.reshape(1)
 
     @property

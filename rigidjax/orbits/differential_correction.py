@@ -19,7 +19,7 @@ from rigidjax.frames.point import Point
 from rigidjax.rotation.linalg3 import components
 
 _NAMES = ("x", "z", "vy", "period")
-# The largest number of steps of Newton's method.
+# Newton's method takes at most this number of steps.
 MAX_STEPS = 25
 
 
@@ -69,13 +69,15 @@ def periodic_orbit(
     >>> round(float(orbit.period), 4)
     2.712
     """
-    numbers, index = crossing(guess), index_of_held(hold)
+    numbers, index = numbers_at_crossing(guess), index_of_held(hold)
     free = np.delete(np.arange(4), index)
     if tolerance is None:
         tolerance = usual_tolerance(numbers)
     unknown, left = _compiled_correction(scene, numbers[free], numbers[index], index, tolerance)
     bad = ~(left <= tolerance)
-    said = f" ({float(left):.1e} left at half period)" if _checks.is_known(left) else ""
+    said = ""
+    if _checks.is_known(left):
+        said = f" (the largest of |y|, |vx|, |vz| is {float(left):.1e} at half period)"
     words = f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
     words += "hold another of x, z, vy, period, or loosen the tolerance"
     unknown = _checks.error_if(unknown, bad, words)
@@ -90,14 +92,18 @@ def periodic_orbit(
 
 
 def index_of_held(hold: str) -> int:
-    """Return the index of the quantity `hold` in (x, z, v_y, T/2)."""
+    """Return the index, 0 to 3, in (x, z, v_y, T/2) of the quantity `hold`: `"x"`, `"z"`, `"vy"` or
+    `"period"`.
+    """
     return _NAMES.index(_checks.require_option(hold, _NAMES, "hold"))
 
 
-def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
-    """Return x, z, v_y, T/2 (4,) of an orbit of period T that crosses y = 0 at a right angle.
+def numbers_at_crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
+    """Return the four numbers x, z, v_y, T/2 (4,) of an orbit `guess`: its position and velocity at
+    the plane y = 0, and half of its period T.
 
-    Raise an error if the state of `guess` does not cross the plane y = 0 at a right angle.
+    An error is raised unless the state of `guess` crosses this plane at a right angle, so that y,
+    v_x and v_z are zero.
     """
     made = "lyapunov_guess and halo_guess make one"
     wanted = "a PeriodicOrbit(state, period)"
@@ -113,7 +119,11 @@ def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
 
 
 def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
-    """Return the orbit with the `numbers` x, z, v_y, T/2 (4,): the inverse of `crossing`."""
+    """Return the orbit with the `numbers` x, z, v_y, T/2 (4,).
+
+    This function is the inverse of `numbers_at_crossing`: the position is (x, 0, z), the velocity
+    (0, v_y, 0), and the period T.
+    """
     x, z, vy, half = components(numbers)
     zero = jnp.zeros_like(x)
     return PeriodicOrbit(Point(jnp.stack([x, zero, z]), jnp.stack([zero, vy, zero])), 2 * half)
@@ -133,13 +143,13 @@ def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> F
 
 
 def usual_tolerance(numbers: Array) -> float:
-    """Return the default tolerance for |y|, |v_x| and |v_z| at the half period of an orbit with
-    these `numbers`: 1e-12, or 1e-4 in float32.
+    """Return the default tolerance for |y|, |v_x| and |v_z| after half a period of an orbit: 1e-12
+    if the `numbers` of the orbit are float64, else 1e-4.
     """
     return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
 
 
-def integrate(
+def integrate_particle(
     scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **options: Any
 ) -> dfx.Solution:
     """Return the solution of a particle's motion from `state` at time 0 to time `t`, with
@@ -161,11 +171,15 @@ def integrate(
 def state_after(
     scene: AbstractScene, numbers: Float[Array, "6"], t: Array, *, rtol: float, atol: float
 ) -> Float[Array, "6"]:
-    """Return (x, v) (6,) after a motion of duration `t` that starts at (x, v) = `numbers` (6,).
+    """Return the position and velocity (x, v) (6,) after a motion of duration `t` that starts at
+    (x, v) = `numbers` (6,).
 
-    Raise an error if the solve fails.
+    An error is raised if the solve fails. The `scene` has the equations of motion; `rtol` and
+    `atol` are the relative and absolute tolerance of a step.
     """
-    out = integrate(scene, Point(numbers[:3], numbers[3:]), t.astype(numbers.dtype), rtol, atol)
+    out = integrate_particle(
+        scene, Point(numbers[:3], numbers[3:]), t.astype(numbers.dtype), rtol, atol
+    )
     end: Any = out.result.error_if(out.ys, out.result != dfx.RESULTS.successful)
     return jnp.concatenate([end.x[0], end.v[0]])
 
@@ -175,6 +189,10 @@ def transition_matrix(
 ) -> Float[Array, "6 6"]:
     """Return the state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) of the motion that starts at
     `state`.
+
+    **Arguments:** `scene` the equations of motion; `state` a `Point` with the initial position x
+    and velocity v; `t` the duration of the motion, in the scene's unit of time; `rtol`, `atol` the
+    relative and absolute tolerance of a step.
     """
     _checks.require_instance(state, Point, "state", requirement="a Point(x, v)")
     t = _checks.require_finite(_checks.array_of_shape(t, (), "t"), "t")
@@ -198,13 +216,14 @@ def _compiled_transition_matrix(
 
 
 def periodicity_residual(scene: AbstractScene, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
-    """Return y, v_x and v_z (3,) at the half period; the orbit is periodic if all three vanish.
+    """Return y, v_x and v_z (3,) after half a period; the orbit is periodic if all three are zero.
 
-    **Arguments:** `numbers` (4,) x, z, v_y at time 0, and the half period T/2.
+    **Arguments:** `scene` the equations of motion; `numbers` (4,) x, z, v_y at time 0, where y = 0
+    and v_x = v_z = 0, and half of the period, T/2.
     """
     orbit = orbit_of(numbers)
     tight = float(jnp.finfo(numbers.dtype).eps)
-    out = integrate(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight)
+    out = integrate_particle(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight)
     end: Any = out.ys
     left = jnp.stack([end.x[0, 1], end.v[0, 0], end.v[0, 2]])
     return jnp.where(out.result == dfx.RESULTS.successful, left, jnp.nan)
@@ -218,36 +237,37 @@ def value_and_jacobian(f: Callable[[Array], Array], x: Array) -> tuple[Array, Ar
     return along(jnp.eye(x.shape[0], dtype=x.dtype))
 
 
-def newton(f: Callable[[Array], Array], x: Array, tolerance: float) -> Array:
-    """Return a zero (n,) of the function `f` near the start `x` (n,), by Newton's method.
+def newton_root(f: Callable[[Array], Array], start: Array, tolerance: float) -> Array:
+    """Return a zero (n,) of the function `f` near the point `start` (n,), by Newton's method.
 
     The steps end when all |f| are below a tenth of `tolerance`, or after `MAX_STEPS` steps. `f`
     returns as many values (n,) as it has unknowns.
     """
 
-    def is_unfinished(carry: tuple[Array, Array, Array]) -> Any:
+    def is_unfinished(carry: tuple[Array, Array, Array]) -> Array:
         _, left, count = carry
         return (left > 0.1 * tolerance) & (count < MAX_STEPS)
 
-    def step(carry: tuple[Array, Array, Array]) -> Any:
+    def newton_step(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         x, _, count = carry
         missed, slope = value_and_jacobian(f, x)
         moved = x - jnp.linalg.solve(slope, missed)
-        # The returned residual is that before this step, since the residual after the step would
-        # cost a further solve. Newton's method converges quadratically, so that the residual after
-        # the step is smaller still.
+        # The loop ends by the residual before the last step, since the residual after this step
+        # would cost a further solve. Newton's method converges quadratically, so that the residual
+        # after the step is smaller still.
         return jnp.where(jnp.isfinite(moved), moved, x), jnp.max(jnp.abs(missed)), count + 1
 
-    return lax.while_loop(is_unfinished, step, (x, jnp.full_like(x[0], jnp.inf), 0))[0]
+    carry = start, jnp.full_like(start[0], jnp.inf), 0
+    return lax.while_loop(is_unfinished, newton_step, carry)[0]
 
 
-# Newton's method itself is not differentiated: `_correct_orbit_jvp` is its derivative. That rule is
-# linear in the tangents, so that it serves `jax.jacfwd` and `jax.grad`, although the solves inside
-# run in forward mode.
+# Newton's method itself is not differentiated: `_correct_orbit_jvp` is its derivative. This rule is
+# linear in the tangents, so that it serves both `jax.jacfwd` and `jax.grad`, although the motions
+# inside the rule are differentiated in forward mode.
 @eqx.filter_jit
 def _compiled_correction(
     scene: AbstractScene, unknown: Array, held_value: Array, index: int, tolerance: float
-) -> Any:
+) -> tuple[Array, Array]:
     """Return two things: the three corrected numbers (3,) of a periodic orbit; and the largest
     residual, |y|, |v_x| or |v_z| after half a period.
 
@@ -284,14 +304,19 @@ def correct_orbit(
     def residual(unknown: Array) -> Array:
         return periodicity_residual(scene, insert_held(unknown, held_value, index))
 
-    unknown = newton(residual, unknown, tolerance)
+    unknown = newton_root(residual, unknown, tolerance)
     return unknown, jnp.max(jnp.abs(residual(unknown)))
 
 
 @correct_orbit.def_jvp
-def _correct_orbit_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-    """Return the outputs of `correct_orbit` (the three numbers that make an orbit periodic, and the
-    largest residual), and their derivatives along given tangents, by the implicit function theorem.
+def _correct_orbit_jvp(
+    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Return two things: the two results of `correct_orbit`; and their derivatives along given
+    tangents, by the implicit function theorem.
+
+    The two results are the three numbers (3,) that make an orbit periodic, and the largest residual
+    that is left, whose derivative is taken as zero.
 
     - `primals`: the arguments of `correct_orbit`: index, tolerance, scene, unknown numbers (3,) and
       held value.

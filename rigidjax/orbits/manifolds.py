@@ -16,20 +16,25 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.frames.point import Point
 from rigidjax.orbits import continuation
-from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing, integrate, state_after
+from rigidjax.orbits.differential_correction import (
+    PeriodicOrbit,
+    integrate_particle,
+    numbers_at_crossing,
+    state_after,
+)
 from rigidjax.solve.run import Ends
 
 if TYPE_CHECKING:
     from rigidjax.orbits.reversible_scene import AbstractReversible
 
-# The signs of x, y, z, vx, vy, vz in the mirror image, y → −y and t → −t, of a motion: the image is
-# a motion, too.
+# These are the signs of x, y, z, vx, vy, vz in the mirror image, y → −y and t → −t, of a motion.
+# The image is a motion, too.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 Branch = Literal["stable", "unstable"]
-# The tolerances of a step where a manifold starts.
+# A manifold starts at a point of the orbit that is computed with these tolerances of a step.
 _TIGHT = dict(rtol=1e-13, atol=1e-14)
-# The number of steps of inverse iteration; each step reduces the error of an eigenvector at least a
-# hundredfold.
+# Inverse iteration takes this number of steps. Each step reduces the error of an eigenvector at
+# least a hundredfold.
 _ITERATIONS = 12
 
 
@@ -75,16 +80,18 @@ def unstable_direction(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Ar
     near = value * (1 + jnp.finfo(value.dtype).eps ** 0.5)
     still, shift = lax.stop_gradient((monodromy, near))
 
-    def square_and_scale(_: Array, both: tuple[Array, Array]) -> Any:
+    def improve_both_eigenvectors(_: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
         right, left = both
         right = jnp.linalg.solve(still - shift * eye, right)
         left = jnp.linalg.solve((still - shift * eye).T, left)
         return right / jnp.sqrt(jnp.sum(right**2)), left / jnp.sqrt(jnp.sum(left**2))
 
     first = jnp.asarray(np.full(6, 6**-0.5), monodromy.dtype)
-    right, left = lax.fori_loop(0, _ITERATIONS, square_and_scale, (first, first))
-    # The bordered system (M − λ) v + m left = 0, right · v = 1 is regular although M − λ is
-    # singular; the derivatives of the eigenvector v come from this system.
+    right, left = lax.fori_loop(0, _ITERATIONS, improve_both_eigenvectors, (first, first))
+    # The bordered system (M − λ) v + m left = 0, right · v = 1 for the eigenvector v and a number m
+    # is regular although M − λ is singular. Here M is the monodromy matrix, λ its eigenvalue, and
+    # left and right are its eigenvectors by inverse iteration. The derivatives of v come from this
+    # system.
     top = jnp.concatenate([monodromy - value * eye, left[:, None]], 1)
     last = jnp.concatenate([right, jnp.zeros(1, right.dtype)])[None]
     wanted = jnp.zeros(7, right.dtype).at[6].set(1)
@@ -102,11 +109,17 @@ def manifold_point(
     side: int,
     distance: Scalar,
 ) -> tuple[Point, Scalar]:
-    """Return the start of the manifold at `phase`, and the multiplier: see `manifold_start`."""
+    """Return two things, after checks: a state near a periodic orbit, on its stable or unstable
+    manifold; and the multiplier λ, the factor by which the distance from the orbit changes in one
+    period.
+
+    An error is raised for another `branch` or `side`, and for an orbit whose state does not cross
+    the plane y = 0 at a right angle. The arguments are those of `_compiled_manifold_point`.
+    """
     _checks.require_option(branch, ("stable", "unstable"), "branch")
     if isinstance(side, bool) or side not in (1, -1):
         raise ValueError(f"side: wanted 1 (to larger x at the orbit's start) or -1, got {side!r}")
-    crossing(orbit)
+    numbers_at_crossing(orbit)
     return _compiled_manifold_point(scene, orbit, phase, branch, side, distance)
 
 
@@ -183,15 +196,15 @@ def manifold(
     """
     count, samples = _checks.integer(count, "count", 1), _checks.integer(samples, "samples", 2)
     dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
-    distance = _positive_distance(distance, "distance", dtype)
+    distance = _positive_number(distance, "distance", dtype)
     phases = jnp.arange(count).astype(distance.dtype) / count
     starts, value = jax.vmap(lambda p: manifold_point(scene, orbit, p, branch, side, distance))(
         phases
     )
-    words = "manifold: the orbit has no multiplier that is real and larger than 1: it is stable to "
-    words += "first order, or spirals"
+    words = "manifold: the orbit has no multiplier that is real and of size above 1: it is stable "
+    words += "to first order, or nearby motions spiral; take an orbit with an index |ν| > 1"
     value = _checks.error_if(value[0], jnp.isnan(value[0]), words)
-    length = 2 * orbit.period if time is None else _positive_distance(time, "time", dtype)
+    length = 2 * orbit.period if time is None else _positive_number(time, "time", dtype)
     ts = jnp.linspace(jnp.zeros_like(length), length, samples)
     states = _manifold_trajectories(scene, starts, ts, branch)
     return Manifold(ts if branch == "unstable" else -ts, states, phases, value)
@@ -226,7 +239,7 @@ def manifold_start(
     return manifold_point(scene, orbit, where, branch, side, away)[0]
 
 
-def _positive_distance(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
+def _positive_number(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
     """Return `value` as one positive number in the precision `dtype` (`None` keeps the precision of
     `value`), or raise an error that begins with `name`.
     """
@@ -260,7 +273,7 @@ def _manifold_trajectories(
 
     def trajectory(start: Point) -> Point:
         how = dict(saveat=dfx.SaveAt(ts=ts), event=dfx.Event(Ends(scene)))
-        out = integrate(scene, mirror_if_stable(start), ts[-1], 1e-11, 1e-12, **how)
+        out = integrate_particle(scene, mirror_if_stable(start), ts[-1], 1e-11, 1e-12, **how)
         there: Any = jnp.isfinite(jnp.asarray(out.ts))[:, None]
         ys: Any = jax.tree.map(lambda leaf: jnp.where(there, leaf, jnp.nan), out.ys)
         return jax.vmap(mirror_if_stable)(ys)

@@ -26,7 +26,9 @@ class AbstractReversible(AbstractScene):
     """
 
     @abc.abstractmethod
-    def approach(self, t: ScalarLike, state: Point) -> tuple[Array, Array]:
+    def approach(
+        self, t: ScalarLike, state: Point
+    ) -> tuple[Float[Array, " distances"], Float[Array, " collision_distances"]]:
         """Return two arrays (k,): the distances from the k bodies; and the distances that count as
         a collision.
         """
@@ -44,7 +46,10 @@ class AbstractReversible(AbstractScene):
         return jnp.any(gaps <= least)
 
     def end_words(self, t: ScalarLike, state: Point) -> str:
-        """Return a sentence that says the body, the time and the distance of a collision."""
+        """Return words that say with which body, when and at which distance the particle collided.
+
+        They are used in the message of the error with which a run ends.
+        """
         gaps = self.approach(t, state)[0]
         if not _checks.is_known(gaps):
             return "the particle collided with one of the scene's bodies"

@@ -15,18 +15,19 @@ from rigidjax.orbits.differential_correction import PeriodicOrbit
 
 
 def lagrange_points(mu: Scalar) -> Float[Array, "5 3"]:
-    """Return the positions of L1 … L5 (5, 3), rotating axes, for 0 < μ ≤ ½.
+    """Return the positions of L1 … L5 (5, 3), rotating axes, for the mass ratio μ = `mu` of the
+    second body, 0 < μ ≤ ½.
 
     L1, L2 and L3 are roots of Euler's quintic polynomials (Szebehely 1967, sec. 4.4).
     """
-    between, beyond, opposite = distances(mu)
+    between, beyond, opposite = collinear_point_distances(mu)
     half, zero, height = 0.5 - mu, jnp.zeros_like(mu), jnp.full_like(mu, 0.75**0.5)
     x = jnp.stack([1 - mu - between, 1 - mu + beyond, -mu - opposite, half, half])
     y = jnp.stack([zero, zero, zero, height, -height])
     return jnp.stack([x, y, jnp.zeros_like(x)], axis=1)
 
 
-def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+def collinear_point_distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """Return three distances of collinear equilibrium points from bodies, in units of the distance
     between the bodies: of L1 and of L2 from the second body; and of L3 from the first body.
 
@@ -34,29 +35,35 @@ def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """
     one = jnp.ones_like(mu)
     hill = jnp.cbrt(mu / (3 * (1 - mu)))
-    between = _root_near([one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3))
-    beyond = _root_near([one, 3 - mu, 3 - 2 * mu, -mu, -2 * mu, -mu], hill * (1 + hill / 3))
+    between = _polynomial_root_near(
+        [one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3)
+    )
+    beyond = _polynomial_root_near(
+        [one, 3 - mu, 3 - 2 * mu, -mu, -2 * mu, -mu], hill * (1 + hill / 3)
+    )
     rest = mu - 1
-    opposite = _root_near([one, 2 + mu, 1 + 2 * mu, rest, 2 * rest, rest], 1 - 7 * mu / 12)
+    opposite = _polynomial_root_near(
+        [one, 2 + mu, 1 + 2 * mu, rest, 2 * rest, rest], 1 - 7 * mu / 12
+    )
     return between, beyond, opposite
 
 
-def _root_near(coefficients: list[Scalar], start: Scalar) -> Scalar:
+def _polynomial_root_near(coefficients: list[Scalar], start: Scalar) -> Scalar:
     """Return a root of a polynomial by seven steps of Newton's method.
 
     - `coefficients`: the coefficients, that of the highest power first.
-    - `start`: a number near the root. The starts that `distances` gives (estimates of the distances
-      of the equilibrium points L1, L2, L3) are so near to the roots, for every mass ratio, that
-      seven steps are enough.
+    - `start`: a number near the root. The estimates of the distances of the equilibrium points L1,
+      L2, L3 with which `collinear_point_distances` starts are so near to the roots, for every mass
+      ratio, that seven steps are enough.
     """
 
-    def step(_: object, x: Scalar) -> Scalar:
+    def newton_step(_: object, x: Scalar) -> Scalar:
         value, slope = coefficients[0], jnp.zeros_like(x)
         for c in coefficients[1:]:
             value, slope = value * x + c, slope * x + value
         return x - value / slope
 
-    return lax.fori_loop(0, 7, step, start)
+    return lax.fori_loop(0, 7, newton_step, start)
 
 
 def orbit_guess(
@@ -67,12 +74,13 @@ def orbit_guess(
 
     Either `along_x`, the amplitude of a planar Lyapunov orbit, or `along_z`, the amplitude of a
     halo orbit, whose sign selects the branch, is a number; the other argument is `None`. The
-    amplitude is small compared with the distance from the point to the nearer body. Source:
-    Richardson 1980, Celest. Mech. 22, 241, doi:10.1007/BF01229511, at τ = 0.
+    amplitude is small compared with the distance from the point to the nearer body. `mu` is the
+    mass ratio μ of the second body. Source: Richardson 1980, Celest. Mech. 22, 241,
+    doi:10.1007/BF01229511, at the phase τ = 0.
     """
     if point not in (1, 2, 3):
         raise ValueError(f"point: wanted 1, 2 or 3, a collinear point, got {point}")
-    unit = distances(mu)[point - 1]
+    unit = collinear_point_distances(mu)[point - 1]
     c2, c3, c4 = (_potential_coefficient(mu, unit, point, n) for n in (2, 3, 4))
     rate = jnp.sqrt(0.5 * (2 - c2 + jnp.sqrt((c2 - 2) ** 2 + 4 * (c2 - 1) * (1 + 2 * c2))))
     w, w2 = rate, rate * rate
@@ -136,7 +144,7 @@ def _checked_amplitude(value: ScalarLike | None) -> Scalar:
     return _checks.require_finite(_checks.array_of_shape(value, (), "amplitude"), "amplitude")
 
 
-def _potential_coefficient(mu: Scalar, unit: Scalar, point: int, n: int) -> Scalar:
+def _potential_coefficient(mu: Scalar, point_distance: Scalar, point: int, n: int) -> Scalar:
     """Return the coefficient c_n, for the power `n` of the distance, of the expansion of the
     potential of the three-body problem about a collinear equilibrium point.
 
@@ -144,11 +152,11 @@ def _potential_coefficient(mu: Scalar, unit: Scalar, point: int, n: int) -> Scal
     Richardson 1980, eq 8.
 
     - `mu`: the mass ratio μ, the mass of the second body divided by the mass of both.
-    - `unit`: the distance of the point from the nearer body, in units of the distance between the
-      bodies.
+    - `point_distance`: the distance of the point from the nearer body, in units of the distance
+      between the bodies.
     - `point`: 1, 2 or 3 for L1, L2, L3.
     """
-    g = unit
+    g = point_distance
     if point == 3:
         return ((1 - mu) + mu * (g / (1 + g)) ** (n + 1)) / g**3
     side = 1.0 if point == 1 else (-1.0) ** n

@@ -56,7 +56,7 @@ def orbit_of(row):
 @eqx.filter_jit
 def left(scene, orbits):
     """What the orbits miss at the half period, and their stability."""
-    numbers = jax.vmap(differential_correction.crossing)(orbits)
+    numbers = jax.vmap(differential_correction.numbers_at_crossing)(orbits)
     missed = jax.vmap(lambda n: differential_correction.periodicity_residual(scene, n))(numbers)
     return jnp.max(jnp.abs(missed)), jax.vmap(scene.stability_indices)(orbits)
 
@@ -66,7 +66,7 @@ def test_published_halo_orbits_and_their_stability():
     scene = orbits.cr3bp(0.04)
     correct = eqx.filter_jit(jax.vmap(lambda row: scene.periodic_orbit(orbit_of(row), hold="z")))
     found = correct(jnp.asarray(HOWELL))
-    numbers = jax.vmap(differential_correction.crossing)(found)
+    numbers = jax.vmap(differential_correction.numbers_at_crossing)(found)
     # Half a unit of the last digit printed, and of that of z carried along the family.
     slopes = jax.vmap(lambda orbit: scene.family_slope(orbit, hold="z"))(found)
     carried = np.stack(
@@ -182,7 +182,7 @@ def test_following_a_family_past_its_turn():
     assert float(missed) <= 1e-12
     turns = np.diff(np.append(float(first.state.x[0]), found.state.x[:, 0]))
     assert turns[0] < 0 < turns[-1] and (np.diff(found.state.x[:, 2]) > 0).all()
-    numbers = np.asarray(jax.vmap(differential_correction.crossing)(found))
+    numbers = np.asarray(jax.vmap(differential_correction.numbers_at_crossing)(found))
     chords = np.sqrt(np.square(np.diff(numbers, axis=0)).sum(axis=1))
     np.testing.assert_allclose(chords, 0.03, rtol=0.02)
     # The same members by another road.
@@ -257,13 +257,16 @@ def test_a_long_walk_finds_the_stable_band(mu, stable):
         (lambda o: MOON.family(o, [0.8, 0.8], hold="y"), "hold: wanted one of x, z, vy, period"),
         (lambda o: MOON.family(o, 0.8), r"values: wanted shape \(N,\)"),
         (lambda o: MOON.family(o, [0.8, np.nan]), "values: contains NaN or infinity at index"),
-        (lambda o: MOON.family(o, [0.82, 0.6]), "family: lost at x = .*; take smaller steps"),
+        (
+            lambda o: MOON.family(o, [0.82, 0.6]),
+            "family: lost the family at x = .*; take smaller steps",
+        ),
         (lambda o: MOON.family_slope(o, hold="z"), "has a fold in z here"),
         (lambda o: MOON.follow(o, 0.0, 3), "step: wanted a number that is not 0"),
         (lambda o: MOON.follow(o, 0.1, 0), "count: wanted the number of members"),
         pytest.param(
             lambda o: MOON.follow(o, -1.0, 2),
-            "follow: lost after 0 of 2 members; take smaller",
+            "follow: lost the family after 0 of 2 members; take smaller",
             marks=pytest.mark.slow,
         ),
         (lambda o: MOON.periodic_orbit(PeriodicOrbit(o.state, -1.0)), "a period that is positive"),

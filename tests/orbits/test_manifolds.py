@@ -213,5 +213,5 @@ def test_words(unhooked):
     # Long after the end of Hill's family g is a stable orbit: the retrograde ones.
     hill = orbits.hill()
     stable = orbits.PeriodicOrbit(rj.Point([0.3, 0, 0], [0.0, -2.2, 0]), 0.8)
-    with pytest.raises(ValueError, match="no multiplier that is real and larger than 1"):
+    with pytest.raises(ValueError, match="no multiplier that is real and of size above 1"):
         hill.manifold(hill.periodic_orbit(stable), "unstable", count=2, samples=2)

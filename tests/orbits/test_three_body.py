@@ -361,7 +361,7 @@ def test_particles_side_by_side_collide_alone():
         ),
         (
             lambda: MOON.periodic_orbit(ARENSTORF, tolerance=1e-30),
-            "no orbit near the guess .* left at half period",
+            "no orbit near the guess .* at half period",
         ),
     ],
 )
