@@ -21,7 +21,7 @@ from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.charts import Bodies
-from rigidjax.identify.model.model import Model, require_one
+from rigidjax.identify.model.model import Model, require_single_model
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.identify.uncertainty import covariance as uncertainty
 from rigidjax.identify.uncertainty.quantities import (
@@ -197,7 +197,7 @@ def _require_one_brightness(model: Model) -> Reading:
     Raise `TypeError` for traced numbers, as within `jax.jit`, and `ValueError` for a model with
     another sensor, several sensors, recordings or bodies, or a torque.
     """
-    require_one(model)
+    require_single_model(model)
     if not _checks.is_known(model):
         words = "got traced ones; call it outside of jax.jit, jax.grad and jax.vmap"
         raise TypeError(f"model: wanted known numbers, {words}")

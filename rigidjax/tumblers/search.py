@@ -15,7 +15,7 @@ from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.free import leaf_at
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.normal import NormalMatrix
-from rigidjax.identify.model.terms import Noise, scene_template
+from rigidjax.identify.model.terms import Noise, scene_at_starting_values
 from rigidjax.identify.search.least_squares import CAREFUL, Settings, minimise
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.rotation import quaternion
@@ -231,7 +231,7 @@ def _with_best_level(starts: Float[Array, "starts n"], model: Model) -> Float[Ar
     zero phase) is not a free number of the `model`, so that it must keep its value. A start is a
     vector (n,) of free numbers.
     """
-    scene = scene_template(model, model.records)
+    scene = scene_at_starting_values(model, model.records)
     path = leaf_at(lambda s: s.sensors[0].level, scene, "level", "the sensor")[0]
     mine = [slot for slot in model.slots if slot.path == path and slot.shared is not None]
     if not mine:
@@ -248,7 +248,7 @@ def _with_best_level(starts: Float[Array, "starts n"], model: Model) -> Float[Ar
         else:
             shape = jnp.where(mask, reading.values[0] - error, 0.0)
             better = level * jnp.sum(shape * reading.values[0]) / jnp.sum(shape * shape)
-        step = slot.step(level, better)
+        step = slot.step_between(level, better)
         return start.at[slot.shared].set(step.reshape(jnp.asarray(slot.shared).shape))
 
     return jax.vmap(level_of_start)(starts)

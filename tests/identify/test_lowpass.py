@@ -80,7 +80,9 @@ def test_the_model_goes_through_the_filter_and_so_do_its_derivatives():
 
     def errors(x):
         record, reference = pick_records(problem.records, 0), pick_records(problem.reference, 0)
-        return errors_in_sensor_units(problem, problem.index.rows(x)[0], record, reference, None)[0]
+        return errors_in_sensor_units(
+            problem, problem.index.rows_of_recordings(x)[0], record, reference, None
+        )[0]
 
     # SciPy's filter begins at rest; by then it has forgotten that.
     np.testing.assert_allclose(errors(flat)[t > 0.5], 0.0, atol=1e-4)

@@ -8,8 +8,8 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.model.model import AbstractPull, with_parts
-from rigidjax.identify.model.normal import NormalMatrix, OwnBlocks, normal_of
+from rigidjax.identify.model.model import AbstractPull, with_replaced_fields
+from rigidjax.identify.model.normal import NormalMatrix, OwnBlocks, normal_matrix_of_jacobians
 from rigidjax.identify.search.stages import errors_and_slopes
 from rigidjax.identify.uncertainty import covariance as uncertainty
 
@@ -85,19 +85,19 @@ def test_it_is_the_whole_matrix(dtype):
     unit, more = (RNG.uniform(0.5, 2.0, size).astype(dtype) for _ in range(2))
     x, sides = RNG.normal(size=size).astype(dtype), RNG.normal(size=(size, 2)).astype(dtype)
     for own in (None, alone):
-        found = normal_of((jnp.asarray(rows),), jnp.asarray(where), size, own)
+        found = normal_matrix_of_jacobians((jnp.asarray(rows),), jnp.asarray(where), size, own)
         assert found.core.shape[0] == (size if own is None else size - own.size * problem.count)
         np.testing.assert_allclose(found.diagonal, np.diag(wanted), rtol=exact)
         np.testing.assert_allclose(found @ jnp.asarray(x), wanted @ x, rtol=exact, atol=100 * exact)
         whole = wanted * np.outer(unit, unit) + np.diag(more)
-        made = found.in_units(jnp.asarray(unit)).add_diagonal(jnp.asarray(more))
+        made = found.scale_rows_and_columns(jnp.asarray(unit)).add_diagonal(jnp.asarray(more))
         for side in (x, sides):
             solved = np.linalg.solve(whole, side)
             near = exact * np.abs(solved).max()
             np.testing.assert_allclose(made.solve(jnp.asarray(side)), solved, atol=near)
     body = np.zeros((2, size), dtype)
     body[:, :4] = RNG.normal(size=(2, 4))
-    wider = found.with_rows(jnp.asarray(body))
+    wider = found.add_residual_rows(jnp.asarray(body))
     np.testing.assert_allclose(
         wider @ jnp.asarray(x), wanted @ x + body.T @ (body @ x), atol=100 * exact
     )
@@ -204,7 +204,9 @@ class Joints(AbstractPull):
 
 
 def test_numbers_that_rows_tie_together_stay_in_the_core():
-    linear = linear_at(with_parts(identify.Model(records(9), identify.Ratios()), pull=Joints()))
+    linear = linear_at(
+        with_replaced_fields(identify.Model(records(9), identify.Ratios()), pull=Joints())
+    )
     rows = jacobian(linear)
     wanted = np.linalg.pinv(rows) @ np.linalg.pinv(rows).T
     size = np.sqrt(np.diag(wanted))

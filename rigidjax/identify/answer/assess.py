@@ -23,7 +23,7 @@ from rigidjax.identify.answer.answers import (
 from rigidjax.identify.answer.causes import time_stamp_cause
 from rigidjax.identify.answer.result import Fit, Start
 from rigidjax.identify.data.recording import Reading
-from rigidjax.identify.model.model import Model, describe_delays
+from rigidjax.identify.model.model import Model, describe_delays_outside_windows
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.search.noise import median_of_chi2
 from rigidjax.identify.search.stages import (
@@ -384,7 +384,7 @@ def assess(
     else:
         covariance, hidden = jackknife(stretches, white), stretches.hidden_directions
         remarks = (*remarks, *remarks_on(stretches, model, numbers, white))
-    remarks = (*remarks, *describe_delays(model, x))
+    remarks = (*remarks, *describe_delays_outside_windows(model, x))
     parts = considered.considerations(model, linear, noise, white.determined)
     covariance = _with_considered(covariance, parts, model)
     shifts = considered.stacked_shifts(parts, linear.size)

@@ -17,9 +17,9 @@ from rigidjax.identify.answer.answers import Cause
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, readings_of
 from rigidjax.identify.data.reference_states import attitudes, rates_of
-from rigidjax.identify.model.charts import as_list, tensor_of
+from rigidjax.identify.model.charts import bodies_as_list, tensor_of
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.terms import Noise, in_deviations
+from rigidjax.identify.model.terms import Noise, standardised_error_changes
 from rigidjax.identify.search.starts import (
     balance_of_momentum,
     depends_on_rate_only,
@@ -237,7 +237,7 @@ def time_stamp_cause(model: Model, noise: Noise, linear: Linearisation, index: i
         return None
     slope = slope_in_time(model, np.asarray(model.records.readings[index].values) - error)
     late = model.records.readings[index].jitter_error
-    both = np.asarray(in_deviations(np.stack([error, slope], -1), noise[index], late))
+    both = np.asarray(standardised_error_changes(np.stack([error, slope], -1), noise[index], late))
     error, slope = both[..., 0], both[..., 1]
     moved = np.sum(slope**2, axis=-1) * kept
     moving = moved > 1e-2 * moved.max()
@@ -385,7 +385,7 @@ def _rate_response(
         return np.zeros_like
     width = model.index.width
     flow = linear.raw_slopes[index][..., width - 3 : width]
-    tensors = np.stack([np.asarray(tensor_of(b)) for b in as_list(model.bodies(x))])
+    tensors = np.stack([np.asarray(tensor_of(b)) for b in bodies_as_list(model.bodies(x))])
     of = (
         np.zeros(model.count, int) if model.body_indices is None else np.asarray(model.body_indices)
     )
@@ -428,9 +428,8 @@ def _explained_share(
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]
     jitter_error = model.records.readings[index].jitter_error
-    scaled = (
-        np.asarray(in_deviations(direction, noise[index], jitter_error)) * roots[index][..., None]
-    )
+    changes = standardised_error_changes(direction, noise[index], jitter_error)
+    scaled = np.asarray(changes) * roots[index][..., None]
     size = np.sqrt(np.sum(scaled**2, axis=(0, 1, 2)))
     size[size == 0] = 1.0
     columns = [np.zeros((*error.shape, size.size)) for error in errors]

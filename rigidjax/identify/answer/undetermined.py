@@ -13,9 +13,9 @@ from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.answer.answers import FAILS, NOT_ENDED
 from rigidjax.identify.data.full_scale import describe_full_scale
 from rigidjax.identify.data.reference_states import ReferenceStates
-from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, as_list
-from rigidjax.identify.model.model import Model, without_samples
-from rigidjax.identify.model.terms import with_jacobian
+from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, bodies_as_list
+from rigidjax.identify.model.model import Model, with_first_times_only
+from rigidjax.identify.model.terms import jacobian_and_value
 from rigidjax.identify.search.stages import errors_and_slopes
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
@@ -122,7 +122,7 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
         return ()
     best = basis = None
     slopes, values = map(
-        np.asarray, _values_and_slopes(without_samples(fit.model), fit.derivative_point)
+        np.asarray, _values_and_slopes(with_first_times_only(fit.model), fit.derivative_point)
     )
     names, many = _names_and_units(fit.model), len(charts_by_suffix(fit.model))
     first, turns = len(labels(fit.model)), 3 * fit.model.count
@@ -265,14 +265,14 @@ def _values_and_slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, 
 
     def value(x: Array) -> Array:
         numbers = [quantity_vector(model, x)]
-        for body in as_list(model.bodies(x)):
+        for body in bodies_as_list(model.bodies(x)):
             tensor = tensor_of(body)
             numbers.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
         if reports_starts(model):
             numbers += initial_states(x)
         return jnp.concatenate([part.reshape(-1) for part in numbers])
 
-    return with_jacobian(value, point)
+    return jacobian_and_value(value, point)
 
 
 def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
@@ -451,7 +451,8 @@ def scale_is_unseen(fit: "Fit") -> bool:
         return False
     first = len(labels(fit.model))
     slopes, values = (
-        np.asarray(a) for a in _values_and_slopes(without_samples(fit.model), fit.derivative_point)
+        np.asarray(a)
+        for a in _values_and_slopes(with_first_times_only(fit.model), fit.derivative_point)
     )
     here, moved = values[first : first + 6], slopes[first : first + 6] @ null.T
     wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)

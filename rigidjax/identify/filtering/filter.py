@@ -25,9 +25,9 @@ from rigidjax.identify.filtering.steps import (
     coloured_parts,
     dynamics_of,
 )
-from rigidjax.identify.model.model import Model, require_numbers, require_one
+from rigidjax.identify.model.model import Model, require_numbers, require_single_model
 from rigidjax.identify.model.scene import Process, Scene
-from rigidjax.identify.model.terms import scene_from_row, torque_of_scene
+from rigidjax.identify.model.terms import scene_from_row, torque_with_inputs
 from rigidjax.identify.model.walks import Drift, broadcast_to_shape, drifting_values
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import project_to_group
@@ -206,7 +206,7 @@ def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recordi
     is taken, or `None` for a model whose body is known. **Raises** `ValueError` for several
     recordings, for a missing x, and for a sensor that a filter cannot use.
     """
-    require_one(model)
+    require_single_model(model)
     if model.count != 1:
         raise ValueError(
             f"model: wanted one recording, got {model.count}; filter each by a model of its own, "
@@ -233,12 +233,12 @@ def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
     of thrust. Numbers of the scene that are free have the values of x (n,), the free numbers of the
     model.
     """
-    row = model.index.rows(x)[0]
+    row = model.index.rows_of_recordings(x)[0]
     record, reference, body_index = stacking.pick_records(
         (model.records, model.reference, model.body_indices), 0
     )
     scene = scene_from_row(model, row, record, reference, body_index)
-    return dataclasses.replace(scene, torque=torque_of_scene(scene, record))
+    return dataclasses.replace(scene, torque=torque_with_inputs(scene, record))
 
 
 class Grid(NamedTuple):

@@ -20,12 +20,12 @@ from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.filtering import roots
 from rigidjax.identify.model.free import with_leaves
 from rigidjax.identify.model.model import TURN_OF_A_FILTER_STEP
-from rigidjax.identify.model.predict import body_of_equations, shift_in_time
+from rigidjax.identify.model.predict import drop_unneeded_mass, shift_in_time
 from rigidjax.identify.model.scene import (
     Process,
     Scene,
     require_known_torque,
-    require_process,
+    require_unknown_torque,
 )
 from rigidjax.identify.model.walks import Drift
 from rigidjax.identify.sensors import AbstractSensor, Gyro, SensorInput
@@ -211,7 +211,7 @@ def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: ExtendedState) -> Dyna
     - `x`: a state, whose dtype and type (`Spin`, `Attitude` or `Rigid`) the equations get.
     """
     dtype = x.motion.omega.dtype
-    body: Any = body_of_equations(in_precision(scene.body, dtype), type(x.motion))
+    body: Any = drop_unneeded_mass(in_precision(scene.body, dtype), type(x.motion))
     return Dynamics(
         eqx.tree_at(lambda s: s.body, scene, body),
         equations_of_motion(body, x.motion, in_precision(scene.torque, dtype)),
@@ -442,10 +442,8 @@ def sample(
     """
     _checks.random_key(key)
     body = validation.require_single_body(body, (Inertia, MassProperties), "body")
-    _checks.require_unbatched_instance(
-        state0, HasSpin, "state0", requirement="a Spin, an Attitude or a Rigid"
-    )
-    require_process(process)
+    _checks.require_single(state0, HasSpin, "state0", requirement="a Spin, an Attitude or a Rigid")
+    require_unknown_torque(process)
     if torque is not None:
         require_torque(torque)
     require_known_torque(torque)

@@ -18,18 +18,18 @@ from rigidjax.identify.filtering.filter import FilterInput, belief_at, grid_of, 
 from rigidjax.identify.filtering.roots import Terms
 from rigidjax.identify.filtering.steps import require_sensors
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.normal import normal_of
+from rigidjax.identify.model.normal import normal_matrix_of_jacobians
 from rigidjax.identify.model.scene import Scene
 from rigidjax.identify.model.terms import (
     BodyIndex,
-    by_recording,
+    differentiable_map_over_recordings,
     errors_and_jacobians,
     errors_of_scene,
+    jacobian_and_value,
     prior_residuals,
     scene_from_row,
-    standardised_errors,
-    torque_of_scene,
-    with_jacobian,
+    standardised_errors_and_saturation,
+    torque_with_inputs,
 )
 from rigidjax.motion.manifold import dimension
 
@@ -59,7 +59,7 @@ def terms_of_recording(
     if scene.process is None and not model.walks:
         return _terms_of_motion(model, scene, record)
     require_sensors(scene.sensors)
-    scene = dataclasses.replace(scene, torque=torque_of_scene(scene, record))
+    scene = dataclasses.replace(scene, torque=torque_with_inputs(scene, record))
     start: Any = scene.start
     known = jnp.zeros(dimension(start), start.omega.dtype)
     first = belief_at(record.t[0], start, known, scene, model.walks)
@@ -92,7 +92,7 @@ def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
     for reading, sensor, error in zip(record.readings, scene.sensors, errors, strict=True):
         limit: Any = getattr(sensor, "limit", None)
         noise: Any = sensor.noise
-        one, full, wider = standardised_errors(
+        one, full, wider = standardised_errors_and_saturation(
             reading.values, reading.mask, error, noise, limit, reading.jitter_error
         )
         scaled.append(one)
@@ -112,7 +112,9 @@ def reading_terms(model: Model, x: Float[Array, " n"]) -> Terms:
     free numbers. Derivatives with respect to x are computed for one recording after another, in
     forward mode.
     """
-    return by_recording(model.index.rows(x), model, terms_of_recording)
+    return differentiable_map_over_recordings(
+        model.index.rows_of_recordings(x), model, terms_of_recording
+    )
 
 
 def log_density(model: Model, x: Float[Array, " n"]) -> Scalar:
@@ -149,10 +151,10 @@ def curvature(model: Model, x: Float[Array, " n"]) -> Curvature:
     moved = slopes.error + 0.5 * value.error[..., None] * slopes.log_variance
     both = jnp.concatenate([moved, 0.5**0.5 * slopes.log_variance], axis=1)
     places, size = model.index.places, model.size
-    gram = normal_of([both[:, :, None, :]], places, size).core
+    gram = normal_matrix_of_jacobians([both[:, :, None, :]], places, size).core
     each = jnp.einsum("rn,rni->ri", value.error, slopes.error)
     each = each + 0.5 * jnp.sum(slopes.log_variance, 1)
     slope = jnp.zeros(size + 1, x.dtype).at[places].add(each)[:-1]
-    rows, rest = with_jacobian(lambda x: prior_residuals(model, x), x)
+    rows, rest = jacobian_and_value(lambda x: prior_residuals(model, x), x)
     cost = 0.5 * jnp.sum(rest**2) - value.log_density
     return Curvature(cost, gram + rows.T @ rows, slope + rest @ rows)

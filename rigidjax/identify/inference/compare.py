@@ -13,11 +13,15 @@ from rigidjax.identify.answer.fit import fit
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, count_of
-from rigidjax.identify.model.charts import Known, places_of
+from rigidjax.identify.model.charts import Known, indices_of_body_numbers
 from rigidjax.identify.model.free import with_steps
-from rigidjax.identify.model.index import index_of
-from rigidjax.identify.model.model import Model, with_parts
-from rigidjax.identify.model.terms import decorrelate, scene_template, whiten
+from rigidjax.identify.model.index import build_index
+from rigidjax.identify.model.model import Model, with_replaced_fields
+from rigidjax.identify.model.terms import (
+    scene_at_starting_values,
+    white_errors_and_log_variances,
+    whiten,
+)
 from rigidjax.identify.search.stages import errors_and_slopes
 
 
@@ -101,9 +105,9 @@ def _log_mean_square_errors(fit: Fit) -> np.ndarray:
         zip(model.records.readings, white, fit.noises, strict=True)
     ):
         if reading.jitter_error is not None:
-            wider = np.asarray(decorrelate(e, reading.jitter_error / sigma[:, None])[1])[
-                reading.host_mask
-            ]
+            jitter_error = reading.jitter_error / sigma[:, None]
+            _, log_variances = white_errors_and_log_variances(e, jitter_error)
+            wider = np.asarray(log_variances)[reading.host_mask]
             squares = np.sum(np.asarray(e * sigma[:, None])[reading.host_mask] ** 2, axis=-1)
             out[index] = np.log(squares.mean()) + wider.mean()
     return out
@@ -161,7 +165,9 @@ def _with_shared_fixed(model: Model, of_others: Fit) -> Model:
         if slot.shared is not None and fitted.shared is not None:
             x = x.at[slot.shared].set(of_others.x[fitted.shared])
     record = stacking.pick_records(model.records, 0)
-    scene = with_steps(scene_template(model, record), model.slots, model.index.rows(x)[0])
+    scene = with_steps(
+        scene_at_starting_values(model, record), model.slots, model.index.rows_of_recordings(x)[0]
+    )
     sensors = jax.tree.map(lambda leaf: leaf[None] if eqx.is_array(leaf) else leaf, scene.sensors)
     own = [
         slot if slot.each else dataclasses.replace(slot, each=True, prior=slot.spread, spread=None)
@@ -170,9 +176,11 @@ def _with_shared_fixed(model: Model, of_others: Fit) -> Model:
     ]
     chart = Known(of_others.body)
     kinds = model.index.start.shape[1] // 3
-    index, slots = index_of(places_of(chart, None, model.count), chart.size, own, kinds)
+    index, slots = build_index(
+        indices_of_body_numbers(chart, None, model.count), chart.size, own, kinds
+    )
     records = eqx.tree_at(
         lambda r: [reading.sensor for reading in r.readings], model.records, list(sensors)
     )
     parts = dict(chart=chart, torque=scene.torque, records=records, slots=slots, index=index)
-    return with_parts(model, **parts)
+    return with_replaced_fields(model, **parts)

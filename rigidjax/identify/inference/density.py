@@ -16,19 +16,19 @@ from rigidjax._types import Scalar
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.filtering.terms import log_density
-from rigidjax.identify.model.charts import places_of
+from rigidjax.identify.model.charts import indices_of_body_numbers
 from rigidjax.identify.model.free import Slot
-from rigidjax.identify.model.index import index_of
+from rigidjax.identify.model.index import build_index
 from rigidjax.identify.model.model import (
     Model,
     Unpacked,
-    filter_steps_of,
+    filter_steps_per_interval,
     scenes_of,
     unpack_numbers,
-    with_parts,
+    with_replaced_fields,
 )
-from rigidjax.identify.model.scene import Process, Scene, require_process
-from rigidjax.identify.model.terms import Noise, scene_template
+from rigidjax.identify.model.scene import Process, Scene, require_unknown_torque
+from rigidjax.identify.model.terms import Noise, scene_at_starting_values
 from rigidjax.identify.uncertainty.covariance import white_covariance
 from rigidjax.motion.torques.composite import parts_of
 
@@ -106,7 +106,7 @@ class LogDensity(eqx.Module):
         model = fit.model
         process = model.process if process is None else process
         if process is not None:
-            require_process(process)
+            require_unknown_torque(process)
         if model.loss is not None:
             raise ValueError(
                 "fit: wanted a model without a robust loss, which is no density, got "
@@ -250,7 +250,7 @@ def _path_of(model: Model, where: Callable[[Scene], Any]) -> tuple[Any, ...]:
     picks a leaf of it, such as `lambda s: s.sensors[0].noise`. The leaf may be `None`, such as the
     noise of a sensor if it is unknown.
     """
-    scene = scene_template(model, model.records)
+    scene = scene_at_starting_values(model, model.records)
     marked = eqx.tree_at(where, scene, 0.0, is_leaf=lambda node: node is None)
     pairs = jax.tree.leaves_with_path(eqx.tree_at(where, marked, _MARK))
     return next(path for path, leaf in pairs if leaf is _MARK)
@@ -274,10 +274,10 @@ def _with_slots(
 
     The indices (n,) say which of the new free numbers each old one is.
     """
-    bodies = places_of(model.chart, model.body_indices, model.count)
+    bodies = indices_of_body_numbers(model.chart, model.body_indices, model.count)
     kinds = model.index.start.shape[1] // 3
     every = [*model.slots, *slots]
-    index, placed = index_of(bodies, model.index.bodies, every, kinds)
+    index, placed = build_index(bodies, model.index.bodies, every, kinds)
     places = np.arange(model.size)
     places[np.asarray(model.index.start)] = np.asarray(index.start)
     for old, new in zip(model.slots, placed, strict=False):
@@ -290,8 +290,8 @@ def _with_slots(
         list(noises),
         is_leaf=lambda node: node is None,
     )
-    steps = model.filter_steps if process is None else filter_steps_of(model)
-    new_model = with_parts(
+    steps = model.filter_steps if process is None else filter_steps_per_interval(model)
+    new_model = with_replaced_fields(
         model, records=records, process=process, slots=placed, index=index, filter_steps=steps
     )
     return new_model, places

@@ -12,9 +12,13 @@ from jaxtyping import Array, Float, PyTree
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3, Vector
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.identify.model.model import Model, require_numbers, require_one
-from rigidjax.identify.model.normal import normal_of
-from rigidjax.identify.model.terms import delay_derivatives, errors_and_jacobians, in_deviations
+from rigidjax.identify.model.model import Model, require_numbers, require_single_model
+from rigidjax.identify.model.normal import normal_matrix_of_jacobians
+from rigidjax.identify.model.terms import (
+    error_derivatives_by_delay,
+    errors_and_jacobians,
+    standardised_error_changes,
+)
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.covariance import covariance_root
 from rigidjax.identify.uncertainty.quantities import Quantity, quantities, values_and_slopes
@@ -85,9 +89,9 @@ def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
     for index, (sensor, noise, block) in enumerate(zip(sensors, noises, slopes, strict=True)):
         jitter, late = getattr(sensor, "jitter", None), None
         if jitter is not None:
-            late = jitter.deviation[:, None, None] * delay_derivatives(model, x)[index]
-        rows.append(in_deviations(block, noise, late))
-    return normal_of(rows, model.index.places, model.size).core
+            late = jitter.deviation[:, None, None] * error_derivatives_by_delay(model, x)[index]
+        rows.append(standardised_error_changes(block, noise, late))
+    return normal_matrix_of_jacobians(rows, model.index.places, model.size).core
 
 
 def _require_noise(model: Model, x: Float[Array, " n"]) -> None:
@@ -139,7 +143,7 @@ def best_first_rate(
     **Returns** the rate (3,), and the result of `expected_quantities` for this rate. **Raises** the
     errors of `fisher`.
     """
-    require_one(model)
+    require_single_model(model)
     max_steps = _checks.integer(max_steps, "max_steps", 1)
     _require_known(model, (body, omega))
     _require_noise(model, model.start(body, omega))

@@ -17,9 +17,9 @@ from rigidjax.identify.data.windows import (
     require_windows,
     starts_of_windows,
 )
-from rigidjax.identify.model.charts import places_of
-from rigidjax.identify.model.index import index_of
-from rigidjax.identify.model.model import Model, require_inputs_of_windows, with_parts
+from rigidjax.identify.model.charts import indices_of_body_numbers
+from rigidjax.identify.model.index import build_index
+from rigidjax.identify.model.model import Model, require_inputs_of_windows, with_replaced_fields
 from rigidjax.identify.model.terms import all_errors
 
 
@@ -81,8 +81,8 @@ def _model_on_windows(
     """
     reference, _, clusters = starts_of_windows(windows, 1)
     body_indices = None
-    bodies = places_of(model.chart, body_indices, windows.count)
-    index, slots = index_of(bodies, model.index.bodies, model.slots, 0)
+    bodies = indices_of_body_numbers(model.chart, body_indices, windows.count)
+    index, slots = build_index(bodies, model.index.bodies, model.slots, 0)
     parts = dict(
         records=windows.records(),
         counts=np.full(windows.count, windows.length + 1, np.int32),
@@ -94,7 +94,7 @@ def _model_on_windows(
         clusters=clusters,
         noise_groups=jnp.zeros(windows.count, jnp.int32),
     )
-    return with_parts(model, **parts), x[: index.size]
+    return with_replaced_fields(model, **parts), x[: index.size]
 
 
 @eqx.filter_jit

@@ -19,7 +19,7 @@ from rigidjax.body.symmetric3 import inertia_from_second_moment
 # result of `rigidjax.body.parameters.pack`.
 _PARTS = {"mass": (0,), "com": (7, 8, 9), "inertia": (1, 2, 3, 4, 5, 6)}
 Numbers = Float[Array, " chart"]
-Rows = Float[Array, "rows chart"]
+HessianRows = Float[Array, "rows chart"]
 # These are the components of a symmetric tensor in the order xx, yy, zz, yz, xz, xy, as in
 # `Tensor.plain_names`.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
@@ -73,12 +73,12 @@ class AbstractBodyChart(eqx.Module):
         guess of a fit.
         """
 
-    def bend(self, vector: Numbers, slope: Numbers) -> Rows:
-        """Return rows B (j, size) such that BᵀB is the part of a misfit's second derivative that
-        comes from the curvature of the chart.
+    def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
+        """Return j rows B (j, size) such that BᵀB is the part of a misfit's second derivative that
+        comes from the curvature of the chart, since the body is not linear in its numbers.
 
-        The curvature matters if a body may be flat (`rigidjax.body.parameters.flat_bend`). A chart
-        that returns no rows leaves the curvature out.
+        This part matters if a body may be flat (`rigidjax.body.parameters.flat_bend`). A chart with
+        j = 0 leaves this part out.
 
         - `vector`: (size,) the numbers of the body in the chart.
         - `slope`: (size,) the derivative of the misfit with respect to these numbers.
@@ -86,14 +86,14 @@ class AbstractBodyChart(eqx.Module):
         return jnp.zeros((0, self.size), vector.dtype)
 
     @abc.abstractmethod
-    def logs(self, body: PyTree) -> Float[Array, " logs"]:
+    def logs(self, body: PyTree) -> Float[Array, " positive_quantities"]:
         """Return the logarithms of the positive quantities of a `body` that are reported, in the
         order of `log_names`.
         """
 
-    def plain(self, body: PyTree) -> Float[Array, " plain"]:
-        """Return the reported quantities of either sign of a `body`, in the order of `plain_names`;
-        none unless a chart says so.
+    def plain(self, body: PyTree) -> Float[Array, " signed_quantities"]:
+        """Return the reported quantities of a `body` that may have either sign, in the order of
+        `plain_names`. A chart without this method reports no such quantities.
         """
         return jnp.zeros(0)
 
@@ -121,7 +121,7 @@ class Ratios(AbstractBodyChart):
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_shape(body.second_moment)
 
-    def bend(self, vector: Numbers, slope: Numbers) -> Rows:
+    def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
         return charts.flat_bend(vector, slope)
 
     def logs(self, body: Inertia) -> Float[Array, "2"]:
@@ -150,7 +150,7 @@ class PrincipalRatios(AbstractBodyChart):
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_moments(jnp.diagonal(body.tensor))[1:]
 
-    def bend(self, vector: Numbers, slope: Numbers) -> Rows:
+    def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
         return charts.flat_bend(_pad_with_zeros(vector, 0, 3), _pad_with_zeros(slope, 0, 3))[:, :2]
 
     def logs(self, body: Inertia) -> Float[Array, "2"]:
@@ -203,7 +203,7 @@ class Tensor(AbstractBodyChart):
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_second_moment(body.second_moment / (0.5 * self.typical))
 
-    def bend(self, vector: Numbers, slope: Numbers) -> Rows:
+    def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
         return _pad_with_zeros(Ratios().bend(vector[1:], slope[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
@@ -237,7 +237,7 @@ class Principal(AbstractBodyChart):
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_moments(jnp.diagonal(body.tensor) / (0.5 * self.typical))
 
-    def bend(self, vector: Numbers, slope: Numbers) -> Rows:
+    def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
         return _pad_with_zeros(PrincipalRatios().bend(vector[1:], slope[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
@@ -321,7 +321,7 @@ class Mass(AbstractBodyChart):
         step = jnp.concatenate([step[:7], step[7:] / self._body_length])
         return step[np.array(self._free_indices)]
 
-    def bend(self, vector: Numbers, slope: Numbers) -> Rows:
+    def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
         if "inertia" not in self.free:
             return jnp.zeros((0, self.size), vector.dtype)
         first = self._free_indices.index(2)
@@ -330,13 +330,13 @@ class Mass(AbstractBodyChart):
         )
         return _pad_with_zeros(rows, first, self.size - first - 5)
 
-    def logs(self, body: MassProperties) -> Float[Array, " logs"]:
+    def logs(self, body: MassProperties) -> Float[Array, " positive_quantities"]:
         mass, moments = body.mass[None], body.inertia.moments
         parts = [mass] if "mass" in self.free else []
         parts += [moments] if "inertia" in self.free else []
         return jnp.log(jnp.concatenate(parts)) if parts else jnp.zeros(0, mass.dtype)
 
-    def plain(self, body: MassProperties) -> Float[Array, " plain"]:
+    def plain(self, body: MassProperties) -> Float[Array, " signed_quantities"]:
         return body.com if "com" in self.free else jnp.zeros(0, body.com.dtype)
 
 
@@ -419,12 +419,14 @@ class Bodies(eqx.Module):
         """Return how many free numbers describe all bodies together."""
         return sum(chart.size for chart in self.charts)
 
-    def all(self, vector: Float[Array, " numbers"]) -> dict[str, Any]:
-        """Return a dict of name → body, from the numbers `vector` (size,) of all bodies, one body
-        after the other.
+    def all_bodies_by_name(
+        self, vector: Float[Array, " numbers"]
+    ) -> dict[str, Inertia | MassProperties]:
+        """Return all bodies as a dict of name → body, from the numbers `vector` (size,) of all
+        bodies, which holds the numbers of one body after the other.
         """
-        rows = zip(self.names, self.charts, numbers_of(self, vector), strict=True)
-        return {name: scaled_body(chart, numbers) for name, chart, numbers in rows}
+        rows = zip(self.names, self.charts, numbers_of_each_body(self, vector), strict=True)
+        return {name: body_with_scale_mark(chart, numbers) for name, chart, numbers in rows}
 
     def body(self, vector: Numbers, body_index: Int[Array, ""]) -> Inertia | MassProperties:
         """Return one of the bodies, from its numbers in its chart.
@@ -449,12 +451,11 @@ class Bodies(eqx.Module):
         return chosen
 
 
-def scaled_body(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
-    """Return the body that the numbers `vector` represent in a `chart`, in the form in which a user
-    gets it.
+def body_with_scale_mark(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
+    """Return the body that the numbers `vector` represent in a `chart`; its `Inertia` is marked as
+    of arbitrary scale if the chart finds the inertia only up to a factor.
 
-    If the chart finds the inertia only up to a factor, the `Inertia` is marked as of arbitrary
-    scale (`AbstractBodyChart.scale`).
+    The mark is `AbstractBodyChart.scale`. A user gets the body in this form.
     """
     body = chart.body(vector)
     if chart.scale is None or isinstance(body, MassProperties):
@@ -462,8 +463,10 @@ def scaled_body(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProp
     return Inertia(body.tensor, chart.scale)
 
 
-def places_of(
-    chart: AbstractBodyChart | Bodies, body_indices: Int[Array, " records"] | None, count: int
+def indices_of_body_numbers(
+    chart: AbstractBodyChart | Bodies,
+    body_indices: Int[Array, " records"] | None,
+    recording_count: int,
 ) -> Int[np.ndarray, "records numbers"]:
     """Return the indices (R, K) of the numbers of each recording's body among the numbers of all
     bodies.
@@ -473,12 +476,12 @@ def places_of(
 
     - `chart`: the chart of one body, or the charts of several bodies.
     - `body_indices`: (R,) the index of the body of each of R recordings, or `None` for one body.
-    - `count`: R.
+    - `recording_count`: R, the number of recordings.
     """
     if not isinstance(chart, Bodies):
-        return np.broadcast_to(np.arange(chart.size), (count, chart.size))
+        return np.broadcast_to(np.arange(chart.size), (recording_count, chart.size))
     widest = max(one.size for one in chart.charts)
-    parts = numbers_of(chart, np.arange(chart.size))
+    parts = numbers_of_each_body(chart, np.arange(chart.size))
     rows = [np.pad(part, (0, widest - part.size), constant_values=-1) for part in parts]
     return np.stack(rows)[np.asarray(body_indices)]
 
@@ -505,9 +508,11 @@ def chart_list(chart: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ..
     return chart.charts if isinstance(chart, Bodies) else (chart,)
 
 
-def numbers_of(chart: AbstractBodyChart | Bodies, vector: Array | np.ndarray) -> list[Any]:
-    """Return a list with the numbers of each body, cut out of the numbers `vector` of all bodies
-    one after the other.
+def numbers_of_each_body(
+    chart: AbstractBodyChart | Bodies, vector: Array | np.ndarray
+) -> list[Any]:
+    """Return a list with the numbers of each body. They are parts of `vector`, which holds the
+    numbers of one body after the other.
 
     `chart` is the chart of one body, or the charts of several bodies; it says how many numbers each
     body has.
@@ -516,7 +521,7 @@ def numbers_of(chart: AbstractBodyChart | Bodies, vector: Array | np.ndarray) ->
     return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
 
 
-def as_list(bodies: PyTree) -> list[Any]:
+def bodies_as_list(bodies: Inertia | MassProperties | dict[str, Any]) -> list[Any]:
     """Return the result of `Model.bodies`, which is one body or a dict of several bodies, as a list
     of bodies.
     """

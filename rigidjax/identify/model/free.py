@@ -89,8 +89,8 @@ class Free(eqx.Module):
 
 
 def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
-    """Return the argument `each` of a `Free`, which says which recordings share a value, after
-    checks.
+    """Return, after checks, the argument `each` of a `Free` (number that a fit may move). It says
+    which recordings share a value of the number.
 
     `True`, `False` and `"body"` are returned as they are, and a sequence of labels (one for each
     recording) as a tuple. Another `each` raises an error, in which the argument is called `name`.
@@ -145,11 +145,13 @@ class Slot(eqx.Module):
     own: Int[Array, "records *shape"] | None = None
 
     @property
-    def columns(self) -> slice:
-        """Return the slice of the steps of this slot in the free numbers of one recording."""
+    def columns_in_row(self) -> slice:
+        """Return which of the free numbers of one recording are the steps of this slot, as a slice
+        of these numbers.
+        """
         return slice(self.column, self.column + int(np.prod(self.shape, dtype=int)))
 
-    def move(self, start: Array, step: Array) -> Array:
+    def moved_value(self, start: Array, step: Array) -> Array:
         """Return the value of the leaf (the free array of the scene) after a change by `step` from
         the value `start`.
 
@@ -160,48 +162,49 @@ class Slot(eqx.Module):
             return start * jnp.exp(step * self.scale)
         return start + step * self.scale
 
-    def step(self, start: Array, value: Array) -> Array:
-        """Return the change from the value `start` to the value `value` of the leaf (the free array
-        of the scene), in units of `scale`.
+    def step_between(self, start: Array, value: Array) -> Array:
+        """Return the change of the leaf (the free array of the scene) from the value `start` to the
+        value `value`, in units of `scale`.
 
-        For a `positive` leaf it is the change of the logarithm. This is the inverse of `move`.
+        For a `positive` leaf it is the change of the logarithm. This function is the inverse of
+        `moved_value`.
         """
         if self.positive:
             return jnp.log(value / start) / self.scale
         return (value - start) / self.scale
 
 
-def group_of_each(
-    each: str | tuple[Any, ...], bodies: Sequence[str], name: str
+def group_of_each_recording(
+    each: str | tuple[Any, ...], body_names: Sequence[str], name: str
 ) -> tuple[Int[Array, " records"], tuple[str, ...]]:
     """Return two things: the index (R,) of the group of each of R recordings; and the labels of the
     groups.
 
-    The recordings of a group share the value of a free number. The index is that of the label of
-    the group.
+    The recordings of a group share the value of a free number. The index of a group is the index of
+    its label among the labels of the groups.
 
     - `each`: a tuple (R,) of labels, one for each recording: recordings with the same label are a
       group. The text `"body"` makes a group of the recordings of each body.
-    - `bodies`: (R,) the name of the body of each recording.
+    - `body_names`: (R,) the name of the body of each recording.
     - `name`: what the object with the labels is called in an error, which is raised unless there
       are R labels.
     """
-    row = list(bodies) if isinstance(each, str) else list(each)
-    if len(row) != len(bodies):
+    row = list(body_names) if isinstance(each, str) else list(each)
+    if len(row) != len(body_names):
         raise ValueError(
-            f"{name}: wanted one label for each of {len(bodies)} recordings, got {len(row)}"
+            f"{name}: wanted one label for each of {len(body_names)} recordings, got {len(row)}"
         )
     labels = list(dict.fromkeys(map(str, row)))
     rows = [labels.index(str(label)) for label in row]
     return jnp.asarray(rows, jnp.int32), tuple(labels)
 
 
-def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> list[Slot]:
-    """Return a `Slot` for each `Free` in a list: the `Free` with the leaf (array of numbers) that
-    it frees in a `scene`.
+def find_slots(free: Sequence[Free], scene: Scene, body_names: Sequence[str]) -> list[Slot]:
+    """Return a `Slot` for each `Free` (number that a fit may move): the `Free` together with the
+    path of its array in a `scene`.
 
-    `bodies` (R,) holds the name of the body of each of R recordings. An error is raised if a `Free`
-    picks no numbers, or numbers or a name that another `Free` has.
+    `body_names` (R,) holds the name of the body of each of R recordings. An error is raised if a
+    `Free` picks no numbers, or numbers or a name that another `Free` has.
     """
     slots: list[Slot] = []
     for item in free:
@@ -209,16 +212,18 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
         here = f"Free {item.name!r}"
         path, value = leaf_at(item.where, scene, here, "it")
         if any(slot.path == path for slot in slots):
-            raise ValueError(f"{here}: another Free already frees the same numbers")
+            raise ValueError(
+                f"{here}: another Free already frees the same numbers; give each array one Free"
+            )
         if any(slot.name == item.name for slot in slots):
-            raise ValueError(f"{here}: another Free has this name; give each its own")
+            raise ValueError(f"{here}: another Free has this name; give each Free its own name")
         if item.positive and not (np.asarray(value) > 0).all():
             raise ValueError(f"{here}: wanted a positive starting value, got {value}")
         estimated = isinstance(item.spread, str)
-        if estimated and len(bodies) < 3:
+        if estimated and len(body_names) < 3:
             raise ValueError(
-                f"{here}: wanted three recordings or more to estimate a spread, got {len(bodies)}; "
-                "give the spread as a number"
+                f"{here}: wanted three recordings or more to estimate a spread, got "
+                f"{len(body_names)}; give the spread as a number"
             )
         spread = item.scale if isinstance(item.spread, str) else item.spread
         prior = _tolerance_of_sensor(scene, path) if item.prior is None else item.prior
@@ -227,7 +232,7 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
         )
         groups, labels = None, ()
         if not isinstance(item.each, bool):
-            groups, labels = group_of_each(item.each, bodies, here)
+            groups, labels = group_of_each_recording(item.each, body_names, here)
         unit = _unit_implied_by_name(scene, path) if item.unit is None else item.unit
         slots.append(
             Slot(
@@ -264,11 +269,14 @@ def leaf_at(
     try:
         index = where(jax.tree.unflatten(structure, list(range(len(leaves)))))
     except (AttributeError, IndexError, TypeError) as error:
-        raise ValueError(f"{name}: nothing is there ({error})") from None
+        raise ValueError(
+            f"{name}: wanted numbers at the place that `where` picks, but nothing is there "
+            f"({error})"
+        ) from None
     if index is None:
         raise ValueError(
-            f"{name}: None is there; give {role} a starting value, such as "
-            "Gyro(bias=[0.0, 0.0, 0.0])"
+            f"{name}: wanted numbers at the place that `where` picks, but None is there; give "
+            f"{role} a starting value, such as Gyro(bias=[0.0, 0.0, 0.0])"
         )
     if not isinstance(index, int):
         kind = name.split()[0]
@@ -339,7 +347,7 @@ def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"
     paths = [slot.path for slot in slots]
     values = []
     for slot, start in zip(slots, leaves_at(scene, paths), strict=True):
-        value = slot.move(start, row[slot.columns].reshape(slot.shape))
+        value = slot.moved_value(start, row[slot.columns_in_row].reshape(slot.shape))
         values.append(value.astype(start.dtype))
     return with_leaves(scene, paths, values)
 

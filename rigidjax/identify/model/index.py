@@ -44,7 +44,7 @@ class Index(eqx.Module):
     first: int = eqx.field(static=True)
     size: int = eqx.field(static=True)
 
-    def rows(self, x: Float[Array, " n"]) -> Float[Array, "records row"]:
+    def rows_of_recordings(self, x: Float[Array, " n"]) -> Float[Array, "records row"]:
         """Return the row of each recording: the numbers (R, width) on which each of R recordings
         depends, taken from all n free numbers x (n,) of the model.
         """
@@ -55,23 +55,25 @@ class Index(eqx.Module):
         return wide[:, : self.width].at[:, twice].add(wide[:, self.width :])
 
 
-def index_of(
-    bodies: Int[np.ndarray, "records numbers"],
-    size: int,
+def build_index(
+    body_places: Int[np.ndarray, "records numbers"],
+    body_number_count: int,
     slots: Sequence[Slot],
-    kinds: int,
+    vectors_in_state: int,
 ) -> tuple[Index, tuple[Slot, ...]]:
-    """Return two things: the `Index` of a model; and its slots with their places in x.
+    """Return two things: the `Index` of a model, which says where the numbers of each recording are
+    among all free numbers x of the model; and the slots of the model with their places in x.
 
     **Arguments:**
 
-    - `bodies`: (R, K) the places in x of the numbers of each recording's body, −1 where a body has
-      fewer than K numbers.
-    - `size`: how many numbers describe all bodies.
-    - `slots`: the free numbers in scenes.
-    - `kinds`: the number of three-vectors in an initial state, such as 2 for attitude and rate.
+    - `body_places`: (R, K) the places in x of the numbers of each recording's body, −1 where a
+      body has fewer than K numbers.
+    - `body_number_count`: how many numbers describe all bodies.
+    - `slots`: the arrays of a scene that a fit may move, without their places in x.
+    - `vectors_in_state`: the number of three-vectors in an initial state, such as 2 for
+      attitude and rate.
     """
-    count, end = len(bodies), size
+    count, end = len(body_places), body_number_count
 
     def take_places(*shape: int) -> np.ndarray:
         nonlocal end
@@ -82,10 +84,10 @@ def index_of(
     shared = [None if s.each else take_places(max(len(s.labels), 1), *s.shape) for s in slots]
     first_alone = end
     start = np.concatenate(
-        [np.zeros((count, 0), int), *(take_places(count, 3) for _ in range(kinds))], 1
+        [np.zeros((count, 0), int), *(take_places(count, 3) for _ in range(vectors_in_state))], 1
     )
     own = [take_places(count, *s.shape) if s.each or s.spread is not None else None for s in slots]
-    blocks, twice, columns, column = [bodies], [], [], bodies.shape[1]
+    blocks, twice, columns, column = [body_places], [], [], body_places.shape[1]
     placed = []
     for slot, of_all, of_each in zip(slots, shared, own, strict=True):
         width = int(np.prod(slot.shape, dtype=int))
@@ -111,7 +113,7 @@ def index_of(
         (*range(width), *columns),
         tuple(int(place) for place in alone),
         width,
-        size,
+        body_number_count,
         column,
         end,
     )

@@ -29,23 +29,34 @@ from rigidjax.identify.data.windows import (
 from rigidjax.identify.model.charts import (
     AbstractBodyChart,
     Bodies,
+    body_with_scale_mark,
     chart_list,
     has_mass,
-    places_of,
-    scaled_body,
+    indices_of_body_numbers,
 )
-from rigidjax.identify.model.free import Free, Slot, checked_labels, find_slots, group_of_each
-from rigidjax.identify.model.index import Index, index_of
+from rigidjax.identify.model.free import (
+    Free,
+    Slot,
+    checked_labels,
+    find_slots,
+    group_of_each_recording,
+)
+from rigidjax.identify.model.index import Index, build_index
 from rigidjax.identify.model.predict import AbstractIntegrator, HeldSteps, integrator_for
 from rigidjax.identify.model.priors import AbstractLoss, Entropic
-from rigidjax.identify.model.scene import Process, Scene, require_known_torque, require_process
+from rigidjax.identify.model.scene import (
+    Process,
+    Scene,
+    require_known_torque,
+    require_unknown_torque,
+)
 from rigidjax.identify.model.terms import (
     all_errors,
-    motion_of_scene,
-    over_records,
+    jacobian_and_value,
+    map_over_recordings,
+    scene_at_starting_values,
     scene_from_row,
-    scene_template,
-    with_jacobian,
+    states_and_torque_of_scene,
 )
 from rigidjax.identify.model.walks import Drift, Walk, find_drifts
 from rigidjax.identify.sensors import AbstractSensor
@@ -208,7 +219,7 @@ class Model(eqx.Module):
             require_torque(torque)
             require_known_torque(torque)
         if process is not None:
-            require_process(process)
+            require_unknown_torque(process)
         if windows is None:
             data = _data_of_recordings(recordings, torque, charts)
         else:
@@ -226,13 +237,13 @@ class Model(eqx.Module):
         apart = checked_labels(noise_each, "noise_each")
         if isinstance(apart, bool):
             apart = tuple(range(len(names))) if apart else ("",) * len(names)
-        self.noise_groups, _ = group_of_each(apart, names, "noise_each")
+        self.noise_groups, _ = group_of_each_recording(apart, names, "noise_each")
         scene = Scene(None, torque, process, data.sensors, None)
         self.walks = find_drifts(walks, scene)
         slots = find_slots(free, scene, names)
         _require_unused_names(slots, charts)
-        bodies = places_of(charts, self.body_indices, len(names))
-        self.index, self.slots = index_of(bodies, charts.size, slots, data.kinds)
+        bodies = indices_of_body_numbers(charts, self.body_indices, len(names))
+        self.index, self.slots = build_index(bodies, charts.size, slots, data.vectors_in_state)
         turn = 1.5 * data.widest * float(np.max(np.asarray(self.reference.rate)))
         if windows is not None and process is not None:
             raise ValueError(
@@ -240,15 +251,15 @@ class Model(eqx.Module):
                 "of windows"
             )
         if windows is not None or _sampled_inputs_read(torque, self.records):
-            _require_held_steps(integrator)
+            _require_held_steps_or_none(integrator)
             integrator = HeldSteps()
         elif integrator is None and torque is not None:
             integrator = integrator_for(turn)
         self.integrator = integrator
         # Without a filter the number of its steps is not needed. The number would only force a new
-        # compilation for recordings whose times have another widest interval.
+        # compilation if another recording has a longer or shorter widest interval between times.
         filtered = process is not None or self.walks
-        self.filter_steps = filter_steps_of(self) if filtered else 1
+        self.filter_steps = filter_steps_per_interval(self) if filtered else 1
 
     @property
     def size(self) -> int:
@@ -299,7 +310,7 @@ class Model(eqx.Module):
 
         **Raises:** `ValueError` for a body that the chart does not hold, or a wrong shape.
         """
-        require_one(self)
+        require_single_model(self)
         if isinstance(self.chart, Bodies):
             by_name = dict(body) if isinstance(body, Mapping) else {}
             names, charts = self.chart.names, self.chart.charts
@@ -347,8 +358,8 @@ class Model(eqx.Module):
         """
         numbers = x[: self.index.bodies]
         if isinstance(self.chart, Bodies):
-            return self.chart.all(numbers)
-        return scaled_body(self.chart, numbers)
+            return self.chart.all_bodies_by_name(numbers)
+        return body_with_scale_mark(self.chart, numbers)
 
     def scenes(self, x: Float[Array, " n"]) -> Scene:
         """Return the scene (body, torques, sensors, initial state) of each recording at the free
@@ -376,9 +387,9 @@ class Model(eqx.Module):
 
         def motion_of_recording(row: Array, record: Recording, *others: PyTree) -> Any:
             scene = scene_from_row(self, row, record, *others)
-            return motion_of(motion_of_scene(self, scene, record)[0])
+            return motion_of(states_and_torque_of_scene(self, scene, record)[0])
 
-        states = over_records(motion_of_recording, self, self.index.rows(x))
+        states = map_over_recordings(motion_of_recording, self, self.index.rows_of_recordings(x))
         return stacking.pick_records(states, 0) if self.count == 1 else states
 
     def errors(self, x: Float[Array, " n"]) -> tuple[Float[Array, "*records times _"], ...]:
@@ -409,8 +420,8 @@ class _RecordedData(NamedTuple):
       such a prior.
     - `clusters`: (R,) the index of the stretch (group of neighbouring windows) of each window;
       `None` for recordings.
-    - `kinds`: the number of three-vectors (such as attitude and rate) of a free initial state, 0 if
-      the initial state is known.
+    - `vectors_in_state`: the number of three-vectors (such as attitude and rate) of a free initial
+      state, 0 if the initial state is known.
     - `widest`: the longest time between two successive times of a recording, s; 0 for windows.
     """
 
@@ -421,7 +432,7 @@ class _RecordedData(NamedTuple):
     reference: ReferenceStates
     start_weight: Float[Array, "records n"] | None
     clusters: Int[Array, " records"] | None
-    kinds: int
+    vectors_in_state: int
     widest: float
 
 
@@ -452,9 +463,11 @@ def _data_of_recordings(
     # computed at compile time, so that they are concrete arrays, too.
     with jax.ensure_compile_time_eval():
         reference = reference_of(recordings, state_kind)
-    kinds = dimension(stacking.pick_records(reference.state, 0)) // 3
+    vectors_in_state = dimension(stacking.pick_records(reference.state, 0)) // 3
     widest = max(float(np.diff(r.t).max()) for r in recordings)
-    return _RecordedData(records, counts, sensors, state_kind, reference, None, None, kinds, widest)
+    return _RecordedData(
+        records, counts, sensors, state_kind, reference, None, None, vectors_in_state, widest
+    )
 
 
 def _data_of_windows(
@@ -481,9 +494,19 @@ def _data_of_windows(
     stretches = _checks.integer(stretches, "stretches", 2)
     reference, weight, clusters = starts_of_windows(windows, stretches)
     _require_state_type(windows, state_kind)
-    kinds = 0 if weight is None else dimension(stacking.pick_records(reference.state, 0)) // 3
+    vectors_in_state = (
+        0 if weight is None else dimension(stacking.pick_records(reference.state, 0)) // 3
+    )
     return _RecordedData(
-        records, counts, records.sensors, state_kind, reference, weight, clusters, kinds, 0.0
+        records,
+        counts,
+        records.sensors,
+        state_kind,
+        reference,
+        weight,
+        clusters,
+        vectors_in_state,
+        0.0,
     )
 
 
@@ -552,12 +575,14 @@ def unpack_with_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, U
     numbers x (n,) represent; and the derivatives of these quantities with respect to x, along a new
     last axis of each array.
     """
-    slopes, point = _unpack_with_jacobian(without_samples(model), x)
+    slopes, point = _compiled_jacobian_and_quantities(with_first_times_only(model), x)
     return point, slopes
 
 
 @eqx.filter_jit
-def _unpack_with_jacobian(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
+def _compiled_jacobian_and_quantities(
+    model: Model, x: Float[Array, " n"]
+) -> tuple[Unpacked, Unpacked]:
     """Return two things, computed in one compiled program: the derivatives of the quantities that
     the free numbers x (n,) of a `model` represent, along a new last axis of each array; and these
     quantities.
@@ -565,17 +590,18 @@ def _unpack_with_jacobian(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked
     The quantities are the body, the initial state, and the values of the `Free`s, which are the
     other numbers that a fit may move.
     """
-    return with_jacobian(lambda x: unpack_numbers(model, x), x)
+    return jacobian_and_value(lambda x: unpack_numbers(model, x), x)
 
 
-def without_samples(model: Model) -> Model:
-    """Return the model with only the first time of each recording, as NumPy arrays.
+def with_first_times_only(model: Model) -> Model:
+    """Return the model with only the first time of each recording, and with its recordings as NumPy
+    arrays.
 
     The quantities that x represents depend on no reading. A program that computes these quantities
     from the shortened model is compiled once, and not again for recordings of another length.
     """
     records = jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, model.records)
-    return with_parts(model, records=stacking.take_rows(records, 1, axis=1))
+    return with_replaced_fields(model, records=stacking.take_rows(records, 1, axis=1))
 
 
 def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
@@ -586,7 +612,7 @@ def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
     def scene_of_recording(row: Array, *rest: PyTree) -> Scene:
         return scene_from_row(model, row, *rest)
 
-    rows = model.index.rows(x)
+    rows = model.index.rows_of_recordings(x)
     return eqx.filter_vmap(scene_of_recording)(
         rows, model.records, model.reference, model.body_indices
     )
@@ -598,11 +624,11 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
 
     The shapes are those of `Model.values`.
     """
-    rows, out = model.index.rows(x), {}
-    starts = starting_values(model)
+    rows, out = model.index.rows_of_recordings(x), {}
+    starts = starting_values_of_free_numbers(model)
     for slot, start in zip(model.slots, starts, strict=True):
-        steps = rows[:, slot.columns].reshape(model.count, *slot.shape)
-        own = slot.move(start, steps)
+        steps = rows[:, slot.columns_in_row].reshape(model.count, *slot.shape)
+        own = slot.moved_value(start, steps)
         if slot.shared is None:
             out[slot.name] = own
             continue
@@ -610,18 +636,19 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
         if slot.groups is not None:
             groups = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
             first = jnp.argmax(slot.groups[None, :] == groups[:, None], axis=1)
-        value = slot.move(start[first], x[slot.shared])
+        value = slot.moved_value(start[first], x[slot.shared])
         out[slot.name] = value[0] if slot.groups is None else value
         if slot.spread is not None:
             out[f"{slot.name}, own"] = own
     return out
 
 
-def starting_values(model: Model) -> list[Float[Array, "records ..."]]:
-    """Return a list of the starting values of the `Free`s of a `model`: for each `Free` an array
-    (R, *shape) of its values in R recordings.
+def starting_values_of_free_numbers(model: Model) -> list[Float[Array, "records ..."]]:
+    """Return the starting values of the `Free`s (numbers that a fit may move) of a `model`: a list
+    with an array (R, *shape) for each `Free`, which holds its values in R recordings.
     """
-    leaves, out = dict(jax.tree.leaves_with_path(scene_template(model, model.records))), []
+    scene, out = scene_at_starting_values(model, model.records), []
+    leaves = dict(jax.tree.leaves_with_path(scene))
     for slot in model.slots:
         leaf = jnp.asarray(leaves[slot.path])
         of_each = slot.path[0].name == "sensors"
@@ -629,7 +656,7 @@ def starting_values(model: Model) -> list[Float[Array, "records ..."]]:
     return out
 
 
-def filter_steps_of(model: Model) -> int:
+def filter_steps_per_interval(model: Model) -> int:
     """Return the number of integration steps that a filter takes between two successive times of
     the recordings of a `model`.
 
@@ -644,7 +671,7 @@ def filter_steps_of(model: Model) -> int:
     return math.ceil(steps) if 1.0 < steps < math.inf else 1
 
 
-def require_one(model: PyTree) -> Model:
+def require_single_model(model: PyTree) -> Model:
     """Return `model`, and raise `TypeError` or `ValueError` unless `model` is a single `Model`, not
     a batch of models.
     """
@@ -668,7 +695,7 @@ def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
     An error is raised unless x has n numbers of the dtype of the recordings, and all of them are
     finite. Traced numbers are not checked for being finite.
     """
-    require_one(model)
+    require_single_model(model)
     hint = "model.start(body) makes them"
     numbers = _checks.numeric_array(x, "x")
     if numbers.shape != (model.size,):
@@ -685,29 +712,29 @@ def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
     return numbers
 
 
-def with_parts(model: Model, **parts: Any) -> Model:
-    """Return the model with its fields replaced by the values in `parts` (by field name), without
-    checks.
+def with_replaced_fields(model: Model, **values: Any) -> Model:
+    """Return the model after a replacement of some of its fields, without checks. The new values
+    are given by the names of the fields.
 
     `dataclasses.replace` would call `Model(…)`, and `equinox.tree_at` cannot replace a tuple that
     has no leaves.
     """
     new = object.__new__(Model)
     for field in dataclasses.fields(Model):
-        object.__setattr__(new, field.name, parts.get(field.name, getattr(model, field.name)))
+        object.__setattr__(new, field.name, values.get(field.name, getattr(model, field.name)))
     return new
 
 
-def _require_state_type(windows: Windows, kind: type) -> None:
+def _require_state_type(windows: Windows, state_type: type) -> None:
     """Raise `TypeError` unless the measured states in `windows` (short parts of a record of
-    measured states) are of the type `kind`, which the torque needs.
+    measured states) are of the type `state_type`, which the torque needs.
 
-    `kind` is `Spin`, `Attitude` or `Rigid`.
+    `state_type` is `Spin`, `Attitude` or `Rigid`.
     """
-    if not isinstance(windows.starts, kind):
+    if not isinstance(windows.starts, state_type):
         raise TypeError(
-            f"windows: wanted measured states of type {kind.__name__}, which the torque needs, got "
-            f"{type(windows.starts).__name__}"
+            f"windows: wanted measured states of type {state_type.__name__}, which the torque "
+            f"needs, got {type(windows.starts).__name__}"
         )
 
 
@@ -746,12 +773,12 @@ def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
         raise ValueError("; ".join(wrong))
 
 
-def describe_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
-    """Describe the delays that, at the free numbers x (n,), read samples of the inputs outside of
-    the windows of a `model`; return one text for each such delay.
+def describe_delays_outside_windows(model: Model, x: Float[Array, " n"]) -> list[str]:
+    """Return a text for each delay that, at the free numbers x (n,) of a `model`, reads samples of
+    the inputs outside of the windows of the model.
 
-    A delay shifts an input (a logged quantity such as a motor command) in time. The list is empty
-    for a model of recordings.
+    A delay shifts an input (a logged quantity such as a motor command) in time. No text is
+    returned for a model of recordings.
     """
     if model.clusters is None or not delays_of(model.torque):
         return []
@@ -780,7 +807,7 @@ def _sampled_inputs_read(torque: Torque | None, recording: Recording) -> list[st
     return [name for name in input_names_of(torque) if not callable(recording.inputs[name])]
 
 
-def _require_even_times(torque: Torque | None, recording: Recording, number: int) -> None:
+def _require_even_times(torque: Torque | None, recording: Recording, recording_index: int) -> None:
     """Raise `ValueError` if the `torque` reads sampled inputs, and the times of the `recording` are
     not evenly spaced to a thousandth of the first step.
 
@@ -789,20 +816,21 @@ def _require_even_times(torque: Torque | None, recording: Recording, number: int
 
     - `torque`: the torque of the model, or `None`.
     - `recording`: the recording with the times and inputs.
-    - `number`: the index of the recording in the model, for the error.
+    - `recording_index`: the index of the recording in the model, for the error.
     """
     names, steps = _sampled_inputs_read(torque, recording), np.diff(np.asarray(recording.t, float))
     if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
         raise ValueError(
             f"inputs[{names[0]!r}]: samples are held through even steps, and the times of "
-            f"recording {number} have steps from {steps.min():.6g} to {steps.max():.6g} s; "
-            "resample them, or give a function of time such as rigidjax.torques.Linear(t, samples)"
+            f"recording {recording_index} have steps from {steps.min():.6g} to {steps.max():.6g} "
+            "s; resample them, or give a function of time such as rigidjax.torques.Linear(t, "
+            "samples)"
         )
 
 
-def _require_held_steps(integrator: object) -> None:
-    """Raise `ValueError` unless the `integrator` that a user gave is `None` or a `HeldSteps`, which
-    takes one step from each time to the next and holds samples constant over this step.
+def _require_held_steps_or_none(integrator: object) -> None:
+    """Raise `ValueError` unless the `integrator` that a user gave is a `HeldSteps` or `None`. A
+    `HeldSteps` takes one step from each time to the next and holds samples constant over this step.
 
     It is called for a model of windows or with sampled inputs, for which all other integrators are
     refused.

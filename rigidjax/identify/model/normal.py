@@ -44,11 +44,11 @@ class NormalMatrix(eqx.Module):
     def diagonal(self) -> Float[Array, " n"]:
         """Return the diagonal (n,) of the matrix."""
         own = self.own_blocks and jnp.diagonal(self.own_blocks.own, axis1=1, axis2=2)
-        return self._join_rows(jnp.diagonal(self.core), own)
+        return self._join_shared_and_own(jnp.diagonal(self.core), own)
 
     def add_diagonal(self, diagonal: Float[Array, " n"]) -> "NormalMatrix":
         """Return the matrix with `diagonal` (n,) added to its diagonal."""
-        shared, own = self._split_rows(diagonal)
+        shared, own = self._split_shared_and_own(diagonal)
         core, alone = self.core + jnp.diag(shared), self.own_blocks
         if alone is None:
             return NormalMatrix(core)
@@ -56,21 +56,22 @@ class NormalMatrix(eqx.Module):
             core, OwnBlocks(alone.own + jax.vmap(jnp.diag)(own), alone.sides, alone.at)
         )
 
-    def with_rows(self, rows: Float[Array, "m n"]) -> "NormalMatrix":
-        """Return the normal matrix of a larger problem, which has m more residuals.
+    def add_residual_rows(self, rows: Float[Array, "m n"]) -> "NormalMatrix":
+        """Return the normal matrix of a larger problem, which has m residuals more.
 
-        The `rows` (m, n) are the derivatives of the m residuals with respect to the n numbers.
-        These residuals may depend only on numbers of the core.
+        The `rows` (m, n) are the derivatives of the m further residuals with respect to the n
+        numbers. These residuals may depend only on numbers of the core, which are the numbers
+        that recordings share.
         """
         rows = rows[:, : self.core.shape[0]]
         return NormalMatrix(self.core + rows.T @ rows, self.own_blocks)
 
-    def in_units(self, unit: Float[Array, " n"]) -> "NormalMatrix":
+    def scale_rows_and_columns(self, unit: Float[Array, " n"]) -> "NormalMatrix":
         """Return the matrix D M D, where M is this matrix and D the diagonal matrix of `unit` (n,).
 
         It is the normal matrix with respect to x / `unit` instead of the numbers x.
         """
-        shared, own = self._split_rows(unit)
+        shared, own = self._split_shared_and_own(unit)
         core, alone = self.core * (shared[:, None] * shared[None, :]), self.own_blocks
         if alone is None:
             return NormalMatrix(core)
@@ -79,13 +80,15 @@ class NormalMatrix(eqx.Module):
         return NormalMatrix(core, OwnBlocks(alone.own * rows * own[:, None, :], sides, alone.at))
 
     def __matmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        shared, own = self._split_rows(x)
+        shared, own = self._split_shared_and_own(x)
         first, alone = self.core @ shared, self.own_blocks
         if alone is None:
             return first
         first = first + jnp.einsum("rks,rk->s", alone.sides, own)
         from_core = jnp.einsum("rks,s->rk", alone.sides, shared)
-        return self._join_rows(first, jnp.einsum("rkl,rl->rk", alone.own, own) + from_core)
+        return self._join_shared_and_own(
+            first, jnp.einsum("rkl,rl->rk", alone.own, own) + from_core
+        )
 
     def solve(self, rhs: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
         """Return the solution x of `matrix @ x = rhs`, or NaN unless the matrix is positive
@@ -96,14 +99,14 @@ class NormalMatrix(eqx.Module):
         alone, count = self.own_blocks, self.core.shape[0]
         if alone is None:
             return _solve_by_cholesky(self.core, rhs)
-        shared, own = self._split_rows(rhs.reshape(rhs.shape[0], -1))
+        shared, own = self._split_shared_and_own(rhs.reshape(rhs.shape[0], -1))
         taken = jax.vmap(_solve_by_cholesky)(alone.own, jnp.concatenate([alone.sides, own], axis=2))
         rest = jnp.einsum("rks,rkt->st", alone.sides, taken)
         first = _solve_by_cholesky(self.core - rest[:, :count], shared - rest[:, count:])
         last = taken[:, :, count:] - jnp.einsum("rks,st->rkt", taken[:, :, :count], first)
-        return self._join_rows(first, last).reshape(rhs.shape)
+        return self._join_shared_and_own(first, last).reshape(rhs.shape)
 
-    def _split_rows(self, x: Array) -> tuple[Array, Array]:
+    def _split_shared_and_own(self, x: Array) -> tuple[Array, Array]:
         """Return two parts of an array x (n, …), which has one entry for each of the n numbers of
         the normal matrix.
 
@@ -115,7 +118,7 @@ class NormalMatrix(eqx.Module):
             (x, x) if self.own_blocks is None else (x[: self.core.shape[0]], x[self.own_blocks.at])
         )
 
-    def _join_rows(self, shared: Array, own: Array | None) -> Array:
+    def _join_shared_and_own(self, shared: Array, own: Array | None) -> Array:
         """Return an array (n, …) with one entry for each of the n numbers of the normal matrix,
         joined from two parts.
 
@@ -139,8 +142,8 @@ def _solve_by_cholesky(matrix: Array, rhs: Array) -> Array:
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), rhs)
 
 
-def normal_of(
-    blocks: Sequence[Array], places: Array, size: int, own: np.ndarray | None = None
+def normal_matrix_of_jacobians(
+    jacobians: Sequence[Array], places: Array, size: int, own_columns: np.ndarray | None = None
 ) -> NormalMatrix:
     """Return the normal matrix Σ JᵀJ of the Jacobians J (R, T, j, m) of all sensors.
 
@@ -149,18 +152,18 @@ def normal_of(
 
     **Arguments:**
 
-    - `blocks`: J of each sensor.
+    - `jacobians`: J of each sensor.
     - `places`: (R, m) the index of each column of J among all numbers; a column that stands for no
       number has the index `size`.
     - `size`: how many numbers there are in all.
-    - `own`: the columns of the numbers that one recording has alone; `None` puts all numbers into
-      the core, the dense first block of the result.
+    - `own_columns`: the columns of the numbers that one recording has alone; `None` puts all
+      numbers into the core, the dense first block of the result.
     """
     count, columns = places.shape
-    alone = np.zeros(0, int) if own is None else own
+    alone = np.zeros(0, int) if own_columns is None else own_columns
     rest = np.setdiff1d(np.arange(columns), alone)
-    squares = jnp.zeros((count, columns, columns), blocks[0].dtype)
-    for rows in blocks:
+    squares = jnp.zeros((count, columns, columns), jacobians[0].dtype)
+    for rows in jacobians:
         # On a CPU this product of matrices takes a fifth of the time of an `einsum` that sums over
         # the axes of times and residuals.
         flat = rows.reshape(count, -1, columns)
@@ -171,9 +174,12 @@ def normal_of(
     at = jnp.minimum(places[:, rest], last)
     core = jnp.zeros((last + 1, last + 1), squares.dtype)
     core = core.at[at[:, :, None], at[:, None, :]].add(squares[:, rest[:, None], rest])[:-1, :-1]
-    if own is None:
+    if own_columns is None:
         return NormalMatrix(core)
-    mine = squares[:, own]
-    index = jnp.arange(count)[:, None, None], np.arange(own.size)[:, None], at[:, None, :]
-    sides = jnp.zeros((count, own.size, last + 1), squares.dtype).at[index].add(mine[:, :, rest])
-    return NormalMatrix(core, OwnBlocks(mine[:, :, own], sides[:, :, :-1], places[:, own]))
+    mine = squares[:, own_columns]
+    index = jnp.arange(count)[:, None, None], np.arange(own_columns.size)[:, None], at[:, None, :]
+    sides = jnp.zeros((count, own_columns.size, last + 1), squares.dtype)
+    sides = sides.at[index].add(mine[:, :, rest])
+    return NormalMatrix(
+        core, OwnBlocks(mine[:, :, own_columns], sides[:, :, :-1], places[:, own_columns])
+    )

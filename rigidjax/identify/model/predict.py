@@ -282,7 +282,7 @@ def shift_in_time(field: Callable[..., Any], t: Array, state: PyTree, offset: Ar
     return state
 
 
-def body_of_equations(body: Body, state_type: type) -> Body:
+def drop_unneeded_mass(body: Body, state_type: type) -> Body:
     """Return the part of a `body` that the equations of motion of a state of type `state_type`
     need.
 
@@ -313,7 +313,7 @@ def sensor_inputs(
       states of its own.
     - `delay`: a further time, s, that is added to the clock offset, one number or (T,).
     """
-    turned = body_of_equations(body, type(state0))
+    turned = drop_unneeded_mass(body, type(state0))
     field = equations_of_motion(turned, state0, torque)
     offset, times = getattr(sensor, "offset", None), ts
     if delay is not None:
@@ -441,9 +441,9 @@ def simulate_readings(
     if not sensors:
         raise ValueError("sensor: wanted a sensor or several, got none")
     for one in sensors:
-        _require_sensor(one, state0, key)
+        _require_sensor_for_simulation(one, state0, key)
     start: Any = state0
-    sol = simulate(body_of_equations(body, type(state0)), start, ts, torque)
+    sol = simulate(drop_unneeded_mass(body, type(state0)), start, ts, torque)
     states = sol.ys if sol.own is None else Coupled(sol.ys, sol.own)
     count = len(sensors)
     keys = [None] * count if key is None else jax.random.split(_checks.random_key(key), count)
@@ -500,7 +500,7 @@ def _readings_along_motion(
     return values if limit is None else jnp.clip(values, -limit[None], limit[None])
 
 
-def _require_sensor(sensor: PyTree, state0: State, key: object) -> None:
+def _require_sensor_for_simulation(sensor: PyTree, state0: State, key: object) -> None:
     """Raise an error unless `sensor` is a sensor whose readings of a motion can be simulated.
 
     - `sensor`: must be a single sensor, not a batch. Its readings must have as many numbers as its

@@ -31,12 +31,16 @@ class AbstractLoss(eqx.Module):
 
     @abc.abstractmethod
     def shrink(self, error: Float[Array, " k"]) -> Float[Array, " k"]:
-        """Return the error (k,) scaled so that its squared length is ρ(s), for least squares."""
+        """Return the `error` (k,), in units of its noise, multiplied by a factor such that its
+        squared length is the loss ρ(s) and no longer s.
+        """
 
     @abc.abstractmethod
     def weight(self, error: Float[Array, " k"]) -> Scalar:
-        """Return dρ/ds, the weight of the reading in the normal equations, which is 1 for a small
-        error.
+        """Return the weight dρ/ds of a reading in the normal equations, where ρ is the loss and s
+        the squared length of the `error` (k,) of the reading in units of its noise.
+
+        The weight is 1 for a small error.
         """
 
 

@@ -42,7 +42,7 @@ class Scene(eqx.Module):
     start: Spin | Attitude | Rigid | None
 
 
-def require_process(process: PyTree) -> None:
+def require_unknown_torque(process: PyTree) -> None:
     """Raise `TypeError` unless `process` is an unknown torque (a `RandomTorque` or
     `CorrelatedTorque`), or a `Sum` of unknown torques.
     """

@@ -17,7 +17,7 @@ from rigidjax.identify.model.charts import Bodies, body_of_recording
 from rigidjax.identify.model.free import with_steps
 from rigidjax.identify.model.predict import (
     HeldSteps,
-    body_of_equations,
+    drop_unneeded_mass,
     errors_along,
     sensor_inputs,
     states_at,
@@ -37,13 +37,15 @@ BodyIndex = Array | None
 # `Blocks` are two tuples with one array for each sensor: the errors (R, T, k); and the derivatives
 # (R, T, k, m) of these errors with respect to the m numbers of a row.
 Blocks = tuple[tuple[Array, ...], tuple[Array, ...]]
+# `SensorErrors` holds one array for each sensor, such as its errors (R, T, k).
+SensorErrors = tuple[Array | np.ndarray, ...]
 # `Noise` holds the standard deviations (R, k) of each sensor, for R recordings and k components.
 Noise = tuple[Float[Array, "records _"], ...]
 
 
-def scene_template(model: "Model", record: Recording) -> Scene:
+def scene_at_starting_values(model: "Model", record: Recording) -> Scene:
     """Return the scene (torques and sensors) of a recording, in which all free numbers have their
-    starting values, still without body and initial state.
+    starting values. Its body and initial state are still `None`.
 
     `model` has the torques, and `record` the sensors.
     """
@@ -63,13 +65,15 @@ def scene_from_row(
     - `body_index`: the index of the body of the recording among several bodies, or `None` for one
       body.
     """
-    scene = with_steps(scene_template(model, record), model.slots, row)
+    scene = with_steps(scene_at_starting_values(model, record), model.slots, row)
     body = body_of_recording(model.chart, row, body_index)
     start = reference.start_at(row[model.index.first :])
     return Scene(body, scene.torque, scene.process, scene.sensors, start)
 
 
-def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[Any, Any]:
+def states_and_torque_of_scene(
+    model: "Model", scene: Scene, record: Recording
+) -> tuple[PyTree, Torque | None]:
     """Return two things: the states at the times of a recording, with a leading time axis; and the
     torque of the scene, with the inputs (logged quantities) of the recording bound to it.
 
@@ -78,19 +82,19 @@ def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[An
     - `record`: the recording, with the times and the inputs.
     """
     assert scene.body is not None and scene.start is not None
-    body: Any = body_of_equations(scene.body, model.state_kind)
+    body: Any = drop_unneeded_mass(scene.body, model.state_kind)
     functions = {name: source for name, source in record.inputs.items() if callable(source)}
     if isinstance(model.integrator, HeldSteps) and scene.torque is not None:
         samples = {n: rows for n, rows in record.inputs.items() if n not in functions}
         unbound = {name: Input(name) for name in samples}
         torque = bind(scene.torque, functions | unbound)
         states = model.integrator.states_with_inputs(body, scene.start, record.t, torque, samples)
-        return states, torque_of_scene(scene, record)
-    torque = torque_of_scene(scene, record)
+        return states, torque_with_inputs(scene, record)
+    torque = torque_with_inputs(scene, record)
     return states_at(model.integrator, body, scene.start, record.t, torque), torque
 
 
-def torque_of_scene(scene: Scene, record: Recording) -> Torque | None:
+def torque_with_inputs(scene: Scene, record: Recording) -> Torque | None:
     """Return the torque of a `scene` that reads the inputs (logged quantities such as a motor
     command) of the recording `record`, or `None` without a torque.
     """
@@ -129,7 +133,7 @@ def errors_of_scene(
     The error is reading minus prediction; it is zero for a masked reading. `delay` is a time, s,
     that is added to the clock offset of each sensor; `None` for none.
     """
-    states, torque = motion_of_scene(model, scene, record)
+    states, torque = states_and_torque_of_scene(model, scene, record)
     assert scene.body is not None and scene.start is not None
     out, motion = [], (scene.body, torque, record.t, scene.start, states)
     for reading, sensor in zip(record.readings, scene.sensors, strict=True):
@@ -138,9 +142,9 @@ def errors_of_scene(
     return tuple(out)
 
 
-def over_records(function: Callable[..., PyTree], model: "Model", *rows: PyTree) -> Any:
-    """Return `function(*rows, record, reference, body_index)` of every recording, with a leading
-    axis of recordings.
+def map_over_recordings(function: Callable[..., PyTree], model: "Model", *arguments: PyTree) -> Any:
+    """Return `function(*arguments, record, reference, body_index)` of every recording, with a
+    leading axis of recordings.
 
     On a CPU the recordings are computed one after another. XLA compiles the loop of one recording,
     over a few dozen numbers, to one kernel; batched over recordings, this loop runs at half the
@@ -149,10 +153,10 @@ def over_records(function: Callable[..., PyTree], model: "Model", *rows: PyTree)
     - `function`: a function of one recording.
     - `model`: the model, which has the R recordings, their reference states, and the index of the
       body of each recording.
-    - `rows`: trees of arrays with a leading axis (R,), whose parts of one recording are given to
-      `function`, such as the free numbers of each recording.
+    - `arguments`: trees of arrays with a leading axis (R,), such as the free numbers of each
+      recording; `function` is called with the parts of one recording.
     """
-    trees = *rows, model.records, model.reference, model.body_indices
+    trees = *arguments, model.records, model.reference, model.body_indices
     arrays, rest = eqx.partition(trees, eqx.is_array)
 
     def function_of_recording(part: PyTree[Array]) -> PyTree:
@@ -174,18 +178,21 @@ def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
 
     Derivatives with respect to x are computed recording by recording, in forward mode.
     """
-    return by_recording(model.index.rows(x), model, errors_in_sensor_units)
+    return differentiable_map_over_recordings(
+        model.index.rows_of_recordings(x), model, errors_in_sensor_units
+    )
 
 
 @eqx.filter_custom_jvp
-def by_recording(
+def differentiable_map_over_recordings(
     rows: Float[Array, "records columns"], model: "Model", function: Callable[..., PyTree]
 ) -> Any:
     """Return `function(model, row, record, reference, body_index)` of every recording, with a
     leading axis of recordings.
 
-    Only derivatives with respect to the rows are defined. They are computed as in
-    `errors_and_jacobians`.
+    The last four arguments are the free numbers, the readings, the reference state and the index of
+    the body of one recording. Only derivatives with respect to the rows are defined. They are
+    computed as in `errors_and_jacobians`.
 
     - `rows`: (R, columns) the free numbers of each of R recordings, one row for each recording.
     - `function`: a function such as `errors_in_sensor_units`, which returns an array or a tree of
@@ -195,19 +202,21 @@ def by_recording(
     def function_of_row(row: Row, *rest: PyTree) -> Any:
         return function(model, row, *rest)
 
-    return match_batch_axes(over_records(function_of_row, model, rows), rows)
+    return batch_as(map_over_recordings(function_of_row, model, rows), rows)
 
 
-@by_recording.def_jvp
-def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
+@differentiable_map_over_recordings.def_jvp
+def _jvp_of_map_over_recordings(
+    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[PyTree, PyTree]:
     """Return two things: the values of a function of each recording, with a leading axis (R,) of
     recordings; and the derivatives of these values along a change of the free numbers.
 
-    It is the rule by which JAX differentiates `by_recording`. An error is raised if anything but
-    the free numbers changes.
+    It is the rule by which JAX differentiates `differentiable_map_over_recordings`. An error is
+    raised if anything but the free numbers changes.
 
-    - `primals`: the three arguments of `by_recording`: the free numbers (R, columns) of each of R
-      recordings; the model; and the function.
+    - `primals`: the three arguments of `differentiable_map_over_recordings`: the free numbers (R,
+      columns) of each of R recordings; the model; and the function.
     - `tangents`: the changes of these three arguments.
     """
     (rows, model, function), (step, *rest) = primals, tangents
@@ -224,8 +233,8 @@ def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree
 def errors_and_jacobians(
     model: "Model", x: Float[Array, " n"], function: Callable[..., PyTree] = errors_in_sensor_units
 ) -> tuple[Any, Any]:
-    """Return two things: `function` of every recording (R, …); and its derivatives (R, …, m) with
-    respect to the m free numbers of the recording.
+    """Return two things: the value of `function` for each of R recordings (R, …); and its
+    derivatives (R, …, m) with respect to the m free numbers of the recording.
 
     The m columns are those of `model.index.places`. Derivatives of readings with respect to free
     numbers are computed by this function and nowhere else.
@@ -234,7 +243,7 @@ def errors_and_jacobians(
     - `function`: a function such as `errors_in_sensor_units`, with the same arguments, of one
       recording.
     """
-    out, slopes = _values_and_jacobians(model, model.index.rows(x), function)
+    out, slopes = _values_and_jacobians(model, model.index.rows_of_recordings(x), function)
     columns = jnp.asarray(model.index.columns, jnp.int32)
     if columns.size > model.index.width:
         slopes = jax.tree.map(lambda block: block[..., columns], slopes)
@@ -259,14 +268,16 @@ def _values_and_jacobians(
     def value_and_jacobian(row: Row, *rest: PyTree) -> tuple[PyTree, PyTree]:
         # Forward mode is cheaper than reverse mode, to compile and to run, for a dozen numbers and
         # one long loop over time.
-        slopes, out = with_jacobian(lambda row: function(model, row, *rest), row)
+        slopes, out = jacobian_and_value(lambda row: function(model, row, *rest), row)
         return out, slopes
 
-    return over_records(value_and_jacobian, model, rows)
+    return map_over_recordings(value_and_jacobian, model, rows)
 
 
 @eqx.filter_jit
-def delay_derivatives(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
+def error_derivatives_by_delay(
+    model: "Model", x: Float[Array, " n"]
+) -> tuple[Float[Array, "..."], ...]:
     """Return, for each sensor, the derivative (R, T, k) of its errors with respect to a delay of
     its clock, in the sensor's unit per second, at the free numbers x (n,) of the `model`.
     """
@@ -277,10 +288,10 @@ def delay_derivatives(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Arra
             lambda s: errors_in_sensor_units(model, row, *rest, delay=s), (now,), (now + 1,)
         )[1]
 
-    return over_records(derivative_of_recording, model, model.index.rows(x))
+    return map_over_recordings(derivative_of_recording, model, model.index.rows_of_recordings(x))
 
 
-def with_jacobian(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tuple[Any, Any]:
+def jacobian_and_value(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tuple[Any, Any]:
     """Return two things, computed in forward mode: the derivatives (…, n) of a function at x with
     respect to x; and the value (…) of the function.
     """
@@ -292,9 +303,10 @@ def with_jacobian(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tu
     return jax.jacfwd(value_and_aux, has_aux=True)(x)
 
 
-def whiten(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
+def whiten(model: "Model", errors: SensorErrors, noise: Noise) -> tuple[Float[Array, "..."], ...]:
     """Return the errors (R, T, k) of each sensor in standard deviations, where errors due to jitter
-    are made independent, and readings at full scale are treated as limits (`standardised_errors`).
+    are made independent, and readings at full scale are treated as limits
+    (`standardised_errors_and_saturation`).
 
     - `model`: the model, which has the readings of R recordings.
     - `errors`: for each sensor the errors (R, T, k) in its unit.
@@ -304,20 +316,23 @@ def whiten(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, ".
     for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
         limit = getattr(reading.sensor, "limit", None)
         parts = reading.values, reading.mask, error, sigma, limit, reading.jitter_error
-        out.append(jax.vmap(standardised_errors)(*parts)[0])
+        out.append(jax.vmap(standardised_errors_and_saturation)(*parts)[0])
     return tuple(out)
 
 
-def decorrelate(
-    e: Float[Array, "*rows k"], v: Float[Array, "*rows k"]
+def white_errors_and_log_variances(
+    errors: Float[Array, "*rows k"], jitter_error: Float[Array, "*rows k"]
 ) -> tuple[Float[Array, "*rows k"], Float[Array, "*rows k"]]:
     """Return two arrays (…, k), from errors e (…, k) whose covariance is `1 + v vᵀ`: independent
-    errors of variance one; and the logarithms of conditional variances.
+    errors of variance one (white errors); and the logarithms of conditional variances.
 
-    The independent errors are `L⁻¹ e`, where L is the Cholesky factor of the covariance. The
-    conditional variance of a component is its variance if all components before it are given, which
-    is the square of the diagonal element of L.
+    Here v (…, k) is the `jitter_error`, the error due to a time stamp that is one standard
+    deviation late; both e and v are in standard deviations of the noise. The independent errors are
+    `L⁻¹ e`, where L is the Cholesky factor of the covariance. The conditional variance of a
+    component is its variance if all components before it are given, which is the square of the
+    diagonal element of L.
     """
+    e, v = errors, jitter_error
     along, total = jnp.cumsum(v * e, axis=-1), 1.0 + jnp.cumsum(v * v, axis=-1)
     none = jnp.zeros_like(total[..., :1])
     along = jnp.concatenate([none, along[..., :-1]], axis=-1)
@@ -325,22 +340,25 @@ def decorrelate(
     return (e - v * along / before) * jnp.sqrt(before / total), jnp.log(total / before)
 
 
-def in_deviations(
-    x: Array | np.ndarray, sigma: Array | np.ndarray, jitter_error: Array | None
+def standardised_error_changes(
+    error_changes: Array | np.ndarray, sigma: Array | np.ndarray, jitter_error: Array | None
 ) -> Float[Array, "..."] | Float[np.ndarray, "..."]:
-    """Return changes x (R, T, k, n) of a sensor's errors, converted to standard deviations.
+    """Return n changes (R, T, k, n) of a sensor's errors, converted to standard deviations.
 
-    The changes are scaled as `standardised_errors` scales the errors themselves, with the noise
-    `sigma` (R, k). If there is a `jitter_error` (R, T, k), which is the error due to a time stamp
-    that is one standard deviation late, they are also made independent by `decorrelate`.
+    The `error_changes` are in the unit of the sensor. They are scaled as
+    `standardised_errors_and_saturation` scales the errors themselves, with the noise `sigma` (R,
+    k). If there is a `jitter_error` (R, T, k), which is the error due to a time stamp that is one
+    standard deviation late, they are also made independent by `white_errors_and_log_variances`.
     """
-    x = x / sigma[:, None, :, None]
+    scaled = error_changes / sigma[:, None, :, None]
     if jitter_error is None:
-        return x
-    return jax.vmap(lambda e: decorrelate(e, jitter_error / sigma[:, None])[0], -1, -1)(x)
+        return scaled
+    return jax.vmap(
+        lambda e: white_errors_and_log_variances(e, jitter_error / sigma[:, None])[0], -1, -1
+    )(scaled)
 
 
-def standardised_errors(
+def standardised_errors_and_saturation(
     values: Float[Array, "times *components"],
     mask: Bool[Array, " times"],
     error: Float[Array, "times k"],
@@ -373,7 +391,7 @@ def standardised_errors(
         v = jitter_error / sigma[None]
         # The reading of a channel at full scale carries no information about the error of its time
         # stamp.
-        white, wider = decorrelate(scaled, jnp.where(full, 0.0, v))
+        white, wider = white_errors_and_log_variances(scaled, jnp.where(full, 0.0, v))
         scaled = jnp.where(full, scaled / jnp.sqrt(1.0 + v * v), white)
     if limit is None:
         return scaled, full, wider
@@ -386,7 +404,7 @@ def standardised_errors(
 
 
 def reading_residuals(
-    model: "Model", errors: tuple, noise: Noise, weights: Float[Array, "records times"]
+    model: "Model", errors: SensorErrors, noise: Noise, weights: Float[Array, "records times"]
 ) -> tuple[Array, ...]:
     """Return the residuals (R, T, k) of the readings of each sensor, for least squares.
 
@@ -406,8 +424,10 @@ def reading_residuals(
 
 
 def residuals_and_jacobians(
-    function: Callable[[tuple], tuple], errors: tuple, slopes: tuple
-) -> tuple[tuple, tuple]:
+    function: Callable[[tuple[Array, ...]], tuple[Array, ...]],
+    errors: SensorErrors,
+    slopes: SensorErrors,
+) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """Return two things: the residuals `function(errors)`; and their derivatives (R, T, k, n) with
     respect to n numbers.
 
@@ -440,9 +460,9 @@ def prior_weights(model: "Model") -> Float[Array, " n"]:
     return weights
 
 
-def extra_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-    """Return the residuals (j,) that may depend on several of the free numbers x (n,) of a `model`:
-    those of the prior of the body, and of the model's `AbstractPull`.
+def body_prior_and_pull_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
+    """Return the residuals (j,) of the prior of the body, and of the `AbstractPull` of a `model`,
+    at its free numbers x (n,). Each of these residuals may depend on several of the free numbers.
     """
     out = [jnp.zeros(0, x.dtype)]
     if model.prior is not None:
@@ -459,10 +479,12 @@ def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]
     first n residuals of the priors of the single free numbers, then the residuals of the prior of
     the body and of an `AbstractPull`.
     """
-    return jnp.concatenate([prior_weights(model) * x, extra_residuals(model, x)])
+    return jnp.concatenate([prior_weights(model) * x, body_prior_and_pull_residuals(model, x)])
 
 
-def reading_weights(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
+def reading_weights(
+    model: "Model", errors: SensorErrors, noise: Noise
+) -> tuple[Float[Array, "..."], ...]:
     """Return, for each sensor, the weight (R, T) of each of its readings in the normal equations.
 
     The weight is dρ/ds of the robust loss ρ(s), where s is the squared length of the error in
@@ -479,7 +501,7 @@ def reading_weights(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[
     return tuple(jnp.where(mask, weight(e), 0.0) for mask, e in zip(masks, scaled, strict=True))
 
 
-def half_sum(tree: PyTree) -> Float[Array, ""]:
+def half_sum_of_squares(tree: PyTree) -> Float[Array, ""]:
     """Return half the sum of the squares of all numbers in a `tree` of arrays, such as the misfit
     of a tree of residuals.
     """

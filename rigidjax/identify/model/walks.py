@@ -77,7 +77,7 @@ def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]
                 f"{path[0].name}; give an unknown torque as process="
             )
         if any(drift.path == path for drift in drifts):
-            raise ValueError("Walk: another Walk moves the same numbers")
+            raise ValueError("Walk: another Walk moves the same numbers; give each array one Walk")
         value = jnp.asarray(value)
         parts = (
             broadcast_to_shape(number, value.shape, name).astype(value.dtype)
@@ -89,7 +89,7 @@ def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]
 
 def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
     """Return the values of the drifting sensor errors in a `scene`, one array for each of the
-    `drifts`, each of which knows the path of its error in the scene.
+    `drifts`. A `Drift` holds the path of its error in the scene.
     """
     return leaves_at(scene, [drift.path for drift in drifts])
 

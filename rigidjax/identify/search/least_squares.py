@@ -287,6 +287,7 @@ def _damped_step(
     # are very different.
     root = jnp.sqrt(diagonal)
     damped = damping * jnp.maximum(diagonal, order_one) / root**2
-    move = -normal.in_units(1.0 / root).add_diagonal(damped).solve(slope / root) / root
+    scaled = normal.scale_rows_and_columns(1.0 / root)
+    move = -scaled.add_diagonal(damped).solve(slope / root) / root
     far = jnp.max(jnp.abs(move) * order_one)
     return move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300)), root

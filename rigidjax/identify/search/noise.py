@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.terms import Blocks, Noise, delay_derivatives, reading_weights
+from rigidjax.identify.model.terms import Blocks, Noise, error_derivatives_by_delay, reading_weights
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
 
@@ -61,7 +61,7 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
             each = np.broadcast_to(each[:, None], sigma.shape)
             sigma = jnp.asarray(each.astype(sigma.dtype))
         if reading.jitter_error is not None:
-            change = delay_derivatives(model, x)[index]
+            change = error_derivatives_by_delay(model, x)[index]
             root = np.sqrt(np.asarray(weight, float) / share[groups][:, None])
             size = np.asarray(sigma, float)
             e, u = (np.where(mask, np.asarray(x) / size[:, None], 0.0) for x in (error, change))

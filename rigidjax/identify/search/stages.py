@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.data.recording import Reading, count_of
 from rigidjax.identify.model import terms
-from rigidjax.identify.model.charts import chart_list, numbers_of
+from rigidjax.identify.model.charts import chart_list, numbers_of_each_body
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.normal import NormalMatrix, normal_of
+from rigidjax.identify.model.normal import NormalMatrix, normal_matrix_of_jacobians
 from rigidjax.identify.model.predict import FixedSteps, HeldSteps
 from rigidjax.identify.model.terms import Blocks, Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
@@ -140,21 +140,23 @@ def least_squares_from(
         for e, row in zip(residuals, rows, strict=True):
             total = total + jnp.sum(e**2)
             # On a CPU a product of matrices is several times as fast as an `einsum`, as in
-            # `normal_of`.
+            # `normal_matrix_of_jacobians`.
             flat = row.reshape(model.count, -1, places.shape[1])
             pulls = pulls + (e.reshape(model.count, 1, -1) @ flat)[:, 0]
         slope = jnp.zeros(number + 1, kind).at[places].add(pulls)
-        normal = normal_of(rows, places, number, alone).add_diagonal(prior**2)
+        normal = normal_matrix_of_jacobians(rows, places, number, alone).add_diagonal(prior**2)
         total, slope = total + jnp.sum((prior * x) ** 2), slope[:-1] + prior**2 * x
-        row, e = terms.with_jacobian(lambda x: terms.extra_residuals(model, x), x)
+        row, e = terms.jacobian_and_value(
+            lambda x: terms.body_prior_and_pull_residuals(model, x), x
+        )
         if e.size:
             total, slope = total + jnp.sum(e**2), slope + e @ row
-            normal = normal.with_rows(row)
-        normal = normal.with_rows(_curvature_rows(model, x, slope))
+            normal = normal.add_residual_rows(row)
+        normal = normal.add_residual_rows(_curvature_rows(model, x, slope))
         return Evaluation((errors, slopes), pulls), 0.5 * total, normal, slope
 
     zeros = _zeros_of_evaluation(model, kind)
-    zero_normal = normal_of(
+    zero_normal = normal_matrix_of_jacobians(
         (jnp.zeros((places.shape[0], 0, 0, places.shape[1]), kind),), places, number, alone
     )
     windows = model.clusters is not None
@@ -199,7 +201,7 @@ def _expected_gain_of_noise(
     slopes = slopes.at[:, starts].set(0.0)
     diagonal = normal.diagonal
     root = jnp.sqrt(jnp.maximum(diagonal, 1e-12 * jnp.max(diagonal)))
-    definite = normal.in_units(1.0 / root).add_diagonal(jnp.full_like(root, 1e-12))
+    definite = normal.scale_rows_and_columns(1.0 / root).add_diagonal(jnp.full_like(root, 1e-12))
     scaled = slopes / root[None, :]
     return 0.5 * jnp.sum(scaled * definite.solve(scaled.T).T)
 
@@ -226,7 +228,10 @@ def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
     - `slope`: (n,) the gradient of the cost at x.
     """
     count = model.index.bodies
-    parts = (chart_list(model.chart), *(numbers_of(model.chart, y[:count]) for y in (x, slope)))
+    parts = (
+        chart_list(model.chart),
+        *(numbers_of_each_body(model.chart, y[:count]) for y in (x, slope)),
+    )
     rows = block_diag(*(chart.bend(*mine) for chart, *mine in zip(*parts, strict=True)))
     return jnp.pad(rows, ((0, 0), (0, slope.size - rows.shape[1])))
 

@@ -15,7 +15,7 @@ from rigidjax.identify.model.model import Model, require_numbers
 from rigidjax.identify.model.terms import (
     Noise,
     all_errors,
-    half_sum,
+    half_sum_of_squares,
     prior_residuals,
     reading_residuals,
 )
@@ -205,7 +205,7 @@ def misfit_of(x: Float[Array, " n"], model: Model, noise: Noise, rows: Array) ->
     weights = jnp.ones_like(few.records.t)
     residuals = reading_residuals(few, all_errors(few, x), sizes, weights)
     scale = model.count / rows.shape[0]
-    return half_sum(residuals) * scale + half_sum(prior_residuals(model, x))
+    return half_sum_of_squares(residuals) * scale + half_sum_of_squares(prior_residuals(model, x))
 
 
 def chosen_recordings(model: Model, rows: Array) -> Model:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from rigidjax.identify.model.free import TOLERANCES, Slot
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.terms import Noise, in_deviations
+from rigidjax.identify.model.terms import Noise, standardised_error_changes
 from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.identify.sensors.vectors import VectorSensor
 from rigidjax.identify.uncertainty.covariance import Linearisation
@@ -129,7 +129,9 @@ def shifts_of(
     direction = _changes_by_unit_errors(model, linear, index, kind)
     jitter_error = model.records.readings[index].jitter_error
     # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
-    scaled = np.asarray(in_deviations(direction, np.asarray(noise[index]), jitter_error))
+    scaled = np.asarray(
+        standardised_error_changes(direction, np.asarray(noise[index]), jitter_error)
+    )
     pulls = np.einsum(
         "rtkm,rt,rtkc->rmc", linear.slopes[index], linear.weights[index], scaled, optimize=True
     )

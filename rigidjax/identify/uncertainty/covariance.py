@@ -13,12 +13,12 @@ from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import (
     Blocks,
     Noise,
-    extra_residuals,
+    body_prior_and_pull_residuals,
+    jacobian_and_value,
     prior_weights,
     reading_weights,
     residuals_and_jacobians,
     whiten,
-    with_jacobian,
 )
 
 # A direction of the free numbers is undetermined if its singular value is below this fraction of
@@ -181,7 +181,7 @@ def _linearise_parts(model: Model, x: Array, noise: Noise, blocks: Blocks) -> Py
     """
     errors, slopes = blocks
     out, slopes = residuals_and_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
-    extra_slopes, extra = with_jacobian(lambda x: extra_residuals(model, x), x)
+    extra_slopes, extra = jacobian_and_value(lambda x: body_prior_and_pull_residuals(model, x), x)
     weights, prior = reading_weights(model, errors, noise), prior_weights(model)
     return (out, slopes, weights), model.index.places, (prior * x, prior, extra, extra_slopes)
 

@@ -8,9 +8,14 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.symmetric3 import inertia_from_second_moment
-from rigidjax.identify.model.charts import AbstractBodyChart, as_list, chart_list, numbers_of
-from rigidjax.identify.model.model import Model, without_samples
+from rigidjax.body.symmetric3 import swap_trace
+from rigidjax.identify.model.charts import (
+    AbstractBodyChart,
+    bodies_as_list,
+    chart_list,
+    numbers_of_each_body,
+)
+from rigidjax.identify.model.model import Model, with_first_times_only
 
 # Derivatives are computed at a body whose smallest second moment is at least this fraction of the
 # sum of its three second moments.
@@ -101,7 +106,7 @@ def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     thick = list(map(_numbers_of_thicker_body, chart_list(model.chart), bodies_of(model, x)))
     if all(one is None for one in thick):
         return None
-    pairs = zip(numbers_of(model.chart, x[: model.index.bodies]), thick, strict=True)
+    pairs = zip(numbers_of_each_body(model.chart, x[: model.index.bodies]), thick, strict=True)
     vectors = [old if new is None else new for old, new in pairs]
     return jnp.concatenate([*vectors, x[model.index.bodies :]])
 
@@ -111,7 +116,7 @@ def bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
 
     A chart is the parametrisation of one body by free numbers.
     """
-    return _bodies_of(without_samples(model), x)
+    return _bodies_of(with_first_times_only(model), x)
 
 
 @eqx.filter_jit
@@ -123,7 +128,7 @@ def _bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
     """
     # Compile one program: outside of a trace each operation of JAX takes as long as a run of 100
     # steps.
-    return as_list(model.bodies(x))
+    return bodies_as_list(model.bodies(x))
 
 
 def _numbers_of_thicker_body(
@@ -175,7 +180,7 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
     is set to 1 for a body whose moments are not free.
     """
     out = []
-    bodies = as_list(model.bodies(x))
+    bodies = bodies_as_list(model.bodies(x))
     for chart, body in zip(chart_list(model.chart), bodies, strict=True):
         if not _ends_at_flat_bodies(chart):
             out.append(jnp.ones((), x.dtype))

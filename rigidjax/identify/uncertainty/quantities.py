@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax.identify.model.charts import AbstractBodyChart, Bodies, Ratios, as_list
-from rigidjax.identify.model.model import Model, values_of, without_samples
-from rigidjax.identify.model.terms import with_jacobian
+from rigidjax.identify.model.charts import AbstractBodyChart, Bodies, Ratios, bodies_as_list
+from rigidjax.identify.model.model import Model, values_of, with_first_times_only
+from rigidjax.identify.model.terms import jacobian_and_value
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
@@ -157,7 +157,7 @@ def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
     They are, in the order of `labels`, the moments and other numbers of each body, the initial body
     rates (rad/s), and the values of each `Free`. A positive quantity is given by its logarithm.
     """
-    parts, bodies = [jnp.zeros(0, x.dtype)], as_list(model.bodies(x))
+    parts, bodies = [jnp.zeros(0, x.dtype)], bodies_as_list(model.bodies(x))
     for (_, chart), body in zip(charts_by_suffix(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
     if reports_starts(model):
@@ -178,7 +178,7 @@ def value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
     Both arrays have further entries at the end for the flatness (I1 + I2 − I3) / I3 of each body. A
     positive quantity is given by its logarithm.
     """
-    return _value_and_slope(without_samples(model), x)
+    return _value_and_slope(with_first_times_only(model), x)
 
 
 @eqx.filter_jit
@@ -193,7 +193,7 @@ def _value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]
     def value(x: Array) -> Array:
         return jnp.concatenate([quantity_vector(model, x), flat_limit.flatness(model, x)])
 
-    slope, values = with_jacobian(value, x)
+    slope, values = jacobian_and_value(value, x)
     return values, slope
 
 
