@@ -442,7 +442,9 @@ def sample(
     """
     _checks.random_key(key)
     body = validation.require_single_body(body, (Inertia, MassProperties), "body")
-    _checks.require_single(state0, HasSpin, "state0", requirement="a Spin, an Attitude or a Rigid")
+    _checks.require_unbatched_instance(
+        state0, HasSpin, "state0", requirement="a Spin, an Attitude or a Rigid"
+    )
     require_unknown_torque(process)
     if torque is not None:
         require_torque(torque)

@@ -202,7 +202,7 @@ def differentiable_map_over_recordings(
     def function_of_row(row: Row, *rest: PyTree) -> Any:
         return function(model, row, *rest)
 
-    return batch_as(map_over_recordings(function_of_row, model, rows), rows)
+    return match_batch_axes(map_over_recordings(function_of_row, model, rows), rows)
 
 
 @differentiable_map_over_recordings.def_jvp

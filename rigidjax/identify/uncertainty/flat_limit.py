@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.symmetric3 import swap_trace
+from rigidjax.body.symmetric3 import inertia_from_second_moment
 from rigidjax.identify.model.charts import (
     AbstractBodyChart,
     bodies_as_list,
