@@ -244,11 +244,11 @@ def newton_root(f: Callable[[Array], Array], start: Array, tolerance: float) -> 
     returns as many values (n,) as it has unknowns.
     """
 
-    def is_unfinished(carry: tuple[Array, Array, Array]) -> Array:
+    def is_unfinished(carry: tuple[Array, Array, Array | int]) -> Array:
         _, left, count = carry
         return (left > 0.1 * tolerance) & (count < MAX_STEPS)
 
-    def newton_step(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def newton_step(carry: tuple[Array, Array, Array | int]) -> tuple[Array, Array, Array | int]:
         x, _, count = carry
         missed, slope = value_and_jacobian(f, x)
         moved = x - jnp.linalg.solve(slope, missed)

@@ -315,7 +315,7 @@ def whiten(model: "Model", errors: SensorErrors, noise: Noise) -> tuple[Float[Ar
     out = []
     for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
         limit = getattr(reading.sensor, "limit", None)
-        parts = reading.values, reading.mask, error, sigma, limit, reading.jitter_error
+        parts: Any = reading.values, reading.mask, error, sigma, limit, reading.jitter_error
         out.append(jax.vmap(standardised_errors_and_saturation)(*parts)[0])
     return tuple(out)
 
