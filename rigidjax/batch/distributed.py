@@ -65,7 +65,10 @@ def share(tree: PyTree) -> PyTree:
         raise TypeError("share: wanted a tree of arrays with a leading axis of bodies")
     counts = {leaf.shape[0] for leaf in leaves}
     if len(counts) != 1:
-        raise ValueError(f"share: wanted one number of bodies, got {sorted(counts)}")
+        raise ValueError(
+            "share: wanted arrays of one number of bodies (the length of the first axis), got "
+            f"{sorted(counts)}"
+        )
     count = counts.pop()
     if count < processes:
         raise ValueError(f"share: {count} bodies for {processes} processes; start fewer processes")
@@ -101,7 +104,7 @@ def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> Py
         sent = np.asarray(multihost_utils.process_allgather(jnp.asarray(filled)))
         return np.concatenate([part[:n] for part, n in zip(sent, counts, strict=True)])
 
-    return _exchange_arrays(rows_of_all, _copy_to_host(tree, "gather"), checkpoint)
+    return _combine_over_processes(rows_of_all, _copy_to_host(tree, "gather"), checkpoint)
 
 
 def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyTree:
@@ -120,7 +123,7 @@ def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyT
     [1.0, 1.0]
     """
     add = lambda leaf: multihost_utils.process_allgather(jnp.asarray(leaf)).sum(axis=0)  # noqa: E731
-    return _exchange_arrays(add, _copy_to_host(tree, "total"), checkpoint)
+    return _combine_over_processes(add, _copy_to_host(tree, "total"), checkpoint)
 
 
 def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
@@ -171,7 +174,9 @@ def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
     folder = _checks.file_path(folder, "folder")
     paths = sorted(folder.glob("share-*.npz"), key=lambda p: int(p.stem.split("-")[1]))
     if not paths:
-        raise FileNotFoundError(f"recover: no share-*.npz in {folder}")
+        raise FileNotFoundError(
+            f"recover: wanted a folder with files share-*.npz, which save writes, got {folder}"
+        )
     structure = jax.tree.structure(like)
     trees = []
     for path in paths:
@@ -184,28 +189,29 @@ def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
             raise ValueError(f"recover: {path} was not written by save, or is cut short") from error
         if len(leaves) != structure.num_leaves:
             raise ValueError(
-                f"recover: like has {structure.num_leaves} arrays, {path} holds {len(leaves)}"
+                f"recover: wanted a file of {structure.num_leaves} arrays, as `like` has, got "
+                f"{path} with {len(leaves)}"
             )
         trees.append(jax.tree.unflatten(structure, leaves))
     return trees
 
 
-def _copy_to_host(tree: PyTree, name: str) -> PyTree:
+def _copy_to_host(tree: PyTree, caller: str) -> PyTree:
     """Return a tree whose arrays are copied to host memory, as NumPy arrays.
 
-    Raise `TypeError` if an array is traced. The message begins with `name`, the name of the public
-    function that the user called.
+    Raise `TypeError` if an array is traced. The message begins with `caller`, the name of the
+    public function that the user called.
     """
     if not _checks.is_known(tree):
         raise TypeError(
-            f"{name}: wanted a tree of known arrays, got one that is traced; {name} sends arrays "
-            "between processes: call it outside of jax.jit, jax.grad and jax.vmap"
+            f"{caller}: wanted a tree of known arrays, got one that is traced; {caller} sends "
+            "arrays between processes: call it outside of jax.jit, jax.grad and jax.vmap"
         )
     return jax.tree.map(np.asarray, tree)
 
 
-def _exchange_arrays(
-    send: Callable[[np.ndarray], np.ndarray | Array],
+def _combine_over_processes(
+    combine: Callable[[np.ndarray], np.ndarray | Array],
     tree: PyTree,
     checkpoint: str | os.PathLike[str] | None,
 ) -> PyTree:
@@ -213,7 +219,7 @@ def _exchange_arrays(
 
     **Arguments:**
 
-    - `send`: a function that sends an array of this process to all processes, and returns the
+    - `combine`: a function that sends an array of this process to all processes, and returns the
       joined rows, or the sum, of the arrays of all processes.
     - `tree`: the arrays of this process. If there is one process only, `tree` is returned as it is.
     - `checkpoint`: a folder to which `tree` is written before it is sent, so that it is not lost if
@@ -237,7 +243,7 @@ def _exchange_arrays(
     if jax.process_count() == 1:
         return tree
     try:
-        return jax.tree.map(send, tree)
+        return jax.tree.map(combine, tree)
     except Exception as error:
         advice = (
             f"this process's share is in {Path(checkpoint) / f'share-{jax.process_index()}.npz'}"

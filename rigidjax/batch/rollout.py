@@ -11,8 +11,14 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.batch.sharding import CompiledFunction, Devices, Division, division_of, map_bodies
-from rigidjax.batch.validation import TorqueAxes, check_batch, inputs_of_bodies, one_body, step_of
+from rigidjax.batch.sharding import CompiledFunction, Devices, Division, divide_batch, map_bodies
+from rigidjax.batch.validation import (
+    TorqueAxes,
+    check_batch,
+    checked_inputs_of_bodies,
+    checked_step_size_and_number,
+    inertia_state_and_torque,
+)
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import with_own_states
@@ -20,7 +26,7 @@ from rigidjax.motion.torques import bind
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.fixed_loop import inputs_at_start, march_steps
+from rigidjax.solve.fixed_loop import march_steps, torque_inputs_at_start
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.pieces import piece_length
 from rigidjax.solve.splitting import AbstractSplitting
@@ -160,8 +166,8 @@ def rollout(
     Array(0.47942554, dtype=float64)
     """
     batch = check_batch(bodies, states0, torque, torque_axes)
-    h, count = step_of(step_size, num_steps, batch.dtype)
-    samples = inputs_of_bodies(inputs, torque, states0, count, h)
+    h, count = checked_step_size_and_number(step_size, num_steps, batch.dtype)
+    samples = checked_inputs_of_bodies(inputs, torque, states0, count, h)
     if reduce is None and initial is not None:
         raise ValueError(
             "rollout: initial is the first carried value of reduce, but no reduce was given"
@@ -177,13 +183,13 @@ def rollout(
     begin = _checks.checked_time(t0, "t0").astype(batch.dtype)
     numbers = (batch.shared, (batch.per_body, samples), start, h, begin)
     steps = solver, count, every, save_every is not None and reduce is None
-    division = division_of(chunk, devices, progress_meter, batch.dtype, batch.num_bodies)
+    division = divide_batch(chunk, devices, progress_meter, batch.dtype, batch.num_bodies)
     out = _compiled(steps, division, reduce, batch.constants, numbers)
-    batch.require()
+    batch.require_valid_numbers()
     return out
 
 
-def _take_steps_of_bodies(
+def _take_fixed_steps_of_bodies(
     steps: tuple[Solver, int, int, bool],
     division: Division,
     reduce: Reduce | None,
@@ -214,12 +220,14 @@ def _take_steps_of_bodies(
     def step_body(numbers: PyTree, row: PyTree) -> PyTree:
         shared, initial, h, t0 = numbers
         own, inputs = row
-        body, state0, torque = one_body(shared, own, constants)
-        state0 = with_own_states(body, state0, bind(torque, inputs_at_start(torque, h, inputs)), t0)
+        body, state0, torque = inertia_state_and_torque(shared, own, constants)
+        state0 = with_own_states(
+            body, state0, bind(torque, torque_inputs_at_start(torque, h, inputs)), t0
+        )
         field = equations_of_motion(body, state0, torque)
         stepper = stepper_of(solver, field, state0, count)
 
-        def advance(carry: PyTree, first: Array) -> tuple[PyTree, PyTree]:
+        def advance_to_next_saved_state(carry: PyTree, first: Array) -> tuple[PyTree, PyTree]:
             # This goes from one saved state, which is followed by the step number `first`, to the
             # next saved state.
             y, carried = carry
@@ -231,11 +239,11 @@ def _take_steps_of_bodies(
 
         begin = (stepper.start, initial)
         if every == count:
-            (y, carried), saved = advance(begin, jnp.zeros((), jnp.int32))
+            (y, carried), saved = advance_to_next_saved_state(begin, jnp.zeros((), jnp.int32))
             saved = jax.tree.map(lambda leaf: leaf[None], saved)
         else:
             firsts = jnp.arange(0, count, every, dtype=jnp.int32)
-            (y, carried), saved = lax.scan(advance, begin, firsts)
+            (y, carried), saved = lax.scan(advance_to_next_saved_state, begin, firsts)
         if reduce is not None:
             return stepper.state(y), carried
         return saved if keep else stepper.state(y)
@@ -248,4 +256,4 @@ def _take_steps_of_bodies(
     return map_bodies(step_body, (shared, initial, h, t0), per_body, division)
 
 
-_compiled = CompiledFunction(_take_steps_of_bodies)
+_compiled = CompiledFunction(_take_fixed_steps_of_bodies)

@@ -56,7 +56,7 @@ class CompiledFunction:
         self._without_options = eqx.filter_jit(function)
 
     @functools.cached_property
-    def _with_options(self) -> Callable[..., Any]:
+    def _jit_with_compiler_options(self) -> Callable[..., Any]:
         """Return the function under `jit`, with the options of `compiler_options` if there are any.
 
         On CPU they enable vectors of 512 bits; other backends have none, and get a plain `jit`.
@@ -67,10 +67,10 @@ class CompiledFunction:
 
     def __call__(self, *args: Any) -> Any:
         known = _checks.is_known(args[-1])
-        return (self._with_options if known else self._without_options)(*args)
+        return (self._jit_with_compiler_options if known else self._without_options)(*args)
 
 
-def mesh_of(devices: Devices) -> Mesh | None:
+def mesh_of_devices(devices: Devices) -> Mesh | None:
     """Return a mesh of one axis over some devices, or `None` for the default device.
 
     `devices` is `None` for the default device, `"all"` for all devices of this process, or a
@@ -110,21 +110,23 @@ class Division(NamedTuple):
     progress_meter: dfx.AbstractProgressMeter
 
 
-def division_of(
+def divide_batch(
     chunk: int | None,
     devices: Devices,
     progress_meter: dfx.AbstractProgressMeter | None,
     dtype: np.dtype,
-    count: int,
+    num_bodies: int,
 ) -> Division:
-    """Return how a batch of `count` bodies is divided: the number of bodies in a chunk, the
-    devices, and the progress meter.
+    """Return how a batch of bodies is divided: the size of a chunk, and the devices.
+
+    A chunk is the bodies that a device computes at a time. The result also holds the progress
+    meter.
 
     - `chunk`: the number of bodies that are computed at a time, or `None` for the default.
     - `devices`: the devices that share the bodies, `"all"`, or `None` for the default device.
     - `progress_meter`: a progress meter of diffrax, or `None`.
     - `dtype`: the dtype of the numbers, on which the default size of a chunk depends.
-    - `count`: the number of bodies.
+    - `num_bodies`: the number of bodies.
 
     **Raises:** `ValueError` for a progress meter together with devices.
     """
@@ -139,21 +141,21 @@ def division_of(
             "progress_meter: wanted a diffrax.AbstractProgressMeter such as "
             f"diffrax.TextProgressMeter(), got {type(meter).__name__}"
         )
-    return Division(chunk_of(chunk, dtype, count), mesh_of(devices), meter)
+    return Division(chunk_size(chunk, dtype, num_bodies), mesh_of_devices(devices), meter)
 
 
-def chunk_of(chunk: int | None, dtype: np.dtype, count: int) -> int:
-    """Return the number of bodies that a device computes at a time, out of `count` bodies.
+def chunk_size(chunk: int | None, dtype: np.dtype, num_bodies: int) -> int:
+    """Return the number of bodies that a device computes at a time, out of `num_bodies` bodies.
 
-    It is `chunk`, but `count` at most. If `chunk` is `None`, it is on CPU the number of bodies that
-    fill the cache with numbers of the given `dtype`, and all bodies on other backends.
+    It is `chunk`, but `num_bodies` at most. If `chunk` is `None`, it is on CPU the number of bodies
+    that fill the cache with numbers of the given `dtype`, and all bodies on other backends.
     """
     if chunk is None:
         small = _ROW // np.dtype(dtype).itemsize
-        chunk = small if platform() == "cpu" else count
+        chunk = small if platform() == "cpu" else num_bodies
     if not isinstance(chunk, int) or chunk < 1:
         raise ValueError(f"chunk: wanted a positive number of bodies, got {chunk!r}")
-    return min(chunk, count)
+    return min(chunk, num_bodies)
 
 
 def map_bodies(

@@ -14,14 +14,20 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.batch.rollout import Inputs, rollout
-from rigidjax.batch.sharding import CompiledFunction, Devices, Division, division_of, map_bodies
-from rigidjax.batch.validation import BodyBatch, TorqueAxes, check_batch, one_body, step_of
+from rigidjax.batch.sharding import CompiledFunction, Devices, Division, divide_batch, map_bodies
+from rigidjax.batch.validation import (
+    BodyBatch,
+    TorqueAxes,
+    check_batch,
+    checked_step_size_and_number,
+    inertia_state_and_torque,
+)
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of, with_own_states
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
-from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_of_body
+from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_or_nonfinite_input
 from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
 
@@ -128,7 +134,7 @@ def simulate(
         options |= dict(save_every=every, t0=t0, devices=devices, progress_meter=progress_meter)
         ys: Any = rollout(bodies, states0, size, number, torque, **options)
         batch = check_batch(bodies, states0, torque, torque_axes)
-        h, count = step_of(size, number, batch.dtype)
+        h, count = checked_step_size_and_number(size, number, batch.dtype)
         ts = h * jnp.arange(every, count + 1, every).astype(h.dtype)
         ts = _checks.checked_time(t0, "t0").astype(h.dtype) + ts
         num_steps = jnp.full(batch.num_bodies, count, jnp.int32)
@@ -154,10 +160,10 @@ def simulate(
         rtol, atol = validation.checked_tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if solver is None else solver
     options = dict(solver=solver, rtol=rtol, atol=atol, max_steps=max_steps, adjoint=adjoint)
-    division = division_of(chunk, devices, progress_meter, batch.dtype, batch.num_bodies)
+    division = divide_batch(chunk, devices, progress_meter, batch.dtype, batch.num_bodies)
     numbers = (batch.shared, batch.per_body, ts)
     out = Batch(ts, *_compiled(options, division, batch.constants, numbers))
-    batch.require()
+    batch.require_valid_numbers()
     return out
 
 
@@ -166,7 +172,7 @@ def _simulate_bodies(
     division: Division,
     constants: PyTree,
     numbers: tuple[PyTree, PyTree, Array],
-) -> tuple[Any, ...]:
+) -> tuple[PyTree, dfx.RESULTS, Array, tuple[Any, ...] | None]:
     """Simulate many bodies, each by `rigidjax.simulate`, and return the results as four trees.
 
     **Arguments:**
@@ -186,7 +192,7 @@ def _simulate_bodies(
 
     def simulate_body(shared_numbers: PyTree, row: PyTree) -> tuple[Any, ...]:
         shared, ts = shared_numbers
-        body, state0, torque = one_body(shared, row, constants)
+        body, state0, torque = inertia_state_and_torque(shared, row, constants)
         sol = simulate_one(body, state0, ts, torque, throw=False, **options)
         return sol.ys, sol.result, jnp.asarray(sol.stats["num_steps"], jnp.int32), sol.own
 
@@ -196,14 +202,16 @@ def _simulate_bodies(
     def initial_speed(row: PyTree) -> Array:
         # This is |Ω| + √|dΩ/dt| at the start, rad/s, to sort by: the number of steps grows with
         # this speed.
-        body, state0, torque = one_body(shared, row, constants)
+        body, state0, torque = inertia_state_and_torque(shared, row, constants)
         y0 = with_own_states(body, state0, torque, ts[0])
         slope = motion_of(equations_of_motion(body, y0, torque)(ts[0], y0, None))
         rate, change = jnp.sum(state0.omega**2), jnp.sum(slope.omega**2)
         return lax.stop_gradient(jnp.sqrt(rate) + jnp.sqrt(jnp.sqrt(change)))
 
     parts = 1 if division.mesh is None else division.mesh.devices.size
-    order, inverse = order_by_key(jax.vmap(initial_speed)(per_body), division.chunk, parts)
+    order, inverse = sort_bodies_for_chunks(
+        jax.vmap(initial_speed)(per_body), division.chunk, parts
+    )
     rows = jax.tree.map(lambda a: a[order], per_body)
     out = map_bodies(simulate_body, (shared, ts), rows, division)
     return jax.tree.map(lambda a: a[inverse], out)
@@ -223,7 +231,9 @@ def _results_after_fixed_steps(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
 
     def status(row: PyTree, ys: PyTree) -> dfx.RESULTS:
         result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-        return result_of_body(result, one_body(batch.shared, row, batch.constants)[0])
+        return result_or_nonfinite_input(
+            result, inertia_state_and_torque(batch.shared, row, batch.constants)[0]
+        )
 
     return jax.vmap(status)(batch.per_body, ys)
 
@@ -233,7 +243,7 @@ def _results_after_fixed_steps(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
 _UNROLLED = 32
 
 
-def order_by_key(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:
+def sort_bodies_for_chunks(key: Array, chunk: int, num_devices: int) -> tuple[Array, Array]:
     """Sort bodies so that those that are computed together need similar numbers of steps.
 
     A chunk is the bodies that a device computes together; all of them wait for the slowest. The
@@ -245,18 +255,20 @@ def order_by_key(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:
     - `key`: (N,) a number of each body by which it is sorted, such as its speed; NaN is the
       largest.
     - `chunk`: the number of bodies of a chunk.
-    - `parts`: the number of devices, to which consecutive chunks go one after another.
+    - `num_devices`: the number of devices, to which consecutive chunks go one after another.
 
     **Returns** two permutations (N,): the order, which has the old index of each body at its new
     place; and its inverse.
     """
     count = key.shape[0]
-    chunk = min(chunk, -(-count // parts))
-    size = -(-count // (chunk * parts)) * chunk
+    chunk = min(chunk, -(-count // num_devices))
+    size = -(-count // (chunk * num_devices)) * chunk
     # `seats` are the places of the sorted bodies in the array for the devices: first chunk 0 of
     # every device, then chunk 1 of every device, and so on. A device has `size` places, the last
     # device may have fewer.
-    seats = np.arange(size * parts).reshape(-1, parts, chunk).transpose(1, 0, 2).reshape(-1)
+    seats = (
+        np.arange(size * num_devices).reshape(-1, num_devices, chunk).transpose(1, 0, 2).reshape(-1)
+    )
     seats = seats[seats < count]
     place = np.arange(count) % chunk
     place = place % _UNROLLED if chunk % _UNROLLED == 0 else place

@@ -41,9 +41,10 @@ class BodyBatch(NamedTuple):
     constants: PyTree  # the leaves that are no arrays
     num_bodies: int  # the number N of bodies
     dtype: np.dtype  # the precision of the states
-    checks: tuple[Check, ...] = ()  # the checks of known numbers, which `require` completes
+    # The checks of known numbers, whose results `require_valid_numbers` reads.
+    checks: tuple[Check, ...] = ()
 
-    def require(self) -> None:
+    def require_valid_numbers(self) -> None:
         """Raise an error for the first body with a known number that is wrong.
 
         Call this after the computation has been started: the device then checks the bodies while
@@ -54,7 +55,9 @@ class BodyBatch(NamedTuple):
                 refuse(i)
 
 
-def one_body(shared: PyTree, row: PyTree, constants: PyTree) -> tuple[Any, Any, Any]:
+def inertia_state_and_torque(
+    shared: PyTree, row: PyTree, constants: PyTree
+) -> tuple[Inertia | MassProperties, Spin | Attitude | Rigid, Torque | None]:
     """Return the inertia, the initial state and the torque of one body of a batch.
 
     **Arguments:**
@@ -79,8 +82,8 @@ def check_batch(
     """Check the bodies, initial states and torque of `rollout`, and return them as a `BodyBatch`.
 
     The arguments are those of `rollout` with the same names. Raise `TypeError` and `ValueError` for
-    wrong types and shapes. Where the numbers are checked on the device, `BodyBatch.require` raises
-    the error, later.
+    wrong types and shapes. Where the numbers are checked on the device,
+    `BodyBatch.require_valid_numbers` raises the error, later.
     """
     if not isinstance(states0, Spin | Attitude | Rigid):
         raise TypeError(
@@ -125,7 +128,7 @@ def check_batch(
     axes = (
         jax.tree.map(lambda _: own, arrays[0]),
         jax.tree.map(lambda _: True, arrays[1]),
-        _has_row_for_each_body(arrays[2], torque_axes, count),
+        _mask_of_arrays_with_body_rows(arrays[2], torque_axes, count),
     )
     per_body, shared = eqx.partition(arrays, axes)
     # For an `Inertia` the shape of a row is enough for this check, and taking the row itself would
@@ -137,16 +140,16 @@ def check_batch(
     batch = BodyBatch(shared, per_body, constants, count, dtype, tuple(checks))
     if all(isinstance(index, np.ndarray | np.integer) for index, _ in checks):
         # Few bodies are checked on the host, so that errors are raised before anything is compiled.
-        batch.require()
+        batch.require_valid_numbers()
     return batch
 
 
-def inputs_of_bodies(
+def checked_inputs_of_bodies(
     inputs: Mapping[str, ArrayLike] | None,
     torque: Torque | None,
     states0: Spin | Attitude | Rigid,
-    count: int,
-    h: Array,
+    num_steps: int,
+    step_size: Array,
 ) -> dict[str, Array] | None:
     """Return the inputs of a torque as arrays (N, count, *k) by name, after a check.
 
@@ -155,20 +158,20 @@ def inputs_of_bodies(
     - `inputs`: arrays by the names of the torque's inputs, or `None`.
     - `torque`: the torque, or `None`.
     - `states0`: the initial states of the N bodies, whose precision the arrays get.
-    - `count`, `h`: the number of steps, and the length of a step, s.
+    - `num_steps`, `step_size`: the number of steps, and the length of a step, s.
 
     Raise `ValueError` for inputs that do not fit the torque, the bodies or the steps. The result is
     `None` for a torque without inputs.
     """
     for name, delay in delays_of(torque):
-        if _checks.is_known((delay, h)):
-            longest, whole = np.abs(np.asarray(delay)).max(), count * float(h)
+        if _checks.is_known((delay, step_size)):
+            longest, whole = np.abs(np.asarray(delay)).max(), num_steps * float(step_size)
             if longest >= whole:
                 raise ValueError(
                     f"inputs[{name!r}]: its delay of {longest:.6g} s is not shorter than the run "
                     f"of {whole:.6g} s, so that no sample would be used"
                 )
-    wanted = (*states0.omega.shape[:1], count)
+    wanted = (*states0.omega.shape[:1], num_steps)
     samples = {}
     for name, value in require_inputs(torque, inputs).items():
         rows = _checks.numeric_array(value, f"inputs[{name!r}]")
@@ -182,46 +185,51 @@ def inputs_of_bodies(
     return samples or None
 
 
-def _has_row_for_each_body(torque: Torque | None, axes: TorqueAxes, count: int) -> PyTree:
-    """Return which arrays of a torque have a row for each of `count` bodies, as a tree of booleans.
+def _mask_of_arrays_with_body_rows(
+    torque: Torque | None, torque_axes: TorqueAxes, num_bodies: int
+) -> PyTree[bool]:
+    """Return which arrays of a torque have a row for each body of a batch, as a tree of booleans.
 
     The tree has the structure of `torque`, except that one boolean may stand for all arrays of a
-    part of the torque. `axes` says which arrays have such rows: it is a function that picks these
-    arrays from a torque, or a tree with 0 for them and `None` for arrays that all bodies share.
-    Raise `ValueError` if an array that is said to have such rows has not `count` of them.
+    part of the torque. `torque_axes` says which arrays have such rows: it is a function that picks
+    these arrays from a torque, or a tree with 0 for them and `None` for arrays that all bodies
+    share. Raise `ValueError` if an array that is said to have such rows has not `num_bodies` of
+    them.
     """
-    if callable(axes) and not isinstance(axes, eqx.Module):
-        prefix = _is_selected(torque, axes)
+    if callable(torque_axes) and not isinstance(torque_axes, eqx.Module):
+        prefix = _mask_of_selected_arrays(torque, torque_axes)
     else:
-        for axis in jax.tree.leaves(axes):
+        for axis in jax.tree.leaves(torque_axes):
             if not isinstance(axis, int) or axis != 0:
                 raise ValueError(
                     "torque_axes: wanted 0 and None, or a function that picks the arrays, such as "
                     f"lambda law: law.speed, got {axis!r}"
                 )
-        prefix = jax.tree.map(lambda axis: axis is not None, axes, is_leaf=lambda a: a is None)
+        prefix = jax.tree.map(
+            lambda axis: axis is not None, torque_axes, is_leaf=lambda a: a is None
+        )
     own, _ = eqx.partition(torque, prefix)
     for path, leaf in jax.tree.leaves_with_path(own):
-        if leaf.ndim == 0 or leaf.shape[0] != count:
+        if leaf.ndim == 0 or leaf.shape[0] != num_bodies:
             raise ValueError(
-                f"torque_axes: wanted {count} rows in torque{jax.tree_util.keystr(path)}, got "
+                f"torque_axes: wanted {num_bodies} rows in torque{jax.tree_util.keystr(path)}, got "
                 f"shape {leaf.shape}; to make a torque with one row for each body, call its "
                 "constructor under jax.vmap"
             )
     return prefix
 
 
-def _is_selected(torque: Torque | None, pick: Callable[[Any], Any]) -> PyTree:
+def _mask_of_selected_arrays(torque: Torque | None, select: Callable[[Any], Any]) -> PyTree[bool]:
     """Return which arrays of a torque a function selects, as a tree of booleans like the torque.
 
-    `pick` is that function: `pick(torque)` returns one array, a tuple of arrays, or a member of the
-    torque that holds arrays, all of which are then selected. Raise `ValueError` if it selects no
-    array.
+    `select` is that function: `select(torque)` returns one array, a tuple of arrays, or a member of
+    the torque that holds arrays, all of which are then selected. Raise `ValueError` if it selects
+    no array.
     """
     leaves, structure = jax.tree.flatten(torque)
     numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
     try:
-        picked = jax.tree.leaves(pick(numbered))
+        picked = jax.tree.leaves(select(numbered))
     except (AttributeError, IndexError, KeyError, TypeError) as error:
         raise ValueError(
             f"torque_axes: the function selects a part that the torque does not have ({error})"
@@ -234,7 +242,9 @@ def _is_selected(torque: Torque | None, pick: Callable[[Any], Any]) -> PyTree:
     return jax.tree.unflatten(structure, [i in picked for i in range(len(leaves))])
 
 
-def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
+def _check_inertia(
+    bodies: Inertia | MassProperties,
+) -> tuple[Inertia | MassProperties, list[Check]]:
     """Return the bodies, and the check that a real body can have the inertia of each of them.
 
     **Returns** two things: the bodies; and a list with one check. The check is a pair: the index of
@@ -287,7 +297,9 @@ def _is_not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
     return xp.abs(xp.sqrt(xp.sum(xp.square(q), axis=-1)) - 1) > rotation_tolerance(q.dtype)
 
 
-def step_of(step_size: ScalarLike, num_steps: int, dtype: np.dtype) -> tuple[Array, int]:
+def checked_step_size_and_number(
+    step_size: ScalarLike, num_steps: int, dtype: np.dtype
+) -> tuple[Array, int]:
     """Return the length of a step, s, and the number of steps, after a check of each.
 
     `step_size` and `num_steps` are the arguments of `rollout`; `dtype` is the precision that the

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive_loop import NONFINITE, finite
@@ -69,7 +69,7 @@ class _VectorFieldOnTree(eqx.Module):
         return self.tree(self.field(self.constants, t, ravel_pytree(y)[0]))
 
 
-def _state_as_vector(t: Any, y: Any, args: object) -> Array:
+def _state_as_vector(t: Any, y: PyTree, args: object) -> Array:
     """Return the n numbers of the state `y` as one vector (n,), for diffrax to save.
 
     Diffrax also gives the time `t`, s, and the argument `args` of the field; neither is used.
@@ -77,7 +77,7 @@ def _state_as_vector(t: Any, y: Any, args: object) -> Array:
     return ravel_pytree(y)[0]
 
 
-def integrate(
+def integrate_with_diffrax(
     solver: dfx.AbstractSolver,
     field: Callable[..., Any],
     ts: Array,
@@ -202,4 +202,4 @@ def adaptive(
     rtol, atol = (jnp.asarray(a, ts.dtype) for a in (rtol, atol))
     controller = Watched(StandardController(rtol, atol, max_step))
     how = dict(jumps=declared, halt=halt, dt0=dt0, max_steps=max_steps)
-    return integrate(solver, field, ts, y0, controller, **how)
+    return integrate_with_diffrax(solver, field, ts, y0, controller, **how)

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, PyTree
 
-from rigidjax.solve.batching import Arrays, lift
+from rigidjax.solve.batching import Arrays, add_leading_axes
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, nested, stages, weights
 from rigidjax.solve.tableaus import Tableau
 
@@ -70,14 +70,14 @@ class Run(NamedTuple):
     state: Any = None  # the states of the step controller and the progress meter at the start
 
     @property
-    def before(self) -> Array:
+    def last_times_before_jumps(self) -> Array:
         """Return the last floating-point time before each jump, and the end of the run, (J,).
 
         The last stage of a step that ends at a jump is evaluated at this earlier time, so that it
         sees the field as it is before the jump.
         """
         jumps = lax.stop_gradient(self.stops[:-1])
-        gap = previous_number(jumps) - jumps
+        gap = previous_float(jumps) - jumps
         return jnp.concatenate([self.stops[:-1] + gap, self.stops[-1:]])
 
 
@@ -107,8 +107,8 @@ HEAD = 4
 NONE, STEP, LAST = range(3)
 
 
-def pack(loop: LoopState) -> Arrays:
-    """Return a loop state as a short list of arrays, to which `unpack` is the inverse.
+def pack_loop_state(loop: LoopState) -> Arrays:
+    """Return a loop state as a short list of arrays, to which `unpack_loop_state` is the inverse.
 
     The first array is the state y (n, *bodies), where `*bodies` is one last axis for the bodies of
     a batch, or no axis for one body. All other fields are joined, with one array for each dtype.
@@ -117,11 +117,11 @@ def pack(loop: LoopState) -> Arrays:
     """
     rest = _group_by_dtype(loop._replace(y=None))
     join = lambda leaves: jnp.concatenate([a.reshape(-1, *loop.t.shape) for a in leaves])  # noqa: E731
-    return [loop.y, *(join([a.astype(kind) for a in leaves]) for kind, leaves in rest.items())]
+    return [loop.y, *(join([a.astype(dtype) for a in leaves]) for dtype, leaves in rest.items())]
 
 
-def unpack(arrays: Arrays, like: LoopState) -> LoopState:
-    """Return the loop state from the `arrays` that `pack` returned for it.
+def unpack_loop_state(arrays: Arrays, like: LoopState) -> LoopState:
+    """Return the loop state from the `arrays` that `pack_loop_state` returned for it.
 
     `like` is a loop state whose arrays have the wanted shapes and dtypes.
     """
@@ -130,28 +130,30 @@ def unpack(arrays: Arrays, like: LoopState) -> LoopState:
     for (kind, leaves), array in zip(_group_by_dtype(rest).items(), arrays[1:], strict=True):
         sizes = [a.size // max(like.t.size, 1) for a in leaves]
         parts[kind] = iter(jnp.split(array, np.cumsum(sizes)[:-1]))
-    rest = [next(parts[_stored_dtype(a)]).reshape(a.shape).astype(a.dtype) for a in rest]
+    rest = [
+        next(parts[_dtype_or_int32_for_booleans(a)]).reshape(a.shape).astype(a.dtype) for a in rest
+    ]
     return tree.unflatten(rest)._replace(y=arrays[0])
 
 
-def _stored_dtype(a: Array) -> Any:
-    """Return the dtype in which an array is stored beside others: int32 for booleans, else its own.
+def _dtype_or_int32_for_booleans(array: Array) -> np.dtype:
+    """Return int32 for an array of booleans, and the dtype of any other array.
 
-    Booleans are stored as integers so that they need no array of their own: the arrays of the loop
-    over steps are joined, with one array for each dtype.
+    The arrays of the loop over steps are joined, with one array for each dtype. Booleans are stored
+    as integers so that they need no array of their own.
     """
-    return jnp.dtype(jnp.int32) if a.dtype == bool else a.dtype
+    return jnp.dtype(jnp.int32) if array.dtype == bool else array.dtype
 
 
-def _group_by_dtype(tree: Any) -> dict[Any, Arrays]:
+def _group_by_dtype(tree: PyTree) -> dict[np.dtype, Arrays]:
     """Return the arrays of a tree in lists, one list for each dtype.
 
     Each key of the result is a dtype, int32 also for boolean arrays; its value is the list of
     arrays, in the order of the tree.
     """
-    parts: dict[Any, Arrays] = {}
+    parts: dict[np.dtype, Arrays] = {}
     for a in jax.tree.leaves(tree):
-        parts.setdefault(_stored_dtype(a), []).append(a)
+        parts.setdefault(_dtype_or_int32_for_booleans(a), []).append(a)
     return parts
 
 
@@ -175,7 +177,7 @@ class Segment(NamedTuple):
     number: Array  # the number of rows that are filled
 
 
-def previous_number(t: Array) -> Array:
+def previous_float(t: Array) -> Array:
     """Return the largest floating-point number below the time `t`, as diffrax defines it.
 
     For t = 0 the result is the largest negative normal number, because XLA treats subnormal numbers
@@ -186,12 +188,13 @@ def previous_number(t: Array) -> Array:
     return jnp.where(t == 0, -jnp.finfo(t.dtype).tiny, less).astype(t.dtype)
 
 
-def step_times(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
-    """Return the start, length and end of recorded steps, s, which have derivatives.
+def start_length_and_end_of_steps(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
+    """Return the start, length and end of recorded steps, s, with their derivatives.
 
-    Stops are the times at which steps have to end, because the field jumps there. With respect to
-    their times, the start of a step moves with the last stop before it (with `run.t0` before the
-    first stop). The end of a step moves with a stop only if the step ends at this stop.
+    Stops are the times at which steps have to end, because the field jumps there. The derivatives
+    are those with respect to the stops and to `run.t0`: the start of a step moves with the last
+    stop before it (with `run.t0` before the first stop); the end of a step moves with a stop only
+    if the step ends at this stop.
 
     - `run`: holds the start `t0` and the stops.
     - `rows`: (4 + n, …) the recorded steps: in each row the start time, the length, the kind of the
@@ -202,33 +205,36 @@ def step_times(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
     t, h = t.astype(run.t0.dtype), h.astype(run.t0.dtype)
     begun = row_of_each_body(jnp.concatenate([run.t0[None], run.stops]), stop)
     t = t + (begun - lax.stop_gradient(begun))
-    end = row_of_each_body(run.before, stop)
+    end = row_of_each_body(run.last_times_before_jumps, stop)
     h = jnp.where(last, end - t, h)
     return t, h, jnp.where(last, end, t + h)
 
 
-def row_of_each_body(a: Array, index: Array) -> Array:
-    """Return `a[index]` of each body; an index out of range is replaced by the nearest one.
+def row_of_each_body(rows: Array, index: Array) -> Array:
+    """Return `rows[index]` of each body, where each body has an index of its own.
 
-    - `a`: (J, *bodies) the rows; `*bodies` is one last axis for the bodies of a batch, or no axis.
+    An index out of range is replaced by the nearest one that is in range.
+
+    - `rows`: (J, *bodies) the rows; `*bodies` is one last axis for the bodies of a batch, or no
+      axis.
     - `index`: (…, *bodies) integers from 0 to J − 1.
 
     **Returns** an array of the shape of `index`.
     """
-    count = a.shape[0]
-    a = a.reshape(count, *[1] * (index.ndim + 1 - a.ndim), *a.shape[1:])
+    count = rows.shape[0]
+    rows = rows.reshape(count, *[1] * (index.ndim + 1 - rows.ndim), *rows.shape[1:])
     if count == 1:
-        return jnp.broadcast_to(a[0], index.shape)
+        return jnp.broadcast_to(rows[0], index.shape)
     index = jnp.clip(index, 0, count - 1)
     # For so few rows a sum over a mask is quicker than an indexed look-up, also in derivatives.
     if count <= 8:
         each = jnp.arange(count, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
-        return jnp.sum(jnp.where(each == index[None], a, 0), 0).astype(a.dtype)
-    a = jnp.broadcast_to(a, (count, *index.shape))
-    return jnp.take_along_axis(a, index[None], 0)[0]
+        return jnp.sum(jnp.where(each == index[None], rows, 0), 0).astype(rows.dtype)
+    rows = jnp.broadcast_to(rows, (count, *index.shape))
+    return jnp.take_along_axis(rows, index[None], 0)[0]
 
 
-def finite(tree: Any) -> Bool[Array, ""]:
+def finite(tree: PyTree) -> Bool[Array, ""]:
     """Return whether every number in `tree` is finite."""
     good = jnp.asarray(True)
     for leaf in jax.tree.leaves(tree):
@@ -236,47 +242,50 @@ def finite(tree: Any) -> Bool[Array, ""]:
     return good
 
 
-def starting_step(size: Array, rate: Array, order: Any) -> Array:
-    """Return the length of the first step of a run, s, from the sizes of the state and of its rate.
+def starting_step(state_norm: Array, rate_norm: Array, order: Any) -> Array:
+    """Return the length of the first step of a run, s, from the norms of the state and its rate.
 
-    - `size`: the norm of the state at the start, each number divided by its tolerance.
-    - `rate`: the norm of the time derivative of the state, each number divided by its tolerance,
-      1/s.
+    - `state_norm`: the norm of the state at the start, each number divided by its tolerance.
+    - `rate_norm`: the norm of the time derivative of the state, each number divided by its
+      tolerance, 1/s.
     - `order`: the order of the error estimate.
 
     The formula is that of Hairer, Nørsett and Wanner (1993), II.4, with one change: the norm of the
-    second derivative is taken to be rate²/size, as for an oscillation. To measure the second
-    derivative, the field would have to be compiled once more.
+    second derivative is taken to be `rate_norm`²/`state_norm`, as for an oscillation. To measure
+    the second derivative, the field would have to be compiled once more.
     """
-    # A state of zeros gives no time scale, rate/size would be infinite: `size` gets a lower limit.
-    quickness = rate / jnp.maximum(size, 1e-4 * rate)
-    guess = (0.01 / (rate * jnp.maximum(quickness, 1))) ** (1 / order)
-    return jnp.where(rate < 1e-5, 1e-4, jnp.minimum(1 / quickness, guess)).astype(size.dtype)
+    # A state of zeros gives no time scale, because `rate_norm`/`state_norm` would be infinite:
+    # `state_norm` therefore gets a lower limit.
+    quickness = rate_norm / jnp.maximum(state_norm, 1e-4 * rate_norm)
+    guess = (0.01 / (rate_norm * jnp.maximum(quickness, 1))) ** (1 / order)
+    length = jnp.where(rate_norm < 1e-5, 1e-4, jnp.minimum(1 / quickness, guess))
+    return length.astype(state_norm.dtype)
 
 
-def next_step(norm: Array, order: Any, h: Any) -> tuple[Array, Array]:
+def acceptance_and_next_step_size(error_norm: Array, order: Any, h: Any) -> tuple[Array, Array]:
     """Return whether a step is accepted, and the length of the next step, s.
 
-    - `norm`: the norm of the step's error, divided by the tolerance; a step is accepted below 1.
+    - `error_norm`: the norm of the step's error, divided by the tolerance; a step is accepted below
+      1.
     - `order`: the order of this error.
     - `h`: the length of the step, s.
 
     The next length is at least 0.2 and at most 10 times `h`. These limits are the defaults of
     `diffrax.PIDController`.
     """
-    norm, h = lax.stop_gradient((norm, h))
+    error_norm, h = lax.stop_gradient((error_norm, h))
     # NaN is treated as infinity, because it may come from a step that is too long: a shorter
     # step is tried.
-    norm = jnp.where(jnp.isnan(norm), jnp.inf, norm)
-    factor = jnp.clip(_SAFETY * norm ** (-1 / order), _SMALLEST, _LARGEST)
-    return norm < 1, h * factor.astype(jnp.result_type(h))
+    error_norm = jnp.where(jnp.isnan(error_norm), jnp.inf, error_norm)
+    factor = jnp.clip(_SAFETY * error_norm ** (-1 / order), _SMALLEST, _LARGEST)
+    return error_norm < 1, h * factor.astype(jnp.result_type(h))
 
 
-def result_of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
+def result_or_nonfinite_input(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
     """Return the result of a run, or `nonfinite_input` if a number of the body is not finite.
 
-    In a batch, an inertia that no real body can have has been replaced by NaN, because no error can
-    be raised for a single body.
+    Such a body occurs in a batch: there an inertia that no real body can have has been replaced by
+    NaN, because no error can be raised for a single body.
 
     - `result`: how the run ended, a `diffrax.RESULTS`.
     - `body`: the body of the run, or `None`.
@@ -285,7 +294,9 @@ def result_of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
 
 
 def map_over_bodies(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Map a function of the arrays of one body over all bodies, which are the last axis of a run.
+    """Map a function of the arrays of one body over all bodies of a run.
+
+    The bodies are in the last axis of all arrays.
 
     - `run`: tells whether there is an axis of bodies. Without it `function` is returned unchanged.
     - `function`: takes and returns arrays of one body.
@@ -322,7 +333,7 @@ def is_running(method: Method, run: Run, loop: LoopState, until: Array | None) -
     return well & (loop.t < last) & (loop.steps < method.max_steps)
 
 
-def end_of_run(method: Method, constants: Arrays, run: Run) -> LoopState:
+def loop_state_at_end(method: Method, constants: Arrays, run: Run) -> LoopState:
     """Return the loop state at the end of a run, without saving any state before the end.
 
     - `method`: the explicit method, the field and the limits.
@@ -336,7 +347,7 @@ def end_of_run(method: Method, constants: Arrays, run: Run) -> LoopState:
     )
 
 
-def states_of_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState]:
+def run_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState]:
     """Run one body, and return its states at the saved times and the loop state at the end.
 
     - `method`: the explicit method, the field and the limits.
@@ -367,13 +378,13 @@ def states_of_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Arr
         return after, ys, k
 
     # A saved time equal to the start of the run gets its state when the first step is accepted.
-    state = (initial_loop_state(run), _states_before_the_run(run), jnp.zeros((), jnp.int32))
+    state = (initial_loop_state(run), _array_for_saved_states(run), jnp.zeros((), jnp.int32))
     more = lambda state: is_running(method, run, state[0], None)  # noqa: E731
     loop, ys, _ = lax.while_loop(more, one, state)
     return ys, loop
 
 
-def _states_before_the_run(run: Run) -> Array:
+def _array_for_saved_states(run: Run) -> Array:
     """Return the array (K, n, *bodies) into which the states at the K saved times will be written.
 
     Here n is the number of numbers of a state, and `*bodies` is one last axis for the bodies of a
@@ -383,7 +394,7 @@ def _states_before_the_run(run: Run) -> Array:
     - `run`: holds the start, the end, and the saved times `run.between`.
     """
     ended = run.stops[-1] <= run.t0
-    still = jnp.where(lift(ended, run.y0), run.y0, jnp.nan)
+    still = jnp.where(add_leading_axes(ended, run.y0), run.y0, jnp.nan)
     return jnp.broadcast_to(still[None], (run.between.shape[0], *run.y0.shape))
 
 
@@ -401,13 +412,13 @@ def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, Loop
     """
     loop, most = initial_loop_state(run), method.max_steps + run.stops.shape[0]
     count = -(-most // SEGMENT) + 1
-    starts = [jnp.zeros((count, *a.shape), a.dtype) for a in pack(loop)]
-    ys = _states_before_the_run(run)
+    starts = [jnp.zeros((count, *a.shape), a.dtype) for a in pack_loop_state(loop)]
+    ys = _array_for_saved_states(run)
     rows = jnp.zeros((SEGMENT + _MORE + _MOST, HEAD + run.y0.shape[0], *run.t0.shape), ys.dtype)
     zero = jnp.zeros((), jnp.int32)
 
     def put(into: Arrays, i: Array, loop: LoopState) -> Arrays:
-        both = zip(into, pack(loop), strict=True)
+        both = zip(into, pack_loop_state(loop), strict=True)
         return [lax.dynamic_update_index_in_dim(a, b, i, 0) for a, b in both]
 
     def one(state: Any) -> Any:
@@ -415,7 +426,7 @@ def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, Loop
         after, rows, count = record_segment(method, constants, run, loop, rows, None)
         if run.between.shape[0]:
             part = segment_of_rows(rows, after.t, count)
-            ys = states_at_saved_times(method, constants, run, part, ys)
+            ys = fill_saved_states_of_segment(method, constants, run, part, ys)
         return after, ys, put(starts, number + 1, after), rows, number + 1, count
 
     state = (loop, ys, put(starts, zero, loop), rows, zero, zero)
@@ -427,7 +438,7 @@ def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, Loop
 
 def _attempt_step(
     method: Method, constants: Arrays, run: Run, loop: LoopState, until: Array | None,
-    dense: Any = False,
+    dense: bool | Array = False,
 ) -> tuple[LoopState, Array, tuple[Step, Array]]:  # fmt: skip
     """Compute one attempted step of every body; return the loop state after it and the step itself.
 
@@ -451,7 +462,10 @@ def _attempt_step(
     # have none.
     on = is_running(method, run, loop, until) if run.t0.ndim else True
     stop, end = lax.stop_gradient(
-        (row_of_each_body(run.stops, loop.stop), row_of_each_body(run.before, loop.stop))
+        (
+            row_of_each_body(run.stops, loop.stop),
+            row_of_each_body(run.last_times_before_jumps, loop.stop),
+        )
     )
     # A body needs no step to a stop that it has already reached, such as the second of two stops at
     # the same time.
@@ -469,7 +483,7 @@ def _attempt_step(
     if until is not None:
         head = [a.astype(loop.y.dtype) for a in (loop.t, h, kind, loop.stop)]
         begin, length, late = _choose_for_each_body(
-            moving, step_times(run, jnp.stack(head)), step[:3]
+            moving, start_length_and_end_of_steps(run, jnp.stack(head)), step[:3]
         )
         step = Step(begin, length, late, loop.y)
     there = stages(method.tableau, method.field, constants, step, dense)
@@ -504,7 +518,7 @@ def _attempt_step(
     return after, row, (step, there.slopes)
 
 
-def _choose_for_each_body(condition: Any, new: Any, old: Any) -> Any:
+def _choose_for_each_body(condition: bool | Array, new: PyTree, old: PyTree) -> PyTree:
     """Return the arrays of `new` for the bodies for which `condition` is true, else those of `old`.
 
     - `condition`: one truth value for each body, or the constant `True`, for which `new` is
@@ -514,12 +528,12 @@ def _choose_for_each_body(condition: Any, new: Any, old: Any) -> Any:
     """
     if condition is True:
         return jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), new, old)
-    choose = lambda a, b: jnp.where(lift(condition, a), a, b).astype(b.dtype)  # noqa: E731
+    choose = lambda a, b: jnp.where(add_leading_axes(condition, a), a, b).astype(b.dtype)  # noqa: E731
     return jax.tree.map(choose, new, old)
 
 
 def record_segment(
-    method: Method, constants: Arrays, run: Run, loop: LoopState, rows: Rows, until: Any
+    method: Method, constants: Arrays, run: Run, loop: LoopState, rows: Rows, until: Array | None
 ) -> tuple[LoopState, Rows, Array]:
     """Take the steps of one segment (a part of a run), and return them as rows.
 
@@ -568,15 +582,15 @@ def segment_of_rows(rows: Rows, end: Array, count: Array) -> Segment:
     return Segment(rows, times, lax.stop_gradient(end), count)
 
 
-def states_at_saved_times(
-    method: Method, constants: Arrays, run: Run, part: Segment, ys: Array
+def fill_saved_states_of_segment(
+    method: Method, constants: Arrays, run: Run, segment: Segment, ys: Array
 ) -> Array:
     """Return the array of saved states, with the states filled in whose times lie in one segment.
 
     - `method`: the explicit method and the field.
     - `constants`: the arrays on which the field depends.
     - `run`: holds the K saved times `run.between`, in increasing order.
-    - `part`: the segment, a part of the run, with its recorded steps.
+    - `segment`: the segment, a part of the run, with its recorded steps.
     - `ys`: (K, n, *bodies) the saved states so far; `*bodies` is one last axis for the bodies of a
       batch, or no axis for one body.
     """
@@ -588,12 +602,12 @@ def states_at_saved_times(
     search = map_over_bodies(
         run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1
     )
-    index = search(part.times, ts)
-    inside = (index >= 0) | (part.times[0] <= lax.stop_gradient(run.t0))[None]
-    index, inside = jnp.maximum(index, 0), inside & (ts <= part.end[None])
+    index = search(segment.times, ts)
+    inside = (index >= 0) | (segment.times[0] <= lax.stop_gradient(run.t0))[None]
+    index, inside = jnp.maximum(index, 0), inside & (ts <= segment.end[None])
     # For a saved time outside of the segment a step of length 0 at the segment's first state is
     # evaluated, because the field has a finite value there; the result is not used.
-    still = part.rows[0].at[1:3].set(0)
+    still = segment.rows[0].at[1:3].set(0)
     pick = jax.vmap(lambda rows, i: rows[i], (-1 if many else None, -1), -1)
     if not many:
         # The times of one body are in the last axis, where many bodies would be.
@@ -613,8 +627,8 @@ def states_at_saved_times(
             return a[..., 0] if many else a
 
         there, old = cut(inside), cut(ys)
-        row = jnp.where(there[None], pick(part.rows, cut(index)), still)
-        step = Step(*step_times(run, row), row[HEAD:])
+        row = jnp.where(there[None], pick(segment.rows, cut(index)), still)
+        step = Step(*start_length_and_end_of_steps(run, row), row[HEAD:])
         slopes = stages(method.tableau, method.field, constants, step, True).slopes
         new = state_in_step(method, jnp.where(there, cut(run.between), step.t), step, slopes)
         new = jnp.where(there[None], new, old)
@@ -644,4 +658,4 @@ def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
     rows = weights(method.tableau, slopes.dtype).dense
     shares = nested(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
     rise = jnp.sum(shares[None] * slopes, 1)
-    return method.project(step.y + lift(step.h.astype(rise.dtype), rise) * rise)
+    return method.project(step.y + add_leading_axes(step.h.astype(rise.dtype), rise) * rise)

@@ -23,17 +23,17 @@ from rigidjax.solve.adaptive_loop import (
     Record,
     Run,
     Segment,
+    fill_saved_states_of_segment,
     initial_loop_state,
     is_running,
     map_over_bodies,
     record_segment,
     segment_of_rows,
+    start_length_and_end_of_steps,
     state_in_step,
-    states_at_saved_times,
-    step_times,
-    unpack,
+    unpack_loop_state,
 )  # fmt: skip
-from rigidjax.solve.batching import Arrays, lift
+from rigidjax.solve.batching import Arrays, add_leading_axes
 from rigidjax.solve.runge_kutta import Step, stages
 
 
@@ -50,21 +50,21 @@ class Smooth(NamedTuple):
     y0: Array  # (n,) the state at t0
 
 
-def smooth_numbers(run: Run) -> Smooth:
+def arrays_with_derivatives(run: Run) -> Smooth:
     """Return the arrays of a run that have derivatives: its times, and the state at the start."""
     return Smooth(run.t0, run.stops, run.between, run.y0)
 
 
-def saved_times_before_rows(run: Run, part: Segment) -> Array:
+def count_saved_times_before_steps(run: Run, segment: Segment) -> Array:
     """Return the number of saved times before the start of each recorded step of a segment.
 
     - `run`: holds the K saved times `run.between`.
-    - `part`: a segment (a part of a run), with one row for each of its N recorded steps.
+    - `segment`: a segment (a part of a run), with one row for each of its N recorded steps.
 
     **Returns** an array (N + 1, *bodies), where `*bodies` is one last axis for the bodies of a
     batch, or no axis. Its last number is the number of saved times before the end of the segment.
     """
-    ends = jnp.concatenate([jnp.minimum(part.times, part.end[None]), part.end[None]])
+    ends = jnp.concatenate([jnp.minimum(segment.times, segment.end[None]), segment.end[None]])
     search = lambda ts, t: jnp.searchsorted(ts, t, side="right").astype(jnp.int32)  # noqa: E731
     count = map_over_bodies(run, search)(lax.stop_gradient(run.between), ends)
     # A saved time equal to the start of the run belongs to the first step, and is not counted as
@@ -73,8 +73,8 @@ def saved_times_before_rows(run: Run, part: Segment) -> Array:
 
 
 def transpose_saved_states(
-    method: Method, run: Run, step: Step, slopes: Array, first: Array, last: Array, bars: Array,
-    between: Array | None,
+    method: Method, run: Run, step: Step, slopes: Array, first: Array, last: Array,
+    state_cotangents: Array, time_cotangents: Array | None,
 ) -> tuple[Array | None, Step, Array]:  # fmt: skip
     """Return the cotangents of a step from the cotangents of the states that are saved within it.
 
@@ -86,12 +86,13 @@ def transpose_saved_states(
     - `step`, `slopes`: the step, and the slopes (values of the field) at all its stages, (n, s,
       *bodies).
     - `first`, `last`: the indices of the saved times in this step go from `first` to `last` − 1.
-    - `bars`: (K, n, *bodies), the cotangents of all saved states.
-    - `between`: (K, *bodies), the cotangents of the saved times, as far as they are summed up, or
-      `None` if these cotangents are not wanted.
+    - `state_cotangents`: (K, n, *bodies), the cotangents of all saved states.
+    - `time_cotangents`: (K, *bodies), the cotangents of the saved times, as far as they are summed
+      up, or `None` if these cotangents are not wanted.
 
-    **Returns** three things: the array `between`, to which the cotangents of the saved times in
-    this step are added (or `None`); the cotangents of the step; and the cotangents of the slopes.
+    **Returns** three things: the array `time_cotangents`, to which the cotangents of the saved
+    times in this step are added (or `None`); the cotangents of the step; and the cotangents of the
+    slopes.
     """
     state_at, most = partial(state_in_step, method), run.between.shape[0] - 1
     pick = map_over_bodies(run, lambda a, index: a[index])
@@ -103,13 +104,13 @@ def transpose_saved_states(
         number, total, by = state
         inside, there = number < last, jnp.minimum(number, most)
         t = jnp.where(inside, pick(run.between, there), step.t)
-        bar = jnp.where(inside[None], pick(bars, there), 0)
+        bar = jnp.where(inside[None], pick(state_cotangents, there), 0)
         by_t, *more = jax.vjp(state_at, t, step, slopes)[1](bar)
         if total is not None:
             total = map_over_bodies(run, lambda a, i, b: a.at[i].add(b))(total, there, by_t)
         return number + 1, total, jax.tree.map(jnp.add, by, more)
 
-    start = (first, between, jax.tree.map(jnp.zeros_like, [step, slopes]))
+    start = (first, time_cotangents, jax.tree.map(jnp.zeros_like, [step, slopes]))
     _, total, by = lax.while_loop(lambda state: jnp.any(state[0] < last), one, start)
     return total, *by
 
@@ -141,13 +142,20 @@ def replay_steps(
         def step(k: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
             y, rows = both
             row = part.rows[k]
-            there = stages(method.tableau, method.field, constants, Step(*step_times(run, row), y))
+            there = stages(
+                method.tableau,
+                method.field,
+                constants,
+                Step(*start_length_and_end_of_steps(run, row), y),
+            )
             rows = lax.dynamic_update_index_in_dim(rows, row.at[HEAD:].set(y), k, 0)
-            return jnp.where(lift(row[2] >= STEP, y), method.project(there.end), y), rows
+            return jnp.where(
+                add_leading_axes(row[2] >= STEP, y), method.project(there.end), y
+            ), rows
 
         y, rows = lax.fori_loop(0, part.number, step, (y, part.rows))
         if run.between.shape[0]:
-            ys = states_at_saved_times(method, constants, run, part._replace(rows=rows), ys)
+            ys = fill_saved_states_of_segment(method, constants, run, part._replace(rows=rows), ys)
         return y, ys, starts, rows
 
     still, held = lax.stop_gradient(((constants, run), record))
@@ -158,8 +166,13 @@ def replay_steps(
     return ys, y, lax.dynamic_update_index_in_dim(starts, y, number, 0), rows
 
 
-def cotangents(
-    method: Method, constants: Arrays, run: Run, record: Record, bars: Arrays, timed: bool
+def cotangents_of_run(
+    method: Method,
+    constants: Arrays,
+    run: Run,
+    record: Record,
+    state_cotangents: Arrays,
+    wants_time_cotangents: bool,
 ) -> tuple[Arrays, Smooth]:
     """Return the cotangents of the constants and of the run: the transpose of `replay_steps`.
 
@@ -168,9 +181,10 @@ def cotangents(
     - `run`: the start of the run, the stops (times at which the field jumps), and the saved times
       `run.between`.
     - `record`: the recorded steps, in segments, which are parts of the run.
-    - `bars`: a list of two arrays: the cotangents of the states at the saved times, and the
-      cotangent of the state at the end of the run.
-    - `timed`: whether the cotangents of the times of the run are computed; else they are 0.
+    - `state_cotangents`: a list of two arrays: the cotangents of the states at the saved times, and
+      the cotangent of the state at the end of the run.
+    - `wants_time_cotangents`: whether the cotangents of the times of the run are computed; else
+      they are 0.
 
     **Returns** two things: the list of the cotangents of `constants`; and the cotangents of the
     arrays of `run` that have derivatives, in a `Smooth`.
@@ -179,14 +193,17 @@ def cotangents(
 
     def one(i: Array, sums: tuple[Arrays, Smooth]) -> tuple[Arrays, Smooth]:
         part = _segment_of_record(method, constants, run, record, number - 1 - i)
-        known = saved_times_before_rows(run, part) if size else None
+        known = count_saved_times_before_steps(run, part) if size else None
 
         def step(k: Array, sums: tuple[Arrays, Smooth]) -> tuple[Arrays, Smooth]:
             total, of_run = sums
             k = part.number - 1 - k
             row = part.rows[k]
-            by = lambda t0, stops: step_times(run._replace(t0=t0, stops=stops), row)  # noqa: E731
-            (t, h, end), of_times = jax.vjp(by, run.t0, run.stops)
+
+            def step_of_times(t0: Array, stops: Array) -> tuple[Array, Array, Array]:
+                return start_length_and_end_of_steps(run._replace(t0=t0, stops=stops), row)
+
+            (t, h, end), of_times = jax.vjp(step_of_times, run.t0, run.stops)
             here = Step(t, h, end, row[HEAD:])
             dense, seeds, of_slopes, between = False, None, None, of_run.between
             if known is not None:
@@ -195,8 +212,8 @@ def cotangents(
             bar = jax.vjp(method.project, there.end)[1](of_run.y0)[0]
             if known is not None:
                 between, seeds, of_slopes = transpose_saved_states(
-                    method, run, here, there.slopes, known[k], known[k + 1], bars[0],
-                    between if timed else None,
+                    method, run, here, there.slopes, known[k], known[k + 1], state_cotangents[0],
+                    between if wants_time_cotangents else None,
                 )  # fmt: skip
             by_constants, *rest = runge_kutta.pull_back(
                 method.tableau, method.field, constants, here, there, bar, of_slopes
@@ -209,14 +226,16 @@ def cotangents(
             by_t0, by_stops = of_times((by_t, by_h, jnp.zeros_like(end)))
             total = [a + _zero_unless(on, b) for a, b in zip(total, by_constants, strict=True)]
             of_run = of_run._replace(y0=by_y + _zero_unless(~on, of_run.y0))
-            if between is None or not timed:
+            if between is None or not wants_time_cotangents:
                 return total, of_run
             t0, stops = of_run.t0 + by_t0, of_run.stops + by_stops
             return total, of_run._replace(t0=t0, stops=stops, between=between)
 
         return lax.fori_loop(0, part.number, step, sums)
 
-    none = jax.tree.map(jnp.zeros_like, smooth_numbers(run))._replace(y0=bars[1])
+    none = jax.tree.map(jnp.zeros_like, arrays_with_derivatives(run))._replace(
+        y0=state_cotangents[1]
+    )
     return lax.fori_loop(0, number, one, ([jnp.zeros_like(c) for c in constants], none))
 
 
@@ -226,7 +245,7 @@ def _zero_unless(condition: Array, a: Array) -> Array:
     `*bodies` is one last axis for the bodies of a batch, or no axis for one body. `condition`
     (*bodies) has one truth value for each body.
     """
-    return jnp.where(lift(condition, a), a, jnp.zeros_like(a))
+    return jnp.where(add_leading_axes(condition, a), a, jnp.zeros_like(a))
 
 
 def _segment_of_record(
@@ -247,7 +266,9 @@ def _segment_of_record(
     - `number`: the index of the segment.
     """
     like = initial_loop_state(run)
-    loop, after = (unpack([a[i] for a in record.starts], like) for i in (number, number + 1))
+    loop, after = (
+        unpack_loop_state([a[i] for a in record.starts], like) for i in (number, number + 1)
+    )
     # The record has the step count and the result of the forward run, either of which could end the
     # segment. The segment therefore starts with a step count of 0 and a successful result.
     loop = loop._replace(steps=like.steps, result=like.result)

@@ -31,7 +31,7 @@ class Layout(NamedTuple):
     bodies: bool  # whether the arrays of each body have this axis; without it there is one body
     shared: tuple[bool, ...]  # for each constant, whether all bodies share it: it has no such axis
 
-    def over(self, function: Callable[..., Any]) -> Callable[..., Any]:
+    def vmap_over_bodies(self, function: Callable[..., PyTree]) -> Callable[..., PyTree]:
         """Map `function(constants, t, y)`, which takes the arrays of one body, over all bodies.
 
         The result takes and returns arrays whose last axis is that of the bodies; constants that
@@ -42,7 +42,7 @@ class Layout(NamedTuple):
         return jax.vmap(function, (axes, -1, -1), -1) if self.bodies else function
 
     def broadcast_to_bodies(
-        self, constants: Arrays, per_body: list[bool], like: Any
+        self, constants: Arrays, per_body: list[bool], like: Array
     ) -> tuple["Layout", Arrays]:
         """Broadcast some of the constants that all bodies share along a new last axis of bodies.
 
@@ -71,8 +71,12 @@ class Layout(NamedTuple):
 Program = Callable[[Layout, Arrays, Arrays], Arrays]
 
 
-def in_lanes(
-    program: Program, constants: Arrays, each: Arrays, linear: int = 0, layout: Layout | None = None
+def run_with_bodies_last(
+    program: Program,
+    constants: Arrays,
+    each: Arrays,
+    num_linear: int = 0,
+    layout: Layout | None = None,
 ) -> Arrays:
     """Run a program with the bodies of any `jax.vmap` in the last axis of all arrays.
 
@@ -82,9 +86,9 @@ def in_lanes(
       `Program`.
     - `constants`: arrays, each of which all bodies may share.
     - `each`: arrays in which each body has values of its own.
-    - `linear`: the number of arrays at the end of `each` in which the program is linear, such as
-      tangents. A `jax.vmap` over these arrays alone gives several tangents of one motion; its axis
-      is not treated as an axis of bodies.
+    - `num_linear`: the number of arrays at the end of `each` in which the program is linear, such
+      as tangents. A `jax.vmap` over these arrays alone gives several tangents of one motion; its
+      axis is not treated as an axis of bodies.
     - `layout`: says which of the given arrays have a last axis of bodies already; `None` stands for
       one body.
 
@@ -92,13 +96,15 @@ def in_lanes(
     """
     was = Layout(False, (True,) * len(constants)) if layout is None else layout
     number = len(constants)
-    call: Any = jax.custom_batching.custom_vmap(partial(_in_blocks, program, was, number))
+    call: Any = jax.custom_batching.custom_vmap(
+        partial(_run_in_blocks_of_bodies, program, was, number)
+    )
 
     @call.def_vmap
     def _(size: int, batched: Any, *args: Any) -> Any:
         constants, each = list(args[:number]), list(args[number:])
         own, rest = batched[:number], batched[number:]
-        many = len(each) - linear
+        many = len(each) - num_linear
         if not any(batched):
             # JAX calls this rule without a batched array where only tangents are batched.
             out = program(was, constants, each)
@@ -110,7 +116,7 @@ def in_lanes(
                 one = lambda *along: program(layout, constants, [*each[:many], *along])  # noqa: E731
                 return jax.vmap(one, axes, axis_size=size)(*each[many:])
 
-            out = in_lanes(over, constants, each, linear, was)
+            out = run_with_bodies_last(over, constants, each, num_linear, was)
             return out, [True] * len(out)
         new = Layout(True, tuple(s and not b for s, b in zip(was.shared, own, strict=True)))
         count = each[0].shape[-1] if was.bodies else 1
@@ -126,7 +132,7 @@ def in_lanes(
             for c, shared, b, before in zip(constants, new.shared, own, was.shared, strict=True)
         ]
         each = [last(a, b, True) for a, b in zip(each, rest, strict=True)]
-        out = in_lanes(program, constants, each, linear, new)
+        out = run_with_bodies_last(program, constants, each, num_linear, new)
 
         def first(a: Any) -> Any:
             a = a.reshape(*a.shape[:-1], count, size) if was.bodies else a
@@ -137,56 +143,67 @@ def in_lanes(
     answer: Any = jax.custom_jvp(lambda *args: call(*args))
     # The derivative rule of `custom_vmap` gives wrong shapes for a batch of tangents, so that
     # `_program_and_tangent` is used instead.
-    answer.defjvp(partial(_program_and_tangent, program, was, number, linear), symbolic_zeros=True)
+    answer.defjvp(
+        partial(_program_and_tangent, program, was, number, num_linear), symbolic_zeros=True
+    )
     return answer(*constants, *each)
 
 
 def _program_and_tangent(
     program: Program,
     layout: Layout,
-    number: int,
-    linear: int,
+    num_constants: int,
+    num_linear: int,
     primals: tuple[PyTree, ...],
     tangents: tuple[PyTree, ...],
 ) -> tuple[Arrays, Arrays]:
-    """Return the result of a program and its tangent, computed together in one call of `in_lanes`.
+    """Return the result of a program and its tangent, which are computed together.
 
-    `in_lanes` runs a program with the bodies of any `jax.vmap` in the last axis of all arrays; this
-    is the rule for its derivatives in forward mode.
+    This is the rule for derivatives of `run_with_bodies_last` in forward mode.
+    `run_with_bodies_last` runs a program with the bodies of any `jax.vmap` in the last axis of all
+    arrays; here one call of it runs the program and its tangent.
 
     - `program`: a function `program(layout, constants, each)` that returns a list of arrays.
     - `layout`: says which arrays have a last axis of bodies.
-    - `number`: the number of constants, which are the first of `primals`. The other primals are the
-      arrays `each`, in which each body has values of its own.
-    - `linear`: the number of arrays at the end of `each` in which the program is linear.
+    - `num_constants`: the number of constants, which are the first of `primals`. The other primals
+      are the arrays `each`, in which each body has values of its own.
+    - `num_linear`: the number of arrays at the end of `each` in which the program is linear.
     - `primals`, `tangents`: the arrays that the program takes, and their tangents.
     """
-    constants, each = list(primals[:number]), list(primals[number:])
+    constants, each = list(primals[:num_constants]), list(primals[num_constants:])
     moving = [not isinstance(t, SymbolicZero) for t in tangents]
     # The tangents are passed with the arrays `each`, in which every body has values of its own. The
     # tangents of shared constants therefore need a last axis of bodies; `with_tangents` adds the
     # same axis to these constants.
-    _, along = layout.broadcast_to_bodies(list(tangents[:number]), moving[:number], each[0])
-    along = [t for t, m in zip([*along, *tangents[number:]], moving, strict=True) if m]
+    _, along = layout.broadcast_to_bodies(
+        list(tangents[:num_constants]), moving[:num_constants], each[0]
+    )
+    along = [t for t, m in zip([*along, *tangents[num_constants:]], moving, strict=True) if m]
 
     def with_tangents(layout: Layout, constants: Arrays, rest: Arrays) -> Arrays:
-        layout, constants = layout.broadcast_to_bodies(constants, moving[:number], rest[0])
+        layout, constants = layout.broadcast_to_bodies(constants, moving[:num_constants], rest[0])
         args, given = [*constants, *rest[: len(each)]], iter(rest[len(each) :])
         both = zip(args, moving, strict=True)
         moved = [next(given) if m else zero_from_primal(a) for a, m in both]
-        one = lambda *args: program(layout, list(args[:number]), list(args[number:]))  # noqa: E731
+        one = lambda *args: program(layout, list(args[:num_constants]), list(args[num_constants:]))  # noqa: E731
         pairs = zip(*jax.jvp(one, args, moved), strict=True)
         return [a for o, m in pairs for a in ([o, m] if eqx.is_inexact_array(o) else [o])]
 
     out, moved = [], []
-    found = iter(in_lanes(with_tangents, constants, [*each, *along], linear + len(along), layout))
+    found = iter(
+        run_with_bodies_last(
+            with_tangents, constants, [*each, *along], num_linear + len(along), layout
+        )
+    )
     for a in found:
         out.append(a)
         moved.append(next(found) if eqx.is_inexact_array(a) else zero_from_primal(a))
     return out, moved
 
 
-def _in_blocks(program: Program, layout: Layout, number: int, *args: Any) -> Arrays:
+def _run_in_blocks_of_bodies(
+    program: Program, layout: Layout, num_constants: int, *args: Any
+) -> Arrays:
     """Return the result of a program, computed on CPU for at most `BLOCK` (16) bodies at a time.
 
     The arrays of so few bodies stay in the first-level cache of the processor. On other backends
@@ -194,21 +211,21 @@ def _in_blocks(program: Program, layout: Layout, number: int, *args: Any) -> Arr
 
     - `program`: a function `program(layout, constants, each)` that returns a list of arrays.
     - `layout`: says which arrays have a last axis of bodies.
-    - `number`: the number of constants, which are the first of `args`.
+    - `num_constants`: the number of constants, which are the first of `args`.
     - `args`: the constants, then the arrays in which each body has values of its own.
     """
-    constants, each = list(args[:number]), list(args[number:])
+    constants, each = list(args[:num_constants]), list(args[num_constants:])
     count = each[0].shape[-1] if layout.bodies else 1
     if platform() != "cpu" or count <= BLOCK:
         return program(layout, constants, each)
-    number = -(-count // BLOCK)
-    size = -(-count // number)
+    num_blocks = -(-count // BLOCK)
+    size = -(-count // num_blocks)
 
     def cut(a: Any) -> Any:
-        room = number * size - count
+        room = num_blocks * size - count
         if room:
             a = jnp.concatenate([a, jnp.repeat(a[..., -1:], room, -1)], -1)
-        return jnp.moveaxis(a.reshape(*a.shape[:-1], number, size), -2, 0)
+        return jnp.moveaxis(a.reshape(*a.shape[:-1], num_blocks, size), -2, 0)
 
     own = [None if s else cut(c) for c, s in zip(constants, layout.shared, strict=True)]
 
@@ -219,15 +236,15 @@ def _in_blocks(program: Program, layout: Layout, number: int, *args: Any) -> Arr
 
     def joined(a: Any) -> Any:
         a = jnp.moveaxis(a, 0, -2)
-        return a.reshape(*a.shape[:-2], number * size)[..., :count]
+        return a.reshape(*a.shape[:-2], num_blocks * size)[..., :count]
 
     return [joined(a) for a in lax.map(block, (own, [cut(a) for a in each]))]
 
 
-def lift(a: Array, like: Array) -> Array:
-    """Return `a` with leading axes of length 1 added, so that it broadcasts against `like`.
+def add_leading_axes(array: Array, like: Array) -> Array:
+    """Return `array` with leading axes of length 1 added, so that it broadcasts against `like`.
 
-    The last axes of `like` are the axes of `a`: an array with one number for each body is lifted to
-    multiply states (n, *bodies), for example. The result has as many axes as `like`.
+    The last axes of `like` are the axes of `array`: an array with one number for each body is
+    lifted to multiply states (n, *bodies), for example. The result has as many axes as `like`.
     """
-    return a.reshape((1,) * (like.ndim - a.ndim) + a.shape)
+    return array.reshape((1,) * (like.ndim - array.ndim) + array.shape)

@@ -6,12 +6,11 @@ such a loop carries a tuple of (N,) arrays and uses vector instructions. A loop 
 """
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 Atoms = tuple[Array, ...]
 # An array of more numbers than this is not split: to treat each number by itself would cost more
@@ -19,8 +18,8 @@ Atoms = tuple[Array, ...]
 FEW = 32
 
 
-def split(tree: Any) -> Atoms:
-    """Return the numbers of a tree of arrays as a tuple of scalars, the inverse of `join`.
+def split_into_scalars(tree: PyTree) -> Atoms:
+    """Return the numbers of a tree of arrays as a tuple of scalars, the inverse of `join_scalars`.
 
     An array of more than `FEW` numbers is not split: it is one item of the tuple.
     """
@@ -34,13 +33,13 @@ def split(tree: Any) -> Atoms:
     return tuple(parts)
 
 
-def join(parts: Atoms, like: Any) -> Any:
-    """Return the tree of arrays whose numbers `split` returned as the tuple `parts`.
+def join_scalars(scalars: Atoms, like: PyTree) -> PyTree:
+    """Return the tree of arrays whose numbers are in a tuple: the inverse of `split_into_scalars`.
 
-    `like` is a tree with the structure and the shapes of the result.
+    `scalars` is that tuple, and `like` is a tree with the structure and the shapes of the result.
     """
     leaves, structure = jax.tree.flatten(like)
-    queue = iter(parts)
+    queue = iter(scalars)
     out = []
     for leaf in leaves:
         shape = jnp.shape(leaf)

@@ -19,12 +19,12 @@ from jaxtyping import Array
 
 from rigidjax.solve.adaptive_loop import (
     NONFINITE,
-    next_step,
-    previous_number,
+    acceptance_and_next_step_size,
+    previous_float,
     row_of_each_body,
     starting_step,
 )
-from rigidjax.solve.batching import Arrays, lift
+from rigidjax.solve.batching import Arrays, add_leading_axes
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
 from rigidjax.solve.tableaus import Tableau
 
@@ -59,13 +59,13 @@ class Path(NamedTuple):
     h0: Array  # the length of the first step, NaN if it is to be chosen
 
     @property
-    def before(self) -> Array:
+    def last_times_before_jumps(self) -> Array:
         """Return the last floating-point time before each jump, and the end of the run, (J,).
 
         The last stage of a step that ends at a jump is evaluated at this earlier time, so that it
         sees the field as it is before the jump.
         """
-        return jnp.concatenate([previous_number(self.stops[:-1]), self.stops[-1:]])
+        return jnp.concatenate([previous_float(self.stops[:-1]), self.stops[-1:]])
 
 
 class Motion(NamedTuple):
@@ -170,7 +170,7 @@ def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
     end = _IntervalEnd(x, none, none)
     g = jnp.where(there, none, g)
     body = _SearchState(t0, y0, h, side, g, rate, zero, no, x, end, end, zero, zero, no, no)
-    on = lambda body: jnp.any(_is_running(search, run, body))  # noqa: E731
+    on = lambda body: jnp.any(_is_searching(search, run, body))  # noqa: E731
 
     def next_zero(body: _SearchState) -> _SearchState:
         body = lax.while_loop(on, partial(_next_search_state, motion, search, run), body)
@@ -180,7 +180,7 @@ def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
         body, times, states, jumps, k, count = state
         body = lax.while_loop(on, next_zero, body._replace(found=no))
         t = jnp.where(body.found, body.t, jnp.nan)
-        y = jnp.where(lift(body.found, body.y), body.y, jnp.nan)
+        y = jnp.where(add_leading_axes(body.found, body.y), body.y, jnp.nan)
         times = lax.dynamic_update_index_in_dim(times, t, k, 0)
         states = lax.dynamic_update_index_in_dim(states, y, k, 0)
         jumps = lax.dynamic_update_index_in_dim(jumps, body.found & body.jumped, k, 0)
@@ -197,7 +197,7 @@ def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
     return Located(times, states, jumps, count, body.t, body.h, body.steps)
 
 
-def _is_running(search: Search, run: Path, body: _SearchState) -> Array:
+def _is_searching(search: Search, run: Path, body: _SearchState) -> Array:
     """Return for each body whether its search for a zero of a condition g goes on.
 
     The search of a body ends in any of four cases: a zero was found; the end of the run is reached;
@@ -226,9 +226,12 @@ def _next_search_state(
     - `run`: holds the stops, which are the times at which steps end.
     - `body`: the state of the search before this pass; its arrays may have a last axis of bodies.
     """
-    on = _is_running(search, run, body)
+    on = _is_searching(search, run, body)
     t, h, y, side = body.t, body.h, body.y, body.side
-    begin, end = row_of_each_body(run.stops, body.stop), row_of_each_body(run.before, body.stop)
+    begin, end = (
+        row_of_each_body(run.stops, body.stop),
+        row_of_each_body(run.last_times_before_jumps, body.stop),
+    )
     arrived = on & ~body.refining & (t >= begin)
     left = end - t
     last = ~body.refining & (h >= left)
@@ -252,7 +255,9 @@ def _next_search_state(
     # the step is searched for (`crossed`).
     step = on & ~arrived & ~body.refining
     whole = run.stops[-1] - run.t0
-    good, following = accept_and_next_step(norm, motion.order, t, length, h, last, whole)
+    good, following = acceptance_and_next_step_of_search(
+        norm, motion.order, t, length, h, last, whole
+    )
     following = jnp.minimum(following, motion.longest)
     good = step & good
     hidden, turn = _may_hide_zeros(side, start, here, blur)
@@ -277,11 +282,13 @@ def _next_search_state(
 
     new = accept | done
     reached = accept & last
-    shifted = motion.project(after + slope * lift(move.astype(y.dtype), y))
+    shifted = motion.project(after + slope * add_leading_axes(move.astype(y.dtype), y))
     flipped = done | (accept & other)
     return _SearchState(
         t=jnp.where(new, jnp.where(reached, begin, late) + move, t),
-        y=jnp.where(lift(new, y), jnp.where(lift(done, y), shifted, after), y),
+        y=jnp.where(
+            add_leading_axes(new, y), jnp.where(add_leading_axes(done, y), shifted, after), y
+        ),
         h=next_h,
         side=jnp.where(flipped, -side, jnp.where(accept & (side == 0), jnp.sign(g), side)),
         g=jnp.where(done, jnp.zeros_like(g), jnp.where(accept, g, body.g)),
@@ -339,28 +346,28 @@ def _choose_end(condition: Array, if_true: _IntervalEnd, if_false: _IntervalEnd)
 
 
 def _may_hide_zeros(
-    side: Array, low: _IntervalEnd, high: _IntervalEnd, blur: Array
+    sign_at_low: Array, low: _IntervalEnd, high: _IntervalEnd, round_off: Array
 ) -> tuple[Array, Array]:
-    """Return whether g may have two zeros in an interval that its signs at the ends do not show.
+    """Return whether g may have two more zeros in an interval than its signs at the ends show.
 
-    Two zeros more leave the signs at the ends as they are. The cubic polynomial is examined that
+    Two more zeros leave the signs at the ends as they are. The cubic polynomial is examined that
     has the values and slopes of g at both ends. There may be such zeros if this polynomial has an
     extremum within the interval at which its sign is not that of g at `low`, and at which it is
-    farther from zero than `blur`; or if the tangents at both ends meet on that side of zero. If the
-    signs at the ends differ, only the extremum counts, and only if the polynomial then comes back
-    to the sign of g at `low`.
+    farther from zero than `round_off`; or if the tangents at both ends meet on that side of zero.
+    If the signs at the ends differ, only the extremum counts, and only if the polynomial then comes
+    back to the sign of g at `low`.
 
-    - `side`: the sign of g at `low`, 1 or −1.
+    - `sign_at_low`: the sign of g at `low`, 1 or −1.
     - `low`, `high`: the ends of the interval: their times after the start of the step, s, with g
       and dg/dt there.
-    - `blur`: the size that g may have from round-off alone.
+    - `round_off`: the size that g may have from round-off alone.
 
     **Returns** two things: whether there may be such zeros; and the time of the extremum, as a
     length from `low`, s. If g has two zeros, one lies on each side of this extremum.
     """
     width = (high.x - low.x).astype(low.g.dtype)
-    a, b = side * low.rate * width, side * high.rate * width
-    first, last = side * low.g, side * high.g
+    a, b = sign_at_low * low.rate * width, sign_at_low * high.rate * width
+    first, last = sign_at_low * low.g, sign_at_low * high.g
     rise = last - first
     # The slope of the cubic is a + c x + d x², with x from 0 to 1 between the ends.
     c, d = 2 * (3 * rise - 2 * a - b), 3 * (a + b - 2 * rise)
@@ -376,20 +383,26 @@ def _may_hide_zeros(
     # The tangents at both ends meet beyond zero. A function with one extremum and these tangents
     # may reach zero, so that a zero is not excluded.
     meet = (last - b - first) / jnp.where(a == b, 1, a - b)
-    touch = (a < 0) & (b > 0) & (first + a * meet < -blur)
-    two = (last > 0) & ((value(least) < -blur) | touch)
-    three = (last <= 0) & (value(least) < -blur) & within(most) & (value(most) > 0) & (least < most)
+    touch = (a < 0) & (b > 0) & (first + a * meet < -round_off)
+    two = (last > 0) & ((value(least) < -round_off) | touch)
+    three = (
+        (last <= 0)
+        & (value(least) < -round_off)
+        & within(most)
+        & (value(most) > 0)
+        & (least < most)
+    )
     known = (root != 0) & (q != 0) & ((c >= 0) | (d != 0))
     least = jnp.where(known, least, 0)
     return within(least) & (two | three), least.astype(low.x.dtype) * (high.x - low.x)
 
 
-def _guess_zero(side: Array, low: _IntervalEnd, high: _IntervalEnd) -> Array:
+def _guess_zero(sign_at_low: Array, low: _IntervalEnd, high: _IntervalEnd) -> Array:
     """Return a first guess for the time of a zero of a condition g, counted from the step's start.
 
     The guess is in seconds. The condition g is a function of the time and the state of a body.
 
-    - `side`: the sign of g at `low`, 1 or −1; at `high` the sign is the opposite one.
+    - `sign_at_low`: the sign of g at `low`, 1 or −1; at `high` the sign is the opposite one.
     - `low`, `high`: the ends of the interval: their times x after the start of the step, s, with g
       and dg/dt there.
 
@@ -397,7 +410,7 @@ def _guess_zero(side: Array, low: _IntervalEnd, high: _IntervalEnd) -> Array:
     dx/dg at `low` and `high`. The guess is the middle of the interval if g moves away from zero at
     `low` or towards zero at `high`, or if x(0) lies outside of the interval.
     """
-    steady = (side * low.rate < 0) & (side * high.rate < 0)
+    steady = (sign_at_low * low.rate < 0) & (sign_at_low * high.rate < 0)
     rise = jnp.where(steady, high.g - low.g, 1)
     u = -low.g / rise
     width = (high.x - low.x).astype(low.g.dtype)
@@ -430,35 +443,41 @@ def step_with_error(
     left, after, h, slopes = lax.stop_gradient((step.y, right, step.h, there.slopes))
     error = error_estimate(method.tableau, method.sizes, h, slopes)
     largest = jnp.maximum(jnp.abs(left), jnp.abs(after))
-    scale = lift(run.atol, left) + lift(run.rtol, left) * largest
+    scale = add_leading_axes(run.atol, left) + add_leading_axes(run.rtol, left) * largest
     tiny = float(jnp.finfo(error.dtype).tiny)
     return right, jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
 
 
-def accept_and_next_step(
-    norm: Array, order: int, t: Array, h: Array, uncut: Array, last: Array, length: Array
+def acceptance_and_next_step_of_search(
+    error_norm: Array,
+    order: int,
+    t: Array,
+    h: Array,
+    uncut_length: Array,
+    ends_at_stop: Array,
+    run_length: Array,
 ) -> tuple[Array, Array]:
     """Return whether a step is accepted, and the length of the next step, s.
 
     The next length is 0 if a shorter step would be below the round-off of the time, and NaN if the
     step ended with NaN.
 
-    - `norm`: the error divided by the tolerance, as `step_with_error` returns it.
+    - `error_norm`: the error divided by the tolerance, as `step_with_error` returns it.
     - `order`: the order of this error.
     - `t`, `h`: the time at which the step began, and its length, s.
-    - `uncut`: the length, s, that the step would have had if it had not been cut short.
-    - `last`: whether the step was the last before a stop (a time at which a step has to end), and
-      was cut short to end there.
-    - `length`: the length of the run, s. Near t = 0, where the round-off of t vanishes, the
+    - `uncut_length`: the length, s, that the step would have had if it had not been cut short.
+    - `ends_at_stop`: whether the step was the last before a stop (a time at which a step has to
+      end), and was cut short to end there.
+    - `run_length`: the length of the run, s. Near t = 0, where the round-off of t vanishes, the
       round-off of this length is taken instead.
     """
-    good, following = next_step(norm, order, h)
-    uncut = lax.stop_gradient(uncut)
+    good, following = acceptance_and_next_step_size(error_norm, order, h)
+    uncut_length = lax.stop_gradient(uncut_length)
     eps = jnp.finfo(h.dtype).eps
-    unit = 8 * eps * jnp.maximum(jnp.abs(t), eps * length)
-    why = jnp.where(jnp.isfinite(norm), 0.0, jnp.nan).astype(h.dtype)
+    unit = 8 * eps * jnp.maximum(jnp.abs(t), eps * run_length)
+    why = jnp.where(jnp.isfinite(error_norm), 0.0, jnp.nan).astype(h.dtype)
     shorter = jnp.where(following > unit, following, why)
-    longer = jnp.where(last, jnp.maximum(following, uncut), following)
+    longer = jnp.where(ends_at_stop, jnp.maximum(following, uncut_length), following)
     return good, jnp.where(good, longer, shorter)
 
 
@@ -490,7 +509,7 @@ def first_step_length(method: SearchMethod, constants: Arrays, run: Path) -> Arr
     - `run`: holds the start, the state there, and the tolerances.
     """
     y0 = run.y0
-    scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
+    scale = add_leading_axes(run.atol, y0) + add_leading_axes(run.rtol, y0) * jnp.abs(y0)
     slope = method.field(constants, run.t0, y0)
     size, rate = (jnp.sqrt(jnp.mean((a / scale) ** 2, 0)) for a in (y0, slope))
     return starting_step(size, rate, method.tableau.order).astype(run.t0.dtype)

@@ -46,8 +46,8 @@ from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import missing_state_part_message
 from rigidjax.solve import crossing_loop, validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
-from rigidjax.solve.adaptive_loop import result_of_body
-from rigidjax.solve.batching import Arrays, Layout, in_lanes
+from rigidjax.solve.adaptive_loop import result_or_nonfinite_input
+from rigidjax.solve.batching import Arrays, Layout, run_with_bodies_last
 from rigidjax.solve.crossing_loop import (
     Located,
     Motion,
@@ -59,8 +59,8 @@ from rigidjax.solve.crossing_loop import (
     step_with_error,
 )
 from rigidjax.solve.explicit import AbstractExplicit, require_explicit
-from rigidjax.solve.linear_map import as_known, nan_derivatives
-from rigidjax.solve.momentum import ByMomentum, by_momentum
+from rigidjax.solve.linear_map import known_with_derivatives_of, nan_derivatives_where_not_finite
+from rigidjax.solve.momentum import ByMomentum, equations_by_momentum
 from rigidjax.solve.run import (
     ClosedFormRun,
     DiffraxRun,
@@ -214,7 +214,7 @@ def crossings(
         raise ValueError(f"t1: wanted another time than t0, got {float(end):g} for both")
     ts = jnp.stack([begin, end])
     body, state0, times = validation.checked_scene(body, state0, ts, torque, throw=False)
-    state0 = start_with_checked_condition(event, body, state0, torque, times[0])
+    state0 = check_condition_and_add_torque_states(event, body, state0, torque, times[0])
     if torque is None and solver is None and body is not None:
         return _crossings_of_run(ClosedFormRun(body, False), event, many, max_steps, state0, times)
     solver = require_explicit(solver)
@@ -226,13 +226,17 @@ def crossings(
     return _crossings_of_run(setup, event, many, max_steps, state0, times)
 
 
-def start_with_checked_condition(
-    event: Event, body: Any, state0: Any, torque: Any, t: Array
-) -> Any:
-    """Return the start of a run with the torque's own states, and check the condition there.
+def check_condition_and_add_torque_states(
+    event: Event,
+    body: Inertia | MassProperties | None,
+    state0: PyTree,
+    torque: Any,
+    t: Array,
+) -> PyTree:
+    """Check an event's condition at the start of a run, and return the state at the start.
 
-    If the torque has states of its own, the result is a `Coupled` of `state0` and these states; if
-    it has none, the result is `state0` itself.
+    If the torque has states of its own, such as the speed of a wheel, the result is a `Coupled` of
+    `state0` and these states; if it has none, the result is `state0` itself.
 
     - `event`: the `Event` whose condition is checked.
     - `body`, `state0`, `torque`: as for `simulate`.
@@ -243,21 +247,21 @@ def start_with_checked_condition(
     """
     state0 = with_own_states(body, state0, torque, t)
     try:
-        eqx.filter_eval_shape(value, event, body, t, state0)
+        eqx.filter_eval_shape(condition_value, event, body, t, state0)
     except AttributeError as wrong:
         told = missing_state_part_message("condition", wrong)
         if told is None:
             raise
         raise TypeError(told) from wrong
     if _checks.is_known((event, body, t, state0)) and bool(
-        jnp.isnan(_value(event, body, t, state0))
+        jnp.isnan(_compiled_condition_value(event, body, t, state0))
     ):
         words = "condition: wanted a number wherever the motion goes, got NaN at the start, t = "
         raise ValueError(f"{words}{float(t):g}")
     return state0
 
 
-def value(event: Event, body: Any, t: Any, y: Any) -> Array:
+def condition_value(event: Event, body: Any, t: Any, y: PyTree) -> Array:
     """Return the value of an event's condition, and check that it is one real number.
 
     - `event`: the `Event`, whose condition is a function `(t, state, body)`.
@@ -275,13 +279,13 @@ def value(event: Event, body: Any, t: Any, y: Any) -> Array:
     return _checks.array_of_shape(found, (), "condition", hint="one real number, zero at the event")
 
 
-_value = eqx.filter_jit(value)
+_compiled_condition_value = eqx.filter_jit(condition_value)
 
 
 @eqx.filter_jit
-def solve_until(
-    setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
-) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
+def solve_until_event(
+    setup: ClosedFormRun | DiffraxRun, event: Event, state0: PyTree, ts: Array
+) -> tuple[PyTree, dict[str, Any], dfx.RESULTS, Array, PyTree]:
     """Return the saved states of a run that ends at its first event, and the event.
 
     - `setup`: how the run is computed: in closed form or by diffrax.
@@ -295,32 +299,36 @@ def solve_until(
     and state are NaN.
     """
     state0 = project_to_group(state0)
-    crossed, numbers = section(setup, event, state0, ts)
+    crossed, numbers = condition_and_motion_of_run(setup, event, state0, ts)
     given = setup.max_steps if isinstance(setup, DiffraxRun) else None
     steps = 1_000_000 if given is None else given
     found = locate_crossings(crossed, Search(event.direction, 1, steps), numbers)
     met, last = found.number > 0, lax.stop_gradient(ts[-1])
-    end = jnp.where(met, crossed.time(found.times[0]), last)
-    before = ~(crossed.time(ts) > crossed.time(end))
+    end = jnp.where(met, crossed.signed_time(found.times[0]), last)
+    before = ~(crossed.signed_time(ts) > crossed.signed_time(end))
     short = jnp.concatenate([jnp.where(before, ts, end), jnp.where(met, end, ts[-1])[None]])
     ys, stats, result = solve(setup, state0, short)
-    y = crossed.vector(end, jax.tree.map(lambda leaf: leaf[-1], ys))
+    y = crossed.vector_of_state(end, jax.tree.map(lambda leaf: leaf[-1], ys))
     jumps = found.jumps[0]
-    s, y = correction(crossed, numbers[0], crossed.time(end), y, met & ~jumps)
+    s, y = chebyshev_step_to_crossing(
+        crossed, numbers[0], crossed.signed_time(end), y, met & ~jumps
+    )
     met = met & (result == dfx.RESULTS.successful)
 
     def rows(leaf: Array) -> Array:
         there = before.reshape(-1, *[1] * (leaf.ndim - 1))
         return jnp.where(there, leaf[:-1], jnp.full_like(leaf[:-1], jnp.nan))
 
-    time, y = (jnp.where(met, leaf, jnp.nan) for leaf in (crossed.time(s), y))
+    time, y = (jnp.where(met, leaf, jnp.nan) for leaf in (crossed.signed_time(s), y))
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
-    ys = nan_derivatives(jax.tree.map(rows, ys), inputs)
-    time, state = _set_unknown_derivatives_to_nan((time, crossed.state(time, y)), jumps, inputs)
+    ys = nan_derivatives_where_not_finite(jax.tree.map(rows, ys), inputs)
+    time, state = _set_unknown_derivatives_to_nan(
+        (time, crossed.state_of_vector(time, y)), jumps, inputs
+    )
     return ys, stats, dfx.RESULTS.where(met, dfx.RESULTS.event_occurred, result), time, state
 
 
-def _set_unknown_derivatives_to_nan(crossing: Any, jumps: Array, inputs: Any) -> Any:
+def _set_unknown_derivatives_to_nan(crossing: PyTree, jumps: Array, inputs: PyTree) -> PyTree:
     """Return the arrays of `crossing` with their values, and with NaN for unknown derivatives.
 
     - `crossing`: a tree of arrays: the times and states of crossings, which are the zeros of a
@@ -339,8 +347,8 @@ def _set_unknown_derivatives_to_nan(crossing: Any, jumps: Array, inputs: Any) ->
             jumps.reshape(*jumps.shape, *[1] * (leaf.ndim - jumps.ndim)), jnp.nan, leaf
         )
 
-    moved = nan_derivatives(jax.tree.map(lost, crossing), inputs)
-    return as_known(lax.stop_gradient(crossing), moved)
+    moved = nan_derivatives_where_not_finite(jax.tree.map(lost, crossing), inputs)
+    return known_with_derivatives_of(lax.stop_gradient(crossing), moved)
 
 
 @eqx.filter_jit
@@ -359,22 +367,27 @@ def _crossings_of_run(
     - `ts`: (2,) s, the times at which the run begins and ends.
     """
     state0 = project_to_group(state0)
-    crossed, numbers = section(setup, event, state0, ts)
+    crossed, numbers = condition_and_motion_of_run(setup, event, state0, ts)
     found = locate_crossings(crossed, Search(event.direction, max_crossings, max_steps), numbers)
-    times, states = _with_derivatives_of_scene(
+    times, states = _crossings_with_derivatives(
         found.times, found.states, found.jumps, setup, event, state0, ts
     )
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
-    out = crossed.time(times), jax.vmap(crossed.state)(crossed.time(times), states)
+    out = (
+        crossed.signed_time(times),
+        jax.vmap(crossed.state_of_vector)(crossed.signed_time(times), states),
+    )
     times, states = _set_unknown_derivatives_to_nan(out, found.jumps, inputs)
-    result = result_of_search(found.h, found.t, crossed.time(ts[-1]), found.number >= max_crossings)
-    result = result_of_body(result, setup.body)
+    result = result_of_search(
+        found.h, found.t, crossed.signed_time(ts[-1]), found.number >= max_crossings
+    )
+    result = result_or_nonfinite_input(result, setup.body)
     return Crossings(times, states, found.number, result, found.steps)
 
 
 @eqx.filter_custom_jvp
-def _with_derivatives_of_scene(
-    times: Array, states: Array, jumps: Array, *scene: Any
+def _crossings_with_derivatives(
+    times: Array, states: Array, jumps: Array, *inputs: Any
 ) -> tuple[Array, Array]:
     """Return `times` and `states` as they are; their derivatives come from a second run.
 
@@ -384,15 +397,17 @@ def _with_derivatives_of_scene(
     - `times`, `states`: the K crossings found, shapes (K,) and (K, n) for states of n numbers. The
       times are s = σt, where σ is 1 for a run forwards in time t and −1 for a run backwards.
     - `jumps`: (K,), whether the condition, which is zero at a crossing, jumps over zero there.
-    - `scene`: four things: the set-up of the run, which holds the body and the torque; the `Event`,
-      which holds the condition; the state at the start; and the times at which the run begins and
-      ends, s.
+    - `inputs`: four things: the set-up of the run, which holds the body and the torque; the
+      `Event`, which holds the condition; the state at the start; and the times at which the run
+      begins and ends, s.
     """
     return times, states
 
 
-@_with_derivatives_of_scene.def_jvp
-def _jvp_of_crossings(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
+@_crossings_with_derivatives.def_jvp
+def _jvp_of_crossings(
+    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[PyTree, PyTree]:
     """Return the crossings found before, and their tangents from a second run.
 
     - `primals`: the times and states of the crossings; whether the condition jumps over zero at
@@ -400,14 +415,14 @@ def _jvp_of_crossings(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...])
       the start, and the times at which it begins and ends.
     - `tangents`: the tangents of all these; only the tangents of the four inputs are used.
     """
-    found, jumps, scene = primals[:2], primals[2], primals[3:]
+    found, jumps, inputs = primals[:2], primals[2], primals[3:]
     moved, along = eqx.filter_jvp(
-        partial(_crossings_of_scene, found[0], jumps), scene, tangents[3:]
+        partial(_recompute_crossings, found[0], jumps), inputs, tangents[3:]
     )
-    return as_known(found, moved), along
+    return known_with_derivatives_of(found, moved), along
 
 
-def _crossings_of_scene(
+def _recompute_crossings(
     times: Array, jumps: Array, setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any,
     ts: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
@@ -427,13 +442,17 @@ def _crossings_of_scene(
     **Returns** the times (K,), again s = σt, and the states (K, n). Times and states have
     derivatives with respect to all numbers of `setup`, `event`, `state0` and `ts`.
     """
-    crossed, (constants, *_) = section(setup, event, state0, ts)
+    crossed, (constants, *_) = condition_and_motion_of_run(setup, event, state0, ts)
     there = jnp.isfinite(times)
-    last = jnp.max(jnp.where(there, times, lax.stop_gradient(crossed.time(ts[0]))))
+    last = jnp.max(jnp.where(there, times, lax.stop_gradient(crossed.signed_time(ts[0]))))
     s = jnp.where(there, times, last)
-    ys, *_ = solve(setup, state0, jnp.concatenate([ts[:1], crossed.time(s)]))
-    ys = jax.vmap(crossed.vector)(crossed.time(s), jax.tree.map(lambda leaf: leaf[1:], ys))
-    times, states = jax.vmap(partial(correction, crossed, constants))(s, ys, there & ~jumps)
+    ys, *_ = solve(setup, state0, jnp.concatenate([ts[:1], crossed.signed_time(s)]))
+    ys = jax.vmap(crossed.vector_of_state)(
+        crossed.signed_time(s), jax.tree.map(lambda leaf: leaf[1:], ys)
+    )
+    times, states = jax.vmap(partial(chebyshev_step_to_crossing, crossed, constants))(
+        s, ys, there & ~jumps
+    )
     return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
 
 
@@ -464,29 +483,36 @@ class Section(NamedTuple):
     # divided by a fixed inertia, and back. `None`: the state itself is integrated.
     form: ByMomentum | None = None
 
-    def vector(self, t: Array, state: Any) -> Array:
+    def vector_of_state(self, t: Array, state: PyTree) -> Array:
         """Return the vector (n,) of the numbers that are integrated, made from a state.
 
         - `t`: the time of the state, s.
         - `state`: the state, such as an `Attitude`. If the inertia is a function of time, the body
           rate is replaced by the momentum divided by the inertia at the start (see `ByMomentum`).
         """
-        return ravel_pytree(state if self.form is None else self.form.enter(t, state))[0]
+        return ravel_pytree(
+            state if self.form is None else self.form.replace_rate_by_momentum(t, state)
+        )[0]
 
-    def state(self, t: Array, y: Array) -> Any:
-        """Return the state that belongs to a vector of integrated numbers, the inverse of `vector`.
+    def state_of_vector(self, t: Array, y: Array) -> PyTree:
+        """Return the state that belongs to a vector of integrated numbers.
+
+        This is the inverse of `vector_of_state`.
 
         - `t`: the time of the state, s.
         - `y`: (n,) the numbers that are integrated.
         """
-        return self.tree(y) if self.form is None else self.form.leave(t, self.tree(y))
+        return self.tree(y) if self.form is None else self.form.restore_body_rate(t, self.tree(y))
 
-    def project(self, y: Array) -> Array:
+    def normalise_quaternion(self, y: Array) -> Array:
         """Return the vector `y` (n,) of a state with its quaternion, if any, scaled to length 1."""
         return ravel_pytree(project_to_group(self.tree(y)))[0]
 
-    def time(self, s: Array) -> Array:
-        """Convert the time s of a run to t = σs, or t to s = σt, where σ is 1 or −1."""
+    def signed_time(self, s: Array) -> Array:
+        """Return σs: convert the time s, which grows along a run, to the time t, or t to s.
+
+        σ is 1 for a run forwards in time t, and −1 for a run backwards.
+        """
         return self.sign.astype(s.dtype) * s
 
 
@@ -494,10 +520,13 @@ class Section(NamedTuple):
 Numbers = tuple[Arrays, Path, Array]
 
 
-def section(
+def condition_and_motion_of_run(
     setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
 ) -> tuple[Section, Numbers]:
-    """Return the condition and the motion of a run as functions of a time that grows along the run.
+    """Return the condition of an event and the motion of a run, as functions that can be searched.
+
+    The time of these functions is s = σt, which grows along the run: σ is 1 for a run forwards in
+    time t, and −1 for a run backwards.
 
     - `setup`: how the run is computed: in closed form or by diffrax.
     - `event`: an `Event`, which holds the condition g and the longest step.
@@ -507,12 +536,18 @@ def section(
     **Returns** two things: a `Section`, which holds the functions; and the tuple `Numbers`, which
     holds their constants, the run that is searched for crossings, and its longest step, s.
     """
-    form = by_momentum(setup.body, state0, setup.torque) if isinstance(setup, DiffraxRun) else None
+    form = (
+        equations_by_momentum(setup.body, state0, setup.torque)
+        if isinstance(setup, DiffraxRun)
+        else None
+    )
 
     def condition(t: Array, y: Any) -> Array:
-        return value(event, setup.body, t, y if form is None else form.leave(t, y))
+        return condition_value(
+            event, setup.body, t, y if form is None else form.restore_body_rate(t, y)
+        )
 
-    inside = state0 if form is None else form.enter(ts[0], state0)
+    inside = state0 if form is None else form.replace_rate_by_momentum(ts[0], state0)
     (y0, tree), dtype = ravel_pytree(inside), ts.dtype
     sign = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
     way = setup.sign if isinstance(setup, DiffraxRun) else sign
@@ -582,19 +617,19 @@ def locate_crossings(section: Section, search: Search, numbers: Numbers) -> Loca
       longest step.
     """
     constants, run, longest = lax.stop_gradient(numbers)
-    program = partial(_locate_in_lanes, section, search)
-    return Located(*in_lanes(program, constants, [*run, longest]))
+    program = partial(_locate_crossings_of_bodies, section, search)
+    return Located(*run_with_bodies_last(program, constants, [*run, longest]))
 
 
-def _locate_in_lanes(
+def _locate_crossings_of_bodies(
     section: Section, search: Search, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
     """Return the fields of `Located` in a list: the crossings of one body, or of many at once.
 
     They are the times of the crossings, their states, and whether the condition jumps over zero at
     each; the number of crossings; and at the end of the search the time, the length of the next
-    step, and the number of steps. `in_lanes` calls this function, and puts the bodies of a batch
-    into the last axis of every array.
+    step, and the number of steps. `run_with_bodies_last` calls this function, and puts the bodies
+    of a batch into the last axis of every array.
 
     - `section`: the condition, which is zero at a crossing, and the motion, as functions of the
       time s = σt: σ is 1 for a run forwards in time t, and −1 for a run backwards.
@@ -607,10 +642,14 @@ def _locate_in_lanes(
       its longest step, s.
     """
     run, longest = Path(*each[:-1]), each[-1]
-    solver, motion = section.solver, layout.over(section.motion)
-    project = jax.vmap(section.project, -1, -1) if layout.bodies else section.project
+    solver, motion = section.solver, layout.vmap_over_bodies(section.motion)
+    project = (
+        jax.vmap(section.normalise_quaternion, -1, -1)
+        if layout.bodies
+        else section.normalise_quaternion
+    )
     seen, clear = (
-        partial(layout.over(partial(f, section)), constants)
+        partial(layout.vmap_over_bodies(partial(f, section)), constants)
         for f in (_condition_and_round_off, _rate_relative_to_round_off)
     )
 
@@ -646,7 +685,7 @@ def _norms_of_arrays(sizes: list[int], vector: Array) -> Array:
     return jnp.sqrt(jnp.sum(same * (vector * vector)[None], 1))
 
 
-def _test_change(sizes: list[int], y: Array) -> Array:
+def _change_to_measure_round_off(sizes: list[int], y: Array) -> Array:
     """Return a change (n,) of the state `y` (n,), with which the effect of round-off is measured.
 
     Each number changes by at most the norm of the array to which it belongs. The factors, cosines
@@ -661,7 +700,7 @@ def _test_change(sizes: list[int], y: Array) -> Array:
 
 def _condition_and_round_off(
     section: Section, constants: Arrays, s: Array, y: Array
-) -> tuple[Array, ...]:
+) -> tuple[Array, Array, Array, Array]:
     """Return the condition g at a state, its rate, the slope of the state, and the round-off of g.
 
     - `section`: holds g, a condition that is zero at a crossing, and the motion, as functions of
@@ -674,7 +713,7 @@ def _condition_and_round_off(
     from round-off alone.
     """
     of_g = lambda s, y: section.rates(constants, s, y)[0]  # noqa: E731
-    noise = jax.jvp(of_g, (s, y), (s, _test_change(section.sizes, y)))[1]
+    noise = jax.jvp(of_g, (s, y), (s, _change_to_measure_round_off(section.sizes, y)))[1]
     blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)
     g, rate, slope = section.rates(constants, s, y)
     return jnp.asarray(g), jnp.asarray(rate), slope, blur
@@ -693,14 +732,14 @@ def _rate_relative_to_round_off(section: Section, constants: Arrays, s: Array, y
     """
     rates, sizes = partial(section.rates, constants, s), section.sizes
     _, rate, slope = rates(y)
-    shift = jax.jvp(lambda y: rates(y)[2], (y,), (_test_change(sizes, y),))[1]
+    shift = jax.jvp(lambda y: rates(y)[2], (y,), (_change_to_measure_round_off(sizes, y),))[1]
     by_s, by_y = jax.jacfwd(lambda s, y: section.rates(constants, s, y)[0], (0, 1))(s, y)
     lengths = _norms_of_arrays(sizes, slope) + _norms_of_arrays(sizes, shift)
     terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * lengths)
     return jnp.abs(rate) / (jnp.finfo(y.dtype).eps * terms)
 
 
-def correction(
+def chebyshev_step_to_crossing(
     section: Section, constants: Arrays, s: Array, y: Array, is_crossing: Array
 ) -> tuple[Array, Array]:
     """Return the time and the state of a crossing by one step of Chebyshev's method from nearby.
@@ -729,4 +768,4 @@ def correction(
         is_crossing, newton * (1 - 0.5 * newton * second / rate), jnp.zeros_like(newton)
     )
     state = y + slope * move + 0.5 * turn * move * move
-    return s + move.astype(s.dtype), section.project(state)
+    return s + move.astype(s.dtype), section.normalise_quaternion(state)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
 
@@ -38,26 +38,29 @@ class Slopes(NamedTuple):
     - `derivative`: the slope computed from the derivative.
     - `difference`: the slope computed from a difference of values.
     - `differ`: whether the two slopes differ by more than their uncertainty.
-    - `ways`: the direction: by how much each number of x changes, without its sign.
+    - `direction`: by how much each number of x changes along the direction, without its sign.
     """
 
     derivative: Array
     difference: Array
     differ: Array
-    ways: Any
+    direction: Any
 
 
-def size_of(leaf: Array) -> Array:
-    """Return the size of each number of an array: its absolute value, or 1 if all are zero.
+def absolute_or_one_if_all_zero(array: Array) -> Array:
+    """Return the absolute value of each number of an array, or ones if all numbers are zero.
 
-    If all numbers of the array `leaf` are zero, their natural size is not known, and 1 is taken.
+    The result is taken as the natural size of each number. If all of them are zero, their natural
+    size is not known, and 1 is taken.
     """
-    return jnp.where(jnp.all(leaf == 0), jnp.ones_like(leaf), jnp.abs(leaf))
+    return jnp.where(jnp.all(array == 0), jnp.ones_like(array), jnp.abs(array))
 
 
 @jax.jit
-def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple[Array, Any]:
-    """Return the length of a step, and the two points one step from `x` in a random direction.
+def step_and_two_points(
+    x: PyTree, value: Array, value_error: Array, derivative: PyTree
+) -> tuple[Array, PyTree]:
+    """Return the length of a step, and the two points one step from `x` along a random line.
 
     The values of a function f at the two points give its slope, to be compared with its derivative.
 
@@ -66,8 +69,8 @@ def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple
     - `derivative`: df/dx, a tree of arrays whose axes are those of f(x) and then those of x.
 
     **Returns** two things: the length h () of the step, relative to the sizes of the numbers of
-    `x`; and the two points x − h d and x + h d, where d is the direction, as a tree with the two
-    points in a new first axis of each array.
+    `x`; and the two points x − h d and x + h d, where d is the direction of the line, as a tree
+    with the two points in a new first axis of each array.
     """
     rng = np.random.default_rng(2)
 
@@ -75,11 +78,11 @@ def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple
         way = rng.uniform(0.5, 1.0, leaf.shape) * rng.choice([-1.0, 1.0], leaf.shape)
         if leaf.ndim > 1 and leaf.shape[-1] == leaf.shape[-2]:
             way = 0.5 * (way + np.swapaxes(way, -1, -2))
-        size = size_of(leaf)
+        size = absolute_or_one_if_all_zero(leaf)
         return jnp.where(size == 0, jnp.max(size), size) * jnp.asarray(way, leaf.dtype)
 
     way = jax.tree.map(random_way, x)
-    rise = jnp.max(jnp.abs(_change_along(derivative, way)))
+    rise = jnp.max(jnp.abs(_directional_change(derivative, way)))
     size = jnp.maximum(jnp.max(jnp.abs(value)), _SLOW * rise)
     unsure = jnp.maximum(jnp.max(value_error), float(jnp.finfo(value.dtype).eps) * size)
     # The length of the step is chosen such that the value changes by the geometric mean of its size
@@ -95,21 +98,24 @@ def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple
     return step, jax.tree.map(both, x, way)
 
 
-def values_at(value: Callable[[Any, Any], Array], sides: Any, tolerances: Array) -> Array:
-    """Return the values of a function at two points; NaN at a point that the function refuses.
+def values_at_two_points(
+    function: Callable[[Any, Array], Array], points: PyTree, tolerances: Array
+) -> Array:
+    """Return the values of a function at two points.
 
-    Under `jit` the numbers of the points are not known, and the function cannot refuse them.
+    The value is NaN at a point for which the function raises a `RuntimeError`, because it is no
+    valid argument. Under `jit` the numbers of the points are not known, and no error is raised.
 
-    - `value`: the function, called as `value(x, tolerances)`.
-    - `sides`: a tree of arrays with the two points in the first axis.
+    - `function`: the function, called as `function(x, tolerances)`.
+    - `points`: a tree of arrays with the two points in the first axis.
     - `tolerances`: passed to the function.
     """
-    if not _checks.is_known((sides, tolerances)):
-        return lax.map(lambda x: value(x, tolerances), sides)
+    if not _checks.is_known((points, tolerances)):
+        return lax.map(lambda x: function(x, tolerances), points)
     values: list[Any] = []
-    for side in (jax.tree.map(itemgetter(i), sides) for i in range(2)):
+    for side in (jax.tree.map(itemgetter(i), points) for i in range(2)):
         try:
-            values.append(value(side, tolerances))
+            values.append(function(side, tolerances))
         except RuntimeError:
             # A flat body is at the limit of what a real body can be, so that one of the two points
             # is no real body.
@@ -118,42 +124,46 @@ def values_at(value: Callable[[Any, Any], Array], sides: Any, tolerances: Array)
 
 
 @jax.jit
-def slopes_of(x: Any, middle: Array, step: Array, sides: Any, values: Array, error: Any) -> Slopes:
+def slopes_by_derivative_and_values(
+    x: PyTree, value_at_x: Array, step: Array, points: PyTree, values: Array, error: Any
+) -> Slopes:
     """Return the slope of a function by its derivative, and by its values on both sides of `x`.
+
+    Both are slopes along one line through `x`, on which the two points lie.
 
     **Arguments:**
 
     - `x`: the numbers at which the derivative is taken.
-    - `middle`: the value at `x`, computed with the same tolerances as `values`.
-    - `step`, `sides`: the results of `sides_of`: the length of the step, and the two points, one
-      step from `x` on either side.
-    - `values`: the values at the two points `sides`, NaN if there is none.
+    - `value_at_x`: the value at `x`, computed with the same tolerances as `values`.
+    - `step`, `points`: the results of `step_and_two_points`: the length of the step, and the two
+      points, one step from `x` on either side.
+    - `values`: the values at the two points `points`, NaN if there is none.
     - `error`: a `FunctionError` with the derivative, and with the errors of value and derivative.
     """
     # The numbers of the two points have been rounded, so that their difference is not exactly along
     # the direction.
-    moved = jax.tree.map(lambda side, leaf: side - leaf[None], sides, x)
-    rises = jax.vmap(lambda way: _change_along(error.derivative, way))(moved)
+    moved = jax.tree.map(lambda side, leaf: side - leaf[None], points, x)
+    rises = jax.vmap(lambda way: _directional_change(error.derivative, way))(moved)
     there = jnp.isfinite(values)
-    # A missing value is replaced by 2 `middle` minus the other value.
-    values = jnp.where(there, values, 2 * middle[None] - values[::-1])
+    # A missing value is replaced by 2 `value_at_x` minus the other value.
+    values = jnp.where(there, values, 2 * value_at_x[None] - values[::-1])
     rises = jnp.where(there, rises, -rises[::-1])
     derivative, difference = ((a[1] - a[0]) / (2 * step) for a in (rises, values))
-    bend = jnp.abs(values[0] + values[1] - 2 * middle)
+    bend = jnp.abs(values[0] + values[1] - 2 * value_at_x)
     size, rise = jnp.max(jnp.abs(error.value)), jnp.max(jnp.abs(derivative))
     eps = jnp.finfo(error.value.dtype).eps
     unsure = jnp.max(bend + _CLOSER * error.value_error) + 8 * float(eps) * size
-    ways = jax.tree.map(lambda side: jnp.abs(side[1] - side[0]) / (2 * step), sides)
-    of_derivative = _change_along(error.derivative_error, ways)
+    direction = jax.tree.map(lambda side: jnp.abs(side[1] - side[0]) / (2 * step), points)
+    of_derivative = _directional_change(error.derivative_error, direction)
     curved = rise * rise * step / jnp.maximum(size, _SLOW * rise)
     curved = jnp.where(rise > 0, curved, 0)
     allowed = _UNSURE * (unsure / step + of_derivative + curved)
     differ = jnp.abs(difference - derivative) > allowed
-    return Slopes(derivative, difference, differ, ways)
+    return Slopes(derivative, difference, differ, direction)
 
 
 @jax.jit
-def errors_of_numbers(slopes: Slopes) -> Any:
+def derivative_error_from_slopes(slopes: Slopes) -> PyTree:
     """Return the error of a function's derivative with respect to each number of its argument x.
 
     Two slopes along one direction are compared. The error with respect to each number is so large
@@ -171,13 +181,15 @@ def errors_of_numbers(slopes: Slopes) -> Any:
         inverse = 1 / jnp.where(way > 0, way, 1)
         return jnp.tensordot(slope, inverse.astype(slope.dtype), axes=0)
 
-    return jax.tree.map(of_leaf, slopes.ways)
+    return jax.tree.map(of_leaf, slopes.direction)
 
 
-def warn_of_slopes(slopes: Slopes) -> None:
-    """Warn that a derivative misses a change of values, if the `slopes` are known and differ.
+def warn_if_slopes_differ(slopes: Slopes) -> None:
+    """Warn the user that a derivative leaves something out, if two slopes of a function differ.
 
-    - `slopes`: the slope of a function by its derivative, and by a difference of its values.
+    Nothing is compared under `jit`, where the slopes are not known.
+
+    - `slopes`: the slope of the function by its derivative, and by a difference of its values.
     """
     if not _checks.is_known(slopes) or not np.any(slopes.differ):
         return
@@ -193,19 +205,19 @@ def warn_of_slopes(slopes: Slopes) -> None:
     )
 
 
-def _change_along(derivative: Any, way: Any) -> Array:
-    """Return the change of a function's value for the change `way` of its argument x: df/dx · way.
+def _directional_change(derivative: PyTree, direction: PyTree) -> Array:
+    """Return df/dx · direction, the change of a function's value if x changes by `direction`.
 
     - `derivative`: df/dx of the function f, a tree with one array for each array of x. The axes of
       an array are those of the value f(x), then those of this array of x.
-    - `way`: a tree of the structure of x.
+    - `direction`: a tree of the structure of x.
 
     **Returns** an array of the shape of the value.
     """
 
-    def of_leaf(derivative: Array, way: Array) -> Array:
-        many = derivative.ndim - way.ndim
-        way = way.reshape(*[1] * many, *way.shape)
-        return jnp.sum(derivative * way, tuple(range(many, derivative.ndim)))
+    def of_leaf(derivative: Array, direction: Array) -> Array:
+        many = derivative.ndim - direction.ndim
+        direction = direction.reshape(*[1] * many, *direction.shape)
+        return jnp.sum(derivative * direction, tuple(range(many, derivative.ndim)))
 
-    return jnp.sum(jnp.stack(jax.tree.leaves(jax.tree.map(of_leaf, derivative, way))), 0)
+    return jnp.sum(jnp.stack(jax.tree.leaves(jax.tree.map(of_leaf, derivative, direction))), 0)

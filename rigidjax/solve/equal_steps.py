@@ -8,12 +8,13 @@ fast. Without derivatives it runs a tenth longer, and in reverse mode a third lo
 from collections.abc import Callable
 from typing import Any
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax.rotation.barrier import barrier
 from rigidjax.solve.explicit import AbstractExplicit
@@ -30,23 +31,26 @@ class StepWithLoopedStages(eqx.Module):
     solver: AbstractExplicit
 
 
-def roll_steps(solver: Any) -> Any:
-    """Return an explicit method of order 4 or 5 with its stages in a loop; others are unchanged.
+def loop_stages_of_low_order(solver: dfx.AbstractSolver) -> Any:
+    """Return an explicit method of order 4 or 5 with its stages computed in a loop.
 
-    - `solver`: the method. With a loop its program compiles faster.
+    With a loop the program of the method compiles faster. A method of another order, and a method
+    that is not explicit, is returned unchanged.
+
+    - `solver`: the method.
     """
-    few = isinstance(solver, AbstractExplicit) and solver.tableau.order <= 5
-    return StepWithLoopedStages(solver) if few else solver
+    is_low_order = isinstance(solver, AbstractExplicit) and solver.tableau.order <= 5
+    return StepWithLoopedStages(solver) if is_low_order else solver
 
 
-def change_in(
+def change_in_step(
     solver: AbstractExplicit | StepWithLoopedStages,
     field: Field,
     t: Any,
     h: Array,
-    y: Any,
+    y: PyTree,
     end: Any,
-) -> Any:
+) -> PyTree:
     """Return the change of a state in one step of an explicit method.
 
     The quaternion of the state is not scaled to length 1.
@@ -61,10 +65,10 @@ def change_in(
     """
     if isinstance(solver, StepWithLoopedStages):
         return _change_by_looped_stages(solver.solver.tableau, field, t, h, y, end)
-    return change_and_slope(solver.tableau, field, t, h, y, end)[0]
+    return change_and_slope_at_start(solver.tableau, field, t, h, y, end)[0]
 
 
-def advance(tableau: Tableau, field: Field, t: Any, h: Array, y: Any) -> Any:
+def state_after_step(tableau: Tableau, field: Field, t: Any, h: Array, y: PyTree) -> PyTree:
     """Return the state after one step of an explicit method.
 
     The quaternion of the state is not scaled to length 1.
@@ -74,12 +78,12 @@ def advance(tableau: Tableau, field: Field, t: Any, h: Array, y: Any) -> Any:
     - `t`, `h`: the time at the start of the step, and its length, s.
     - `y`: the state at the start, a tree of arrays.
     """
-    return jax.tree.map(jnp.add, y, change_and_slope(tableau, field, t, h, y)[0])
+    return jax.tree.map(jnp.add, y, change_and_slope_at_start(tableau, field, t, h, y)[0])
 
 
-def change_and_slope(
-    tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any = None
-) -> tuple[Any, Any]:
+def change_and_slope_at_start(
+    tableau: Tableau, field: Field, t: Any, h: Array, y: PyTree, end: Any = None
+) -> tuple[PyTree, PyTree]:
     """Return the change of a state in one step, and the slope dy/dt at the start of the step.
 
     The stages are written out one after the other, and the quaternion of the state is not scaled to
@@ -91,9 +95,9 @@ def change_and_slope(
     - `y`: the state at the start, a tree of arrays.
     - `end`: the time of the stages at the end of the step, s; `None` is the rounded sum `t + h`.
 
-    The barriers are needed because XLA would otherwise make one kernel for each result, and each
-    kernel would repeat all stages before it.
     """
+    # Without the barriers XLA makes one kernel for each result, and each kernel repeats all stages
+    # before it.
     end = t + h if end is None else end
     slopes = [barrier(field(t, y))]
     for node, row in zip(tableau.c, tableau.a, strict=True):
@@ -102,7 +106,7 @@ def change_and_slope(
     return _weighted_sum(h, tableau.b, slopes), slopes[0]
 
 
-def _weighted_sum(h: Array, row: Row, slopes: list[Any]) -> Any:
+def _weighted_sum(h: Array, row: Row, slopes: list[PyTree]) -> PyTree:
     """Return `h` times the sum of the slopes of some stages, each multiplied by its weight.
 
     - `h`: the length of the step, s.
@@ -121,8 +125,8 @@ def _weighted_sum(h: Array, row: Row, slopes: list[Any]) -> Any:
 
 
 def _change_by_looped_stages(
-    tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any
-) -> Any:
+    tableau: Tableau, field: Field, t: Any, h: Array, y: PyTree, end: Any
+) -> PyTree:
     """Return the change of a state in one step of an explicit method whose stages are a loop.
 
     The loop carries the slopes dy/dt of the last few stages, as many as any later stage reads.
@@ -156,7 +160,7 @@ def _change_by_looped_stages(
     return lax.scan(stage, (jax.tree.map(jnp.zeros_like, y), rest), each)[0][0]
 
 
-def _add_multiple(y: Any, factor: Array, slope: Any) -> Any:
+def _add_multiple(y: PyTree, factor: Array, slope: PyTree) -> PyTree:
     """Return y + factor · slope, where `factor` is a scalar array.
 
     `y` and `slope` are trees of arrays with equal structure.

@@ -25,7 +25,7 @@ from rigidjax import _checks, _show
 from rigidjax._types import ScalarLike
 from rigidjax.motion.manifold import leaf_names, minus, parts_by_name
 from rigidjax.solve import difference, validation
-from rigidjax.solve.linear_map import as_known
+from rigidjax.solve.linear_map import known_with_derivatives_of
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
 from rigidjax.solve.sides import with_constant_pieces
 
@@ -123,20 +123,22 @@ class Error(eqx.Module):
 
     @property
     def total(self) -> dict[str, Float[Array, " times"]]:
-        """Return the error of steps and round-off together, one array (T,) by name; inf where
-        `lost`.
+        """Return the errors of steps and of round-off together, by the names of the arrays.
+
+        Each is an array (T,); it is infinite at times at which the state is `lost`.
         """
         both = jax.tree.map(jnp.hypot, self.steps, self.round_off)
         return jax.tree.map(lambda part: jnp.where(self.lost, jnp.inf, part), both)
 
     @property
     def relative(self) -> Float[Array, " times"]:
-        """Return the largest error of any name (T,), divided by its scale; inf where `lost`.
+        """Return the largest relative error of the state at each time (T,).
 
-        For a quaternion the error is an angle, rad; for other arrays it is relative to the largest
-        value in the run.
+        The largest is taken over the arrays of the state (`q`, `omega`, …). For a quaternion the
+        error is an angle, rad; for other arrays it is divided by the largest value in the run. It
+        is infinite at times at which the state is `lost`.
         """
-        return jnp.where(self.lost, jnp.inf, self._relative)
+        return jnp.where(self.lost, jnp.inf, self._largest_relative_error)
 
     @property
     def lost(self) -> Bool[Array, " times"]:
@@ -145,7 +147,7 @@ class Error(eqx.Module):
         The state is unknown from the first time on at which the largest relative error is above one
         half.
         """
-        return lax.associative_scan(jnp.logical_or, self._relative > _LOST)
+        return lax.associative_scan(jnp.logical_or, self._largest_relative_error > _LOST)
 
     @property
     def known_until(self) -> Float[Array, ""]:
@@ -153,7 +155,7 @@ class Error(eqx.Module):
         return self.ts[jnp.sum(~self.lost) - 1]
 
     @property
-    def _relative(self) -> Array:
+    def _largest_relative_error(self) -> Array:
         """Return the largest error of a state at each time (T,), without a unit.
 
         The largest is taken over the arrays of the state (`q`, `omega`, …), after the error of each
@@ -174,7 +176,7 @@ class TriedRun(NamedTuple):
     result: dfx.RESULTS  # whether the run reached the end, or why not
 
     @property
-    def steps(self) -> Array:
+    def accepted_steps(self) -> Array:
         """Return the number of accepted steps of the run, a whole number."""
         return self.stats["num_accepted_steps"]
 
@@ -183,8 +185,8 @@ class TriedRun(NamedTuple):
 def estimate_error_of_run(
     setup: Any,
     ts: Array,
-    ys: Any,
-    count: Array,
+    ys: PyTree,
+    num_steps: Array,
     search: tuple[TriedRun, TriedRun] | None = None,
 ) -> Error:
     """Return an estimate of the error of a run that is already known, at each of its saved times.
@@ -199,39 +201,41 @@ def estimate_error_of_run(
       a `DiffraxRun`.
     - `ts`: (T,) s, the times of the states.
     - `ys`: the states at `ts` that the run gave, with a leading time axis.
-    - `count`: the number of steps of the run.
+    - `num_steps`: the number of steps of the run.
     - `search`: `None`, or two runs of a search for a tolerance, both at larger tolerances: the
       first run of the search, and the run before `ys`. The run before then serves instead of a
       second run, and the error of the steps is too large by a factor of about four.
     """
-    setup, ts, ys, count, search = _without_derivatives((setup, ts, ys, count, search))
+    setup, ts, ys, num_steps, search = _without_derivatives((setup, ts, ys, num_steps, search))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
     if search is not None:
         before = search[1]
         rtol, others = setup.rtol, before.ys
         far = (
-            _largest_relative_distance(_distances_of_states(others, ys), _scales_by_name(ys))
+            _largest_relative_distance(_distances_of_states(others, ys), _error_scales_by_name(ys))
             > _FORESEEN
         )
         factor = jnp.where(far, jnp.inf, _ALLOWED * rtol / before.rtol)
     elif not isinstance(setup, ClosedFormRun):
-        second, rtol, factor = _more_accurate_run(setup, ts, _sudden_times(setup, ts, ys))
+        second, rtol, factor = _more_accurate_setup(
+            setup, ts, _times_of_sudden_torque(setup, ts, ys)
+        )
         others, *_ = solve(second, jax.tree.map(lambda leaf: leaf[0], ys), ts)
     steps = jax.tree.map(lambda part: factor * part, _distances_of_states(others, ys))
-    return _error_with_round_off(setup, ts, ys, count, steps, rtol, search)
+    return _error_with_round_off(setup, ts, ys, num_steps, steps, rtol, search)
 
 
-def _without_derivatives(tree: Any) -> Any:
+def _without_derivatives(tree: PyTree) -> PyTree:
     """Return a tree with the same numbers as `tree`, whose arrays are constants for derivatives."""
     return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_array(a) else a, tree)
 
 
 def _error_with_round_off(
-    setup: Any,
+    setup: ClosedFormRun | DiffraxRun,
     ts: Array,
-    ys: Any,
-    count: Array,
-    steps: dict[str, Array],
+    ys: PyTree,
+    num_steps: Array,
+    step_errors: dict[str, Array],
     rtol: Array,
     search: tuple[TriedRun, TriedRun] | None,
 ) -> Error:
@@ -244,24 +248,24 @@ def _error_with_round_off(
 
     - `setup`: the body, the torque, the solver and the tolerances of the run.
     - `ts`, `ys`: the saved times (T,), s, and the states of the run at these times.
-    - `count`: the number of steps of the run.
-    - `steps`: the known error of the steps, one array (T,) for each array of a state, by its name
-      (`q`, `omega`, …).
+    - `num_steps`: the number of steps of the run.
+    - `step_errors`: the known error of the steps, one array (T,) for each array of a state, by its
+      name (`q`, `omega`, …).
     - `rtol`: the relative tolerance of the run.
     - `search`: `None`, or two runs of the search that found the tolerance of the run: the first one
       and the one before the last. They have larger tolerances, and one of them stands for the run
       when its round-off is measured, so that no new run is needed for that.
     """
-    sizes, start = _scales_by_name(ys), jax.tree.map(lambda leaf: leaf[0], ys)
+    sizes, start = _error_scales_by_name(ys), jax.tree.map(lambda leaf: leaf[0], ys)
     reached = jnp.isfinite(_largest_relative_distance(_distances_of_states(ys, ys), sizes))
-    # This is `_ABOVE` times the sum of the rounding errors of n = `count` steps, about n^1.5
+    # This is `_ABOVE` times the sum of the rounding errors of n = `num_steps` steps, about n^1.5
     # roundings, in a motion without growth of errors: n^0.5 for the body rate, and once more n for
     # the angle.
     eps = float(jnp.finfo(ts.dtype).eps)
-    plain = {name: _ABOVE * eps * count.astype(ts.dtype) ** 1.5 * sizes[name] for name in sizes}
+    plain = {name: _ABOVE * eps * num_steps.astype(ts.dtype) ** 1.5 * sizes[name] for name in sizes}
     coarse = rtol > _COARSE * eps
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
-    setup, ys, more = _run_at_larger_tolerance(setup, start, ts, ys, count, search)
+    setup, ys, more = _run_at_larger_tolerance(setup, start, ts, ys, num_steps, search)
     free = isinstance(setup, ClosedFormRun)
 
     def changes_of_neighbour(numbers: Any, times: Array) -> Array:
@@ -274,9 +278,9 @@ def _error_with_round_off(
         # If round-off is known to be small, all times of a neighbour are the start, so that it
         # takes no step.
         changes = changes_of_neighbour(near, jnp.where(clear, ts[0], ts * later))
-        shown = _lengths_by_name(start, _DEVIATIONS * _ABOVE_ONE * changes)
+        shown = _lengths_of_changes_by_name(start, _DEVIATIONS * _ABOVE_ONE * changes)
         bounds = {name: jnp.maximum(plain[name], shown[name]) for name in sizes}
-        above = jnp.stack([(steps[name] > _CLEAR * bounds[name])[1:] for name in sizes])
+        above = jnp.stack([(step_errors[name] > _CLEAR * bounds[name])[1:] for name in sizes])
         small = coarse & jnp.all(above | ~reached[None, 1:])
         return jnp.where(number == 0, small, clear), (changes, bounds)
 
@@ -288,21 +292,28 @@ def _error_with_round_off(
     # times of its neighbours are therefore changed, too.
     later = jnp.asarray(1.0 + eps * free * np.array([1.0, -1.0, 1.0]), ts.dtype)
     inputs = jnp.arange(_NEIGHBOURS), near, later
-    # The neighbours are run one after another: in lanes they would take as long.
+    # The neighbours are run one after another: all at once, in a batch, they would take as long.
     clear, (changes, bounds) = lax.scan(neighbour, jnp.asarray(False), inputs)
-    off = _lengths_by_name(start, _DEVIATIONS * jnp.sqrt(_variance_over_neighbours(changes)))
+    off = _lengths_of_changes_by_name(
+        start, _DEVIATIONS * jnp.sqrt(_variance_over_neighbours(changes))
+    )
     off = {name: jnp.where(clear, bounds[name][0], off[name]) for name in off}
 
     def known(part: Array) -> Array:
         return jnp.where(reached, jnp.where(jnp.isnan(part), jnp.inf, part), jnp.nan)
 
-    steps, off = jax.tree.map(known, (steps, off))
-    return Error(ts, steps, off, sizes)
+    step_errors, off = jax.tree.map(known, (step_errors, off))
+    return Error(ts, step_errors, off, sizes)
 
 
 def _run_at_larger_tolerance(
-    setup: Any, start: Any, ts: Array, ys: Any, count: Array, search: Any
-) -> tuple[Any, Any, Any]:
+    setup: Any,
+    start: PyTree,
+    ts: Array,
+    ys: PyTree,
+    num_steps: Array,
+    search: tuple[TriedRun, TriedRun] | None,
+) -> tuple[Any, PyTree, float | Array]:
     """Return a run at a larger tolerance, by which the round-off of a given run can be measured.
 
     **Returns** three things: the set-up of the run at the larger tolerance, which takes fewer
@@ -321,14 +332,14 @@ def _run_at_larger_tolerance(
     - `setup`: the body, the torque, the solver and the tolerances of the given run.
     - `start`: the state at the start of the run.
     - `ts`, `ys`: the saved times (T,), s, and the states of the given run at these times.
-    - `count`: the number of steps of the given run.
+    - `num_steps`: the number of steps of the given run.
     - `search`: two finished runs at larger tolerances: the first is returned if its states are near
       `ys`, else the second. With `None` a new run is made.
     """
     replayed = isinstance(setup, DiffraxRun) and setup.is_replayed
     if not replayed or ts.dtype == jnp.float32:
         return setup, ys, 1.0
-    sizes = _scales_by_name(ys)
+    sizes = _error_scales_by_name(ys)
     unreached = jnp.isnan(_largest_relative_distance(_distances_of_states(ys, ys), sizes))
 
     def is_near(run: TriedRun) -> Array:
@@ -345,17 +356,17 @@ def _run_at_larger_tolerance(
         run = lax.while_loop(
             lambda run: ~(is_near(run) | (run.rtol <= setup.rtol)),
             closer,
-            _run_without_steps(setup, start, ts, loosest),
+            _placeholder_run(setup, start, ts, loosest),
         )
     else:
         near = is_near(search[0])
         run = jax.tree.map(lambda first, last: jnp.where(near, first, last), *search)
-    fewer = jnp.maximum(run.steps, 1)
+    fewer = jnp.maximum(run.accepted_steps, 1)
     setup = _with_tolerance(setup, run.rtol)
-    return setup, run.ys, (jnp.maximum(count / fewer, 1.0) ** 0.25).astype(ts.dtype)
+    return setup, run.ys, (jnp.maximum(num_steps / fewer, 1.0) ** 0.25).astype(ts.dtype)
 
 
-def _run_at_tolerance(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) -> TriedRun:
+def _run_at_tolerance(setup: DiffraxRun, state0: PyTree, ts: Array, rtol: Array) -> TriedRun:
     """Run a set-up at the relative tolerance `rtol`, and return the run with this tolerance.
 
     `setup` holds the body, the torque and the solver, `state0` is the state at the time `ts[0]`,
@@ -365,7 +376,7 @@ def _run_at_tolerance(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) ->
     return TriedRun(rtol, *solve(_with_tolerance(setup, rtol), state0, ts))
 
 
-def _run_without_steps(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) -> TriedRun:
+def _placeholder_run(setup: DiffraxRun, state0: PyTree, ts: Array, rtol: Array) -> TriedRun:
     """Return a `TriedRun` that stands for no run: no step was taken, and its states are NaN.
 
     Its arrays have the shapes and dtypes of a run of `setup` (the body, the torque and the solver)
@@ -381,7 +392,7 @@ def _run_without_steps(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) -
     return jax.tree.map(empty, run)._replace(rtol=jnp.asarray(rtol, ts.dtype))
 
 
-def _distances_of_states(others: Any, ys: Any) -> dict[str, Array]:
+def _distances_of_states(others: PyTree, ys: PyTree) -> dict[str, Array]:
     """Return how far the states of two runs are apart, at each of the T saved times.
 
     `others` and `ys` are the states of the two runs at equal times, with a leading time axis.
@@ -389,10 +400,12 @@ def _distances_of_states(others: Any, ys: Any) -> dict[str, Array]:
     for a quaternion the angle of the turn from one state to the other, rad, else the length of the
     difference.
     """
-    return _lengths_by_name(jax.tree.map(lambda leaf: leaf[0], ys), jax.vmap(minus)(others, ys))
+    return _lengths_of_changes_by_name(
+        jax.tree.map(lambda leaf: leaf[0], ys), jax.vmap(minus)(others, ys)
+    )
 
 
-def _lengths_by_name(state: Any, changes: Array) -> dict[str, Array]:
+def _lengths_of_changes_by_name(state: PyTree, changes: Array) -> dict[str, Array]:
     """Return the length of the change of each array of a state, by the name of the array.
 
     `state` gives the names and the kinds of the arrays. `changes` (…, n) are the n numbers of each
@@ -404,16 +417,16 @@ def _lengths_by_name(state: Any, changes: Array) -> dict[str, Array]:
     return {name.removeprefix("motion."): jnp.linalg.norm(part, axis=-1) for name, part in named}
 
 
-def largest_in_run(leaf: Array) -> Array:
-    """Return the largest length that one array of the states of a run has at its T saved times.
+def largest_length_in_run(array: Array) -> Array:
+    """Return the largest length that a vector of the state has at the T saved times of a run.
 
-    `leaf` (T, …) is the array with a leading time axis. Times that the run did not reach, where the
-    array is NaN, are left out.
+    `array` (T, …) is the array with a leading time axis. Times that the run did not reach, where
+    the array is NaN, are left out.
     """
-    return jnp.nanmax(jnp.linalg.norm(leaf.reshape(leaf.shape[0], -1), axis=-1))
+    return jnp.nanmax(jnp.linalg.norm(array.reshape(array.shape[0], -1), axis=-1))
 
 
-def _scales_by_name(ys: Any) -> dict[str, Array]:
+def _error_scales_by_name(ys: PyTree) -> dict[str, Array]:
     """Return the scale by which an error of each array of a state is divided.
 
     `ys` are the states of a run, with a leading time axis. **Returns** a dict by the names of the
@@ -423,7 +436,7 @@ def _scales_by_name(ys: Any) -> dict[str, Array]:
     sizes = {}
     for name, leaf in zip(leaf_names(ys), jax.tree.leaves(ys), strict=True):
         name = name.removeprefix("motion.")
-        most = largest_in_run(leaf)
+        most = largest_length_in_run(leaf)
         sizes[name] = jnp.ones_like(most) if name == "q" else jnp.maximum(most, _SMALL)
     return sizes
 
@@ -439,10 +452,10 @@ def _largest_relative_distance(distances: dict[str, Array], sizes: dict[str, Arr
 
 
 @eqx.filter_jit
-def solve_to(
-    setup: DiffraxRun, state0: Any, ts: Array, accuracy: Array
-) -> tuple[DiffraxRun, Any, tuple[TriedRun, TriedRun]]:
-    """Find a tolerance at which the global error of a run is below `accuracy`, if there is one.
+def solve_to_accuracy(
+    setup: DiffraxRun, state0: PyTree, ts: Array, accuracy: Array
+) -> tuple[DiffraxRun, PyTree, tuple[TriedRun, TriedRun]]:
+    """Solve a run at a tolerance at which its global error is below `accuracy`, if there is one.
 
     Runs are tried at smaller and smaller tolerances. The error of each run is estimated by its
     distance from the run before, and scaled in proportion to the tolerance.
@@ -460,7 +473,7 @@ def solve_to(
     """
     still = _without_derivatives((setup, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
-    sudden = _sudden_times(still[0], ts, jax.tree.map(lambda leaf: leaf[None], still[1]))
+    sudden = _times_of_sudden_torque(still[0], ts, jax.tree.map(lambda leaf: leaf[None], still[1]))
     cut = dataclasses.replace(still[0], cuts=sudden)
     first_rtol = jnp.asarray(max(_FIRST, 100 * floor), ts.dtype)
 
@@ -470,10 +483,10 @@ def solve_to(
         # takes no step.
         new = _run_at_tolerance(cut, still[1], jnp.where(ended, ts[0], ts), rtol)
         is_first = number == 0
-        count, counted = new.steps.astype(ts.dtype), before.steps.astype(ts.dtype)
+        count, counted = new.accepted_steps.astype(ts.dtype), before.accepted_steps.astype(ts.dtype)
         off = jnp.nanmax(
             _largest_relative_distance(
-                _distances_of_states(before.ys, new.ys), _scales_by_name(new.ys)
+                _distances_of_states(before.ys, new.ys), _error_scales_by_name(new.ys)
             )[1:]
         )
         foreseen = off < _FORESEEN
@@ -492,7 +505,7 @@ def solve_to(
         none_reached = ~jnp.any(
             jnp.isfinite(
                 _largest_relative_distance(
-                    _distances_of_states(new.ys, new.ys), _scales_by_name(new.ys)
+                    _distances_of_states(new.ys, new.ys), _error_scales_by_name(new.ys)
                 )
             )[1:]
         )
@@ -500,7 +513,7 @@ def solve_to(
         first = jax.tree.map(lambda a, b: jnp.where(is_first, a, b), new, first)
         return number + 1, first, before, new, following, found | none_reached
 
-    begun = _run_without_steps(cut, still[1], ts, first_rtol)
+    begun = _placeholder_run(cut, still[1], ts, first_rtol)
     carry = (0, begun, begun, begun, first_rtol, jnp.asarray(False))
     _, first, before, new, *_ = lax.while_loop(lambda carry: ~carry[-1], closer, carry)
     setup = dataclasses.replace(_with_tolerance(setup, lax.stop_gradient(new.rtol)), cuts=sudden)
@@ -509,7 +522,7 @@ def solve_to(
 
 
 @eqx.filter_custom_jvp
-def _with_derivatives_of_solve(setup: DiffraxRun, state0: Any, ts: Array, ys: Any) -> Any:
+def _with_derivatives_of_solve(setup: DiffraxRun, state0: PyTree, ts: Array, ys: PyTree) -> PyTree:
     """Return the known states `ys` of a run, with the derivatives that `solve` would give them.
 
     `setup` (the body, the torque and the solver), `state0` (the state at the start) and `ts` (the
@@ -523,10 +536,10 @@ def _with_derivatives_of_solve(setup: DiffraxRun, state0: Any, ts: Array, ys: An
 def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     states = lambda *args: solve(*args)[0]  # noqa: E731
     ys, along = eqx.filter_jvp(states, primals[:3], tangents[:3])
-    return as_known(primals[3], ys), along
+    return known_with_derivatives_of(primals[3], ys), along
 
 
-def _with_tolerance(setup: DiffraxRun, rtol: Any) -> DiffraxRun:
+def _with_tolerance(setup: DiffraxRun, rtol: Array) -> DiffraxRun:
     """Return the set-up of a run with another relative tolerance `rtol`.
 
     `setup` holds the body, the torque, the solver and the tolerances. The absolute tolerance
@@ -536,7 +549,7 @@ def _with_tolerance(setup: DiffraxRun, rtol: Any) -> DiffraxRun:
     return dataclasses.replace(setup, rtol=rtol, atol=_SMALL * rtol, throw=False)
 
 
-def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
+def _times_of_sudden_torque(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: PyTree) -> Array:
     """Return times at which the torque changes suddenly, so that a run may miss a short pulse.
 
     A run does not notice a pulse that is shorter than a step and that no stage of a step hits. The
@@ -590,7 +603,9 @@ def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
     return lax.stop_gradient(lax.map(sudden, (times, saved)))
 
 
-def _more_accurate_run(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
+def _more_accurate_setup(
+    setup: Any, ts: Array, sudden_times: Array
+) -> tuple[DiffraxRun, Array, float]:
     """Return the set-up of a more accurate run, by which the error of a given run is measured.
 
     **Arguments:**
@@ -598,8 +613,8 @@ def _more_accurate_run(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, 
     - `setup`: the body, the torque, the solver and the tolerances (or the fixed step) of the given
       run.
     - `ts`: (T,) s, the times of its saved states.
-    - `sudden`: (m,) s, times at which steps of the more accurate run are to end, such as the times
-      at which the torque changes suddenly. Under fixed steps they are not used.
+    - `sudden_times`: (m,) s, times at which steps of the more accurate run are to end, such as the
+      times at which the torque changes suddenly. Under fixed steps they are not used.
 
     **Returns** three things: the set-up of the more accurate run; the relative tolerance of the
     given run, 0 under fixed steps; and a factor, 1, or 4/3 under fixed steps, which are halved. The
@@ -611,10 +626,10 @@ def _more_accurate_run(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, 
     if setup.controller is None:
         rtol = jnp.asarray(setup.rtol, ts.dtype)
         less = jnp.maximum(_CLOSER * rtol, _DEEPEST * eps)
-        cuts = sudden
+        cuts = sudden_times
         if setup.seeks_stops:
             parts = jnp.arange(1, _CUTS).astype(ts.dtype) / _CUTS
-            cuts = jnp.concatenate([ts[0] + (ts[-1] - ts[0]) * parts, sudden])
+            cuts = jnp.concatenate([ts[0] + (ts[-1] - ts[0]) * parts, sudden_times])
         new = dict(rtol=less, atol=setup.atol * (less / rtol), cuts=cuts if cuts.size else None)
         return dataclasses.replace(setup, **new), rtol, 1.0
     pid = lambda node: isinstance(node, dfx.PIDController)  # noqa: E731
@@ -624,7 +639,7 @@ def _more_accurate_run(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, 
         both = less, found[0].atol * (less / found[0].rtol)
         where = lambda s: (inside(s.controller)[0].rtol, inside(s.controller)[0].atol)  # noqa: E731
         setup = eqx.tree_at(where, setup, both)
-        setup = dataclasses.replace(setup, cuts=sudden) if sudden.size else setup
+        setup = dataclasses.replace(setup, cuts=sudden_times) if sudden_times.size else setup
         return setup, jnp.asarray(found[0].rtol, ts.dtype), 1.0
     if not isinstance(setup.controller, dfx.ConstantStepSize):
         raise TypeError(
@@ -663,7 +678,7 @@ class FunctionError(eqx.Module):
 
     @property
     def known(self) -> Bool[Array, ""]:
-        """Return whether the error of the derivative is below half of the derivative's length.
+        """Return whether the length of the derivative's error is below half of the derivative's.
 
         If it is not, as in chaos, the derivative means nothing, even if it is finite.
         """
@@ -748,7 +763,10 @@ def error_of(
         def neighbours() -> Any:
             rng = np.random.default_rng(0)
             near = jax.tree.map(
-                lambda leaf: _copies_changed_in_last_digit(leaf, rng, difference.size_of(leaf)), x
+                lambda leaf: _copies_changed_in_last_digit(
+                    leaf, rng, difference.absolute_or_one_if_all_zero(leaf)
+                ),
+                x,
             )
             others = jax.vmap(both, (0, None))(near, first)
             changes = jax.tree.map(lambda a, b: a - b[None], others, answer)
@@ -761,11 +779,13 @@ def error_of(
         return FunctionError(value, whole[0], derivative, whole[1]), two[0][1]
 
     error, closer = stated(x, first, second)
-    step, sides = difference.sides_of(x, error.value, error.value_error, error.derivative)
-    values = difference.values_at(eqx.filter_jit(value), sides, second)
-    slopes = difference.slopes_of(x, closer, step, sides, values, error)
-    difference.warn_of_slopes(slopes)
-    missed = difference.errors_of_numbers(slopes)
+    step, sides = difference.step_and_two_points(
+        x, error.value, error.value_error, error.derivative
+    )
+    values = difference.values_at_two_points(eqx.filter_jit(value), sides, second)
+    slopes = difference.slopes_by_derivative_and_values(x, closer, step, sides, values, error)
+    difference.warn_if_slopes_differ(slopes)
+    missed = difference.derivative_error_from_slopes(slopes)
     derivative_error = jax.tree.map(jnp.hypot, error.derivative_error, missed)
     return dataclasses.replace(error, derivative_error=derivative_error)
 
@@ -799,7 +819,8 @@ def _copies_changed_in_last_digit(leaf: Array, rng: np.random.Generator, size: A
     shape = (_NEIGHBOURS + 1) // 2, *leaf.shape
     # The change is at least half a unit, because a smaller change would often be rounded away.
     # Numbers are changed up in one copy and down in another: as a function of the last digits, the
-    # result of a long motion is a staircase, and a change to one side may stay on the same stair.
+    # result of a long motion is piecewise constant, and a change to one side may stay on the same
+    # piece.
     noise = rng.uniform(0.5, 1.0, shape) * rng.choice([-1.0, 1.0], shape)
     noise = np.concatenate([noise, -noise])[:_NEIGHBOURS]
     if leaf.ndim > 1 and leaf.shape[-1] == leaf.shape[-2]:

@@ -29,7 +29,7 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
     y0: Any
     coefficients: Any
 
-    def evaluate(self, t0: RealLike, t1: RealLike | None = None, left: bool = True) -> Any:
+    def evaluate(self, t0: RealLike, t1: RealLike | None = None, left: bool = True) -> PyTree:
         """Return the state at the time `t0`, or, with `t1`, its change from `t0` to `t1`."""
         if t1 is not None:
             return jax.tree.map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
@@ -41,7 +41,7 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
         return project_to_group(jax.tree.map(value, self.y0, self.coefficients))
 
 
-def direction_and_length(
+def direction_and_length_of_step(
     terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike
 ) -> tuple[Array, Array]:
     """Return the direction of a step of diffrax, 1 or −1, and its length, s.
@@ -57,14 +57,19 @@ def direction_and_length(
     return way, way * h
 
 
-def cubic_rows(rise: Any, h: Any, left: Any, right: Any) -> tuple[Any, Any, Any]:
+def cubic_coefficients(
+    change: Array, h: Array, left_slope: Array, right_slope: Array
+) -> tuple[Array, Array, Array]:
     """Return the three coefficients of a cubic polynomial that interpolates within a step.
 
-    They are the rows F0, F1 and F2 of `runge_kutta.nested`. The cubic changes by `rise` over the
-    step, whose length is `h`, s; its slopes at the start and the end of the step are `left` and
-    `right`. All but `h` are arrays of the shape of a state, or of one array of it.
+    They are the coefficients F0, F1 and F2 of `runge_kutta.nested`, which evaluates the polynomial.
+
+    - `change`: the change of the polynomial over the step, an array of a state.
+    - `h`: the length of the step, s.
+    - `left_slope`, `right_slope`: the slopes of the polynomial at the start and the end of the
+      step, with the shape of `change`.
     """
-    return rise, h * left - rise, 2 * rise - h * (left + right)
+    return change, h * left_slope - change, 2 * change - h * (left_slope + right_slope)
 
 
 class AbstractExplicit(dfx.AbstractAdaptiveSolver):
@@ -99,7 +104,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
     ) -> Any:
         validation.one_dtype(y0, "state")
         numbers, tree = ravel_pytree(y0)
-        way, h = direction_and_length(terms, t0, t1)
+        way, h = direction_and_length_of_step(terms, t0, t1)
 
         def field(_: Any, t: Any, y: Array) -> Array:
             return way.astype(y.dtype) * ravel_pytree(terms.vf(t, tree(y), args))[0]
@@ -173,7 +178,10 @@ class DormandPrince8(AbstractExplicit):
 
 
 def require_explicit(solver: AbstractExplicit | None) -> AbstractExplicit:
-    """Return the solver, or `DormandPrince8` for `None`; refuse a solver that is not explicit."""
+    """Return the solver, or `DormandPrince8` for `None`.
+
+    Raise `TypeError` for a solver that is no explicit method of `rigidjax.solvers`.
+    """
     solver = DormandPrince8() if solver is None else solver
     wanted = "an explicit method of rigidjax.solvers"
     return _checks.require_instance(solver, AbstractExplicit, "solver", requirement=wanted)

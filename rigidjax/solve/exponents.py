@@ -137,7 +137,7 @@ def lyapunov_exponents(
     return _exponents_of_run(how, field, state0, begin, length, rtol, atol)
 
 
-def _small_product(a: Array, b: Array) -> Array:
+def _product_of_small_matrices(a: Array, b: Array) -> Array:
     """Return the product `a @ b` of small matrices, in a form that XLA fuses with other code.
 
     - `a`, `b`: two matrices, (n, m) and (m, k), of any sizes n, m and k. The result is (n, k).
@@ -147,7 +147,7 @@ def _small_product(a: Array, b: Array) -> Array:
 
 @eqx.filter_jit
 def _exponents_of_run(
-    options: Any,
+    options: tuple[AbstractExplicit, int, int, int, int],
     field: Callable[..., Any],
     state0: Any,
     t0: Array,
@@ -183,12 +183,16 @@ def _exponents_of_run(
 
         # The frame is held orthonormal to second order: the equations of a frame that is not
         # orthonormal are unstable.
-        frame = 1.5 * frame - 0.5 * _small_product(frame, _small_product(frame.T, frame))
+        frame = 1.5 * frame - 0.5 * _product_of_small_matrices(
+            frame, _product_of_small_matrices(frame.T, frame)
+        )
         push = jax.linearize(rate, jnp.zeros(frame.shape[0], t.dtype))[1]
         pushed = jax.vmap(push, -1, -1)(frame)
-        grown = _small_product(frame.T, pushed)
+        grown = _product_of_small_matrices(frame.T, pushed)
         upper = jnp.triu(grown) + jnp.tril(grown, -1).T
-        return Coupled(slope, (pushed - _small_product(frame, upper), jnp.diagonal(grown)))
+        return Coupled(
+            slope, (pushed - _product_of_small_matrices(frame, upper), jnp.diagonal(grown))
+        )
 
     def interval(carry: Any, i: Array) -> Any:
         state, frame = carry

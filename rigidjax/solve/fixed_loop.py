@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax.motion.torques.inputs import InputRow, delays_of
 from rigidjax.rotation.barrier import platform
@@ -62,7 +62,7 @@ def fixed(
         if isinstance(substeps, int):
             y = march_steps(stepper, h, left, jnp.zeros((), jnp.int32), substeps, y)
         else:
-            y = lax.fori_loop(0, substeps, lambda i, y: step(stepper, h, left, i, y), y)
+            y = lax.fori_loop(0, substeps, lambda i, y: take_equal_step(stepper, h, left, i, y), y)
         return y, y
 
     if last is None:
@@ -70,12 +70,14 @@ def fixed(
     else:
         start = stepper.start
         still = jax.tree.map(lambda a: jnp.broadcast_to(a, (ts.size - 1, *a.shape)), start)
-        rest = first_rows(last, lambda y, i: span(y, (ts[i], ts[i + 1])), start, still)
+        rest = fill_first_rows(last, lambda y, i: span(y, (ts[i], ts[i + 1])), start, still)
     later = jax.vmap(stepper.state)(rest)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y0, later)
 
 
-def first_rows(count: Any, row_of: Callable[..., Any], y: Any, rows: Any) -> Any:
+def fill_first_rows(
+    count: Any, row_of: Callable[[PyTree, Array], tuple[PyTree, PyTree]], y: PyTree, rows: PyTree
+) -> PyTree:
     """Compute the first rows of a table in a loop, and return the table.
 
     **Arguments:**
@@ -95,20 +97,26 @@ def first_rows(count: Any, row_of: Callable[..., Any], y: Any, rows: Any) -> Any
     return lax.fori_loop(zero, jnp.asarray(count, jnp.int32), put, (y, rows))[1]
 
 
-def step(
-    stepper: AnyStepper, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None, before: int = 0
-) -> Any:
+def take_equal_step(
+    stepper: AnyStepper,
+    h: Array,
+    t0: Array,
+    i: Array,
+    y: PyTree,
+    inputs: PyTree = None,
+    first_row: int = 0,
+) -> PyTree:
     """Take one of a sequence of equal steps, and return the numbers of the state after it.
 
     **Arguments:**
 
-    - `stepper`: what takes a step of one body.
+    - `stepper`: an object that takes a step of one body.
     - `h`: the length of each step, s.
     - `t0`: the time at which step number 0 begins, s.
     - `i`: the number of the step.
     - `y`: the numbers that stand for the state before the step, as the stepper carries them.
     - `inputs`: `None`, or an array for each named input of the torque, with one row for each step.
-    - `before`: the step uses row `before + i` of each array of `inputs`.
+    - `first_row`: the step uses row `first_row + i` of each array of `inputs`.
     """
 
     def at(i: Array) -> Array:
@@ -116,12 +124,12 @@ def step(
         # steps to 1e-3 in float32).
         return t0 + i.astype(h.dtype) * h
 
-    now = jax.tree.map(lambda a: _row_at(a, before + i), inputs)
+    now = jax.tree.map(lambda a: _row_or_nearest_row(a, first_row + i), inputs)
     if not stepper.delays:
         return stepper.step(at(i), at(i + 1), h, y, now)
     # A delayed input changes inside the step. The step is therefore taken in parts: one up to the
     # change of each delayed input, and one to the end.
-    parts, early, late = delayed_rows(stepper.delays, h, i, inputs, before)
+    parts, early, late = changes_of_delayed_inputs(stepper.delays, h, i, inputs, first_row)
     edges = jnp.concatenate([jnp.zeros(1, h.dtype), jnp.sort(parts), jnp.ones(1, h.dtype)])
 
     def part(y: Any, ends: tuple[Array, Array]) -> tuple[Any, None]:
@@ -137,10 +145,10 @@ def step(
     return lax.scan(part, y, (edges[:-1], edges[1:]))[0]
 
 
-def delayed_rows(
-    delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: Any, before: int
+def changes_of_delayed_inputs(
+    delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: PyTree, first_row: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Return where within a step each delayed input changes, and its values before and after.
+    """Return where within a step each delayed input changes, and its values before and after that.
 
     An input of a torque is constant during each step; if it is delayed, it changes within a step.
 
@@ -150,7 +158,7 @@ def delayed_rows(
     - `h`: the length of each step, s.
     - `i`: the number of the step.
     - `inputs`: an array for each named input, with one row for each step.
-    - `before`: row `before + i` of an array belongs to step `i`.
+    - `first_row`: row `first_row + i` of an array belongs to step `i`.
 
     **Returns** three things: the places (m,) of the changes, from 0 at the start of the step to 1
     at its end; a list of the m values before the changes; and a list of the m values after them.
@@ -160,30 +168,33 @@ def delayed_rows(
         steps = delay.astype(h.dtype) / h
         whole = lax.stop_gradient(jnp.floor(steps))
         parts.append(steps - whole)
-        last = before + i - whole.astype(jnp.int32)
-        early.append(_row_at(inputs[name], last - 1))
-        late.append(_row_at(inputs[name], last))
+        last = first_row + i - whole.astype(jnp.int32)
+        early.append(_row_or_nearest_row(inputs[name], last - 1))
+        late.append(_row_or_nearest_row(inputs[name], last))
     return jnp.stack(parts), early, late
 
 
-def inputs_at_start(law: Any, h: Array, inputs: Any) -> Any:
-    """Return the values of the inputs of a torque at the start of a run.
+def torque_inputs_at_start(torque: Any, h: Array, inputs: PyTree) -> PyTree:
+    """Return the values that the inputs of a torque have at the start of a run.
 
-    `law` is the torque; `h` is the length of a step, s; `inputs` has an array for each named input,
-    with one row for each step. A delayed input has its value at the start. The result is in the
-    form that `bind` takes, which sets the inputs of a torque.
+    A delayed input still has an earlier value then. The result is in the form that `bind` takes,
+    the function that sets the inputs of a torque.
+
+    - `torque`: the torque.
+    - `h`: the length of a step, s.
+    - `inputs`: an array for each named input, with one row for each step.
     """
-    delays = delays_of(law)
+    delays = delays_of(torque)
     now = jax.tree.map(lambda a: a[0], inputs)
     if not delays:
         return now
-    parts, early, late = delayed_rows(delays, h, jnp.zeros((), jnp.int32), inputs, 0)
+    parts, early, late = changes_of_delayed_inputs(delays, h, jnp.zeros((), jnp.int32), inputs, 0)
     values = [jnp.where(p > 0, a, b) for p, a, b in zip(parts, early, late, strict=True)]
     return InputRow(now, tuple(values))
 
 
-def _row_at(a: Array, i: Any) -> Array:
-    """Return the element `i` (a row) of an array `a` along its first axis.
+def _row_or_nearest_row(a: Array, i: Any) -> Array:
+    """Return row `i` of an array `a` along its first axis.
 
     If `i` lies before the first or after the last row, the first or the last row is returned.
     """
@@ -191,13 +202,14 @@ def _row_at(a: Array, i: Any) -> Array:
 
 
 def march_steps(
-    stepper: AnyStepper, h: Array, t0: Array, first: Array, count: int, y: Any, inputs: Any = None
-) -> Any:
+    stepper: AnyStepper, h: Array, t0: Array, first: Array, count: int, y: PyTree,
+    inputs: PyTree = None,
+) -> PyTree:  # fmt: skip
     """Take many equal steps one after another, and return the numbers of the state after them.
 
     **Arguments:**
 
-    - `stepper`: what takes a step of one body.
+    - `stepper`: an object that takes a step of one body.
     - `h`: the length of each step, s.
     - `t0`: the time at which step number 0 begins, s.
     - `first`, `count`: the number of the first step that is taken, and how many steps are taken.
@@ -208,11 +220,13 @@ def march_steps(
     pieces are stored; the states within a piece are stored for one piece at a time.
     """
     if platform() != "cpu":
-        return in_pieces(lambda y, i: step(stepper, h, t0, i, y, inputs), first, count, y)
+        return in_pieces(
+            lambda y, i: take_equal_step(stepper, h, t0, i, y, inputs), first, count, y
+        )
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def one(y: Any, i: Array) -> tuple[Any, None]:
-        return step(stepper, h, t0, i, y, inputs), None
+        return take_equal_step(stepper, h, t0, i, y, inputs), None
 
     @functools.partial(jax.checkpoint, prevent_cse=False, static_argnums=2)
     def some(y: Any, begin: Array, many: int) -> Any:

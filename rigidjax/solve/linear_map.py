@@ -26,9 +26,9 @@ _ZERO: Any = ad.Zero
 
 
 def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) -> Arrays:
-    """Call a function that is linear in some of its arguments, with a given transpose.
+    """Call a function that is linear in some of its arguments, and give it a transpose.
 
-    Reverse mode then calls the given transpose and does not transpose the function itself.
+    Reverse mode then calls this transpose, and does not transpose the function itself.
 
     **Arguments:**
 
@@ -50,32 +50,38 @@ def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) 
     return _linear_map.bind(*given, *tangents, function=function, transposed=transposed, **how)
 
 
-def as_known(known: Any, moved: Any) -> Any:
-    """Return the numbers `known` with the derivatives, of every order, of the numbers `moved`.
+def known_with_derivatives_of(known: PyTree, recomputed: PyTree) -> PyTree:
+    """Return known numbers, with the derivatives of the same numbers, computed once more.
 
-    `moved` are the same numbers, computed once more for their derivatives. The values of `moved`
-    may be NaN, and so may the derivatives.
+    Derivatives of every order are those of `recomputed`. Its values are not used, and may be NaN;
+    its derivatives may be NaN, too.
+
+    - `known`: a tree of arrays, the known numbers.
+    - `recomputed`: a tree of the same structure, whose arrays have derivatives.
     """
-    return jax.tree.map(_with_derivatives_of, known, moved)
+    return jax.tree.map(_array_with_derivatives_of, known, recomputed)
 
 
 @jax.custom_jvp
-def _with_derivatives_of(known: Array, moved: Array) -> Array:
-    """Return the array `known` with the derivatives of `moved`, another array of its shape."""
-    return match_batch_axes(known, (known, moved))
+def _array_with_derivatives_of(known: Array, recomputed: Array) -> Array:
+    """Return the array `known`, with the derivatives of an array `recomputed` of equal shape."""
+    return match_batch_axes(known, (known, recomputed))
 
 
-@_with_derivatives_of.defjvp
-def _with_derivatives_of_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-    return _with_derivatives_of(*primals), tangents[1]
+@_array_with_derivatives_of.defjvp
+def _array_with_derivatives_of_jvp(
+    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> Any:
+    return _array_with_derivatives_of(*primals), tangents[1]
 
 
-def nan_derivatives(tree: Any, inputs: Any) -> Any:
-    """Return `tree`, but numbers that are not finite get NaN derivatives with respect to `inputs`.
+def nan_derivatives_where_not_finite(tree: PyTree, inputs: PyTree) -> PyTree:
+    """Return the numbers of `tree`; those that are not finite get NaN as derivatives.
 
-    Forward and reverse mode both give NaN. This is needed because a state that a run did not reach
-    is set to NaN by `jnp.where`, whose derivative would be 0, which is wrong. If such a number is
-    not used, its cotangent is 0, and it does not change the gradient.
+    The derivatives are those with respect to all numbers in `inputs`, in forward and in reverse
+    mode. A state that a run did not reach is set to NaN by `jnp.where`, whose derivative would be
+    0, which is wrong. If such a number is not used, its cotangent is 0, and it does not change the
+    gradient.
     """
     smooth, rest = eqx.partition(tree, eqx.is_inexact_array)
     outs, structure = jax.tree.flatten(smooth)
@@ -85,10 +91,10 @@ def nan_derivatives(tree: Any, inputs: Any) -> Any:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _with_nan_derivatives(count: int, *numbers: Array) -> Arrays:
-    """Return the first `count` of the arrays `numbers`, with NaN derivatives where not finite.
+    """Return the first `count` of the arrays `numbers`, some of them with NaN as derivatives.
 
     The values are returned as they are. The other arrays in `numbers` are the inputs: a number that
-    is NaN or infinite gets NaN as its derivative with respect to all of them.
+    is NaN or infinite gets NaN as its derivative with respect to all of the inputs.
     """
     return match_batch_axes(list(numbers[:count]), numbers)
 
@@ -125,7 +131,7 @@ def _linear_map_impl(*args: Any, function: Map, **_: Any) -> Arrays:
 
 
 @_linear_map.def_abstract_eval
-def _linear_map_abstract_eval(*_: Any, results: Any, **__: Any) -> Any:
+def _linear_map_abstract_eval(*_: Any, results: Any, **__: Any) -> list[ShapedArray]:
     """Return the shapes and dtypes of the results of a linear map, as JAX wants them for a trace.
 
     `results` is a tuple of pairs (shape, dtype), one for each result.
@@ -161,14 +167,14 @@ def _linear_map_jvp(
             return jax.jvp(lambda *g: function(*g, *along), given, tuple(moved))[1]
 
         moved = [t for t, w in zip(tangents, which, strict=False) if w]
-        parts.append(linear_map(push, refuse, list(primals), moved))
+        parts.append(linear_map(push, raise_for_missing_transpose, list(primals), moved))
     if not parts:
         return out, [_ZERO.from_primal_value(o) for o in out]
     return out, [sum(more, first) for first, *more in zip(*parts, strict=True)]
 
 
-def refuse(*_: Any) -> Arrays:
-    """Raise `TypeError`, in the place of the transpose of a map that has no transpose."""
+def raise_for_missing_transpose(*_: Any) -> Arrays:
+    """Raise `TypeError`: this function stands for the transpose of a map that has no transpose."""
     raise TypeError(
         "second derivatives through a solver are forward over reverse: wanted "
         "jax.jacfwd(jax.grad(f)) or jax.hessian(f), got reverse mode over a derivative, such as "
@@ -187,7 +193,7 @@ def _linear_map_transpose(cotangents: Any, *args: Any, **params: Any) -> Any:
     number = params["number"]
     given = args[:number]
     if any(ad.is_undefined_primal(g) for g in given):
-        refuse()
+        raise_for_missing_transpose()
     whole = [
         jnp.zeros(*result) if isinstance(c, ad.Zero) else c
         for c, result in zip(cotangents, params["results"], strict=True)

@@ -20,13 +20,17 @@ from rigidjax.motion.equations import AttitudeEquations, project_to_group
 from rigidjax.motion.torques.base import may_read_attitude
 from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import quaternion_product
-from rigidjax.solve.components import join, split
-from rigidjax.solve.equal_steps import change_and_slope
-from rigidjax.solve.explicit import NestedInterpolation, cubic_rows, direction_and_length
+from rigidjax.solve.components import join_scalars, split_into_scalars
+from rigidjax.solve.equal_steps import change_and_slope_at_start
+from rigidjax.solve.explicit import (
+    NestedInterpolation,
+    cubic_coefficients,
+    direction_and_length_of_step,
+)
 from rigidjax.solve.tableaus import KUTTA4
 
 
-def change_and_turn(
+def momentum_change_and_turn(
     slope: Callable[[Any, Triple], Triple], rate: Callable[[Triple], Triple],
     t: Any, end: Any, h: Array, p: Triple,
 ) -> tuple[Triple, Four]:  # fmt: skip
@@ -47,7 +51,7 @@ def change_and_turn(
     1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas, Nørsett and Zanna 2000,
     doi:10.1017/S0962492900002154, section 5.
     """
-    change, first = change_and_slope(KUTTA4, slope, t, h, p, end)
+    change, first = change_and_slope_at_start(KUTTA4, slope, t, h, p, end)
     after = barrier(add(p, change))
     last = slope(end, after)
     middle = tuple(
@@ -75,7 +79,7 @@ class Magnus4(dfx.AbstractSolver):
     The steps have a fixed length. At equal steps this method does less work than
     `rigidjax.solvers.RungeKutta4` and has a smaller error; it is the default of
     `rigidjax.batch.rollout`. A step should turn the body by less than a radian. Source: Magnus
-    1954, doi:10.1002/cpa.3160070404; see `change_and_turn`.
+    1954, doi:10.1002/cpa.3160070404; see `momentum_change_and_turn`.
 
     **Raises:** `TypeError` for a torque that depends on the attitude, or another state.
 
@@ -102,7 +106,9 @@ class Magnus4(dfx.AbstractSolver):
         args: PyTree,
     ) -> None:
         field, _ = field_of(terms)
-        require_blind(require_attitude("Magnus4", field, y0, "RungeKutta4").euler.torque)
+        require_independent_of_attitude(
+            require_attitude_equations("Magnus4", field, y0, "RungeKutta4").euler.torque
+        )
 
     def step(
         self,
@@ -114,27 +120,31 @@ class Magnus4(dfx.AbstractSolver):
         solver_state: PyTree,
         made_jump: Bool[ArrayLike, ""],
     ) -> Any:
-        start = split(y0)
+        start = split_into_scalars(y0)
         q, omega = start[:4], start[4:]
-        way, h = (part.astype(y0.omega.dtype) for part in direction_and_length(terms, t0, t1))
+        way, h = (
+            part.astype(y0.omega.dtype) for part in direction_and_length_of_step(terms, t0, t1)
+        )
         # The law has declared that it does not read the attitude. It gets NaN as the attitude, so
         # that the result is NaN if the law reads the attitude nevertheless.
         nowhere = jnp.full_like(y0.q, jnp.nan)
 
         def slope(t: Any, omega: Triple) -> Triple:
-            return split(way * terms.vf(t, Attitude(nowhere, jnp.stack(omega)), args).omega)
+            return split_into_scalars(
+                way * terms.vf(t, Attitude(nowhere, jnp.stack(omega)), args).omega
+            )
 
         def rate(omega: Triple) -> Triple:
             a, b, c = omega
             return way * a, way * b, way * c
 
-        change, turn = change_and_turn(slope, rate, t0, t1, h, omega)
-        change = join((*quaternion_product(q, turn), *change), y0)
+        change, turn = momentum_change_and_turn(slope, rate, t0, t1, h, omega)
+        change = join_scalars((*quaternion_product(q, turn), *change), y0)
         y1 = project_to_group(jax.tree.map(jnp.add, y0, change))
         left, right = terms.vf(t0, y0, args), terms.vf(t1, y1, args)
 
         def rows(a: Array, b: Array, k: Array, m: Array) -> Array:
-            return jnp.stack(cubic_rows(b - a, way * h, k, m))
+            return jnp.stack(cubic_coefficients(b - a, way * h, k, m))
 
         dense = dict(y0=y0, coefficients=jax.tree.map(rows, y0, y1, left, right))
         return y1, None, dense, None, dfx.RESULTS.successful
@@ -143,28 +153,32 @@ class Magnus4(dfx.AbstractSolver):
         return terms.vf(t0, y0, args)
 
 
-def require_attitude(name: str, field: Any, y0: PyTree, instead: str) -> AttitudeEquations:
-    """Return a vector field after a check that it is that of an attitude (quaternion and rate).
+def require_attitude_equations(
+    solver_name: str, field: Any, y0: PyTree, advised_solver: str
+) -> AttitudeEquations:
+    """Return a vector field after a check that it is that of an attitude and its body rate.
 
     Raise `TypeError` unless `field` is `AttitudeEquations` and the state `y0` is an `Attitude`. The
-    message says that the solver `name` does not fit, and names the solver `instead` to use.
+    message says that the solver `solver_name` does not fit, and names the solver `advised_solver`
+    to use.
     """
     if isinstance(field, AttitudeEquations) and isinstance(y0, Attitude):
         return field
     raise TypeError(
-        f"{name}: wanted AttitudeEquations and an Attitude state, got {type(field).__name__} and "
-        f"{type(y0).__name__}; use {instead}"
+        f"{solver_name}: wanted AttitudeEquations and an Attitude state, got "
+        f"{type(field).__name__} and {type(y0).__name__}; use {advised_solver}"
     )
 
 
-def require_blind(law: Any) -> None:
-    """Raise `TypeError` unless a torque says that it does not read the attitude of the body.
+def require_independent_of_attitude(torque: Any) -> None:
+    """Raise `TypeError` for a torque that may depend on the attitude of the body.
 
-    `law` is the torque; it says so by its member `feels`. `None` stands for no torque.
+    A torque says by its member `feels` that it does not. `None` stands for no torque.
     """
-    if may_read_attitude(law):
+    if may_read_attitude(torque):
         raise TypeError(
-            f"Magnus4: the torque {type(law).__name__} depends on the attitude, or does not say "
-            "what it feels; only time and body rate may enter it: a law of your own says so by "
-            "feels = rigidjax.motion.HasSpin; for others use rigidjax.solvers.RungeKutta4"
+            f"Magnus4: wanted a torque of time and body rate, got {type(torque).__name__}, which "
+            "depends on the attitude, or does not say what it feels; a torque of your own says "
+            "that it reads no attitude by feels = rigidjax.motion.HasSpin; for other torques use "
+            "rigidjax.solvers.RungeKutta4"
         )

@@ -13,7 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import MassProperties, tensor_of, with_tensor
@@ -55,30 +55,34 @@ class ByMomentum(eqx.Module):
 
     A state of the run has the rate Ω̃ = I₀⁻¹ p in the place of the body rate Ω: p = I(t) Ω is the
     momentum, I(t) the inertia at the time t, and I₀ the inertia of the body that `simulate` was
-    given. The method `enter` replaces Ω by Ω̃, and `leave` replaces Ω̃ by Ω.
+    given. The method `replace_rate_by_momentum` replaces Ω by Ω̃, and `restore_body_rate` replaces
+    Ω̃ by Ω.
     """
 
     field: Any  # a `_EquationsUnderChangingInertia`, or the `CoupledEquations` of one
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None) -> Any:
-        return self.field(t, self.leave(t, y))
+        return self.field(t, self.restore_body_rate(t, y))
 
-    def enter(self, t: Any, y: Any) -> Any:
+    def replace_rate_by_momentum(self, t: Any, y: PyTree) -> PyTree:
         """Return the state `y` with its body rate Ω replaced by I₀⁻¹ I(t) Ω, a form of momentum.
 
         I(t) is the inertia at the time `t`, s, and I₀ that of the body that `simulate` was given.
         """
-        return self._with_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
+        return self._replace_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
 
-    def leave(self, t: Any, y: Any) -> Any:
-        """Return the state `y` of the run with body rates: the inverse of `enter`.
+    def restore_body_rate(self, t: Any, y: PyTree) -> PyTree:
+        """Return the state `y` of the run with its body rate, instead of a form of momentum.
 
-        Its rate w becomes Ω = I(t)⁻¹ I₀ w, where I(t) is the inertia at the time `t`, s, and I₀
-        that of the body that `simulate` was given.
+        This is the inverse of `replace_rate_by_momentum`: the rate w of `y` becomes
+        Ω = I(t)⁻¹ I₀ w, where I(t) is the inertia at the time `t`, s, and I₀ that of the body that
+        `simulate` was given.
         """
-        return self._with_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
+        return self._replace_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
 
-    def _with_rate(self, y: Any, new_rate: Callable[..., Array], t: Any) -> Any:
+    def _replace_rate(
+        self, y: PyTree, new_rate: Callable[[Array, Array, Array], Array], t: Any
+    ) -> PyTree:
         """Return the state `y` with its body rate, rad/s, replaced by another one.
 
         `new_rate(I, I₀, w)` computes the new rate from three arrays: the inertia (3, 3) at the time
@@ -98,14 +102,15 @@ class ByMomentum(eqx.Module):
         return eqx.tree_at(lambda s: motion_of(s).omega, y, omega)
 
 
-def by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
-    """Return the equations of motion by momentum if the inertia is a function of time, else `None`.
+def equations_by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
+    """Return the equations of motion by momentum for an inertia that is a function of time.
 
-    `body` and `torque` are those of `simulate`; `state0` is the state at the start, with the body
-    rate. In these equations a multiple of the momentum stands in the place of the body rate, so
-    that nothing jumps where the inertia jumps.
+    In these equations a multiple of the momentum stands in the place of the body rate, so that
+    nothing jumps where the inertia jumps. The result is `None` for an inertia that is constant or
+    depends on more than the time. `body` and `torque` are those of `simulate`; `state0` is the
+    state at the start, with the body rate.
     """
-    if not isinstance(law := momentum_changes(torque), ChangingInertia) or hasattr(
+    if not isinstance(law := changing_inertia_of_torque(torque), ChangingInertia) or hasattr(
         law.inertia, "feels"
     ):
         return None
@@ -113,22 +118,26 @@ def by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
     return ByMomentum(CoupledEquations(field, body) if isinstance(state0, Coupled) else field)
 
 
-def momentum_changes(torque: Any) -> ChangingInertia | None:
-    """Return the law by which the inertia of a body changes with the time, or `None` if none does.
+def changing_inertia_of_torque(torque: Any) -> ChangingInertia | None:
+    """Return the `ChangingInertia` of which a torque consists, or `None` if it is another torque.
 
-    It is the `ChangingInertia` of which the `torque` of `simulate` consists; a `Sum` of this law
-    alone counts, too.
+    A `ChangingInertia` is the law by which the inertia of a body changes with the time; `simulate`
+    takes it in the place of a torque. A `Sum` of this law alone counts, too.
     """
     # The argument may also be a scene of particles or `None`, which are no torques.
     parts = parts_of(torque) if isinstance(torque, ChangingInertia | Sum) else ()
     return parts[0] if len(parts) == 1 and isinstance(parts[0], ChangingInertia) else None
 
 
-def with_body_rates(form: ByMomentum | None, ts: Array, ys: Any) -> Any:
-    """Return the states of a run with body rates, where the run may have used the momentum.
+def with_body_rates(form: ByMomentum | None, ts: Array, ys: PyTree) -> PyTree:
+    """Return the saved states of a run with their body rates.
 
-    `ts` (T,), s, are the saved times, and `ys` the states at these times, with a leading time axis.
-    `form` holds the equations by momentum of the run; if it is `None`, the states already have the
-    body rate.
+    If the inertia is a function of time, the run has used a form of the momentum in the place of
+    the body rate.
+
+    - `form`: the equations by momentum of the run; if it is `None`, the states already have the
+      body rate and are returned as they are.
+    - `ts`: (T,) the saved times, s.
+    - `ys`: the states at these times, with a leading time axis.
     """
-    return ys if form is None else jax.vmap(form.leave)(ts, ys)
+    return ys if form is None else jax.vmap(form.restore_body_rate)(ts, ys)

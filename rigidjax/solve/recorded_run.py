@@ -15,8 +15,8 @@ from jaxtyping import Array
 from rigidjax.solve import adaptive_loop, adjoint
 from rigidjax.solve.adaptive_loop import LoopState, Method, Record, Run
 from rigidjax.solve.adjoint import Smooth
-from rigidjax.solve.batching import Arrays, Layout, in_lanes
-from rigidjax.solve.linear_map import linear_map, refuse
+from rigidjax.solve.batching import Arrays, Layout, run_with_bodies_last
+from rigidjax.solve.linear_map import linear_map, raise_for_missing_transpose
 
 SMOOTH = len(Smooth._fields)
 
@@ -43,7 +43,7 @@ def states_of_run(
     first, state_tree = jax.tree.flatten(state)
     number, smooth = len(constants) + len(first), [*smooth, *(False for _ in first)]
     like = adaptive_loop.initial_loop_state(run._replace(state=state))
-    shapes = jax.eval_shape(adaptive_loop.pack, like)
+    shapes = jax.eval_shape(adaptive_loop.pack_loop_state, like)
     trees = run_tree, state_tree
     # `recorded` returns a list of arrays: the states at the saved times; the loop state at the end,
     # packed into `size` arrays; and the record, which is `size` arrays for its starts, one for its
@@ -54,7 +54,7 @@ def states_of_run(
 
     def mapped(program: Any, linear: int, *args: Any) -> Arrays:
         call = partial(program, method, trees)
-        return in_lanes(call, list(args[:number]), list(args[number:]), linear)
+        return run_with_bodies_last(call, list(args[:number]), list(args[number:]), linear)
 
     answer: Any = jax.custom_jvp(partial(mapped, partial(_run_bodies, False), 0))
     recorded: Any = jax.custom_jvp(partial(mapped, partial(_run_bodies, True), 0))
@@ -76,7 +76,7 @@ def states_of_run(
         push = partial(mapped, partial(_tangents_of_states, moving), len(along))
         given = [*primals, *found[head:]]
         if pull is None:
-            return found, linear_map(push, refuse, given, along)
+            return found, linear_map(push, raise_for_missing_transpose, given, along)
         # Of the arrays of `recorded`, only the states at the saved times and at the end have a
         # transpose.
         back = partial(mapped, partial(pull, moving), 2)
@@ -98,7 +98,7 @@ def states_of_run(
     answer.defjvp(of_answer, symbolic_zeros=True)
     recorded.defjvp(of_record, symbolic_zeros=True)
     between, *end = answer(*constants, *first, *each)
-    return between, adaptive_loop.unpack(end, like)
+    return between, adaptive_loop.unpack_loop_state(end, like)
 
 
 def _method_over_bodies(
@@ -132,13 +132,13 @@ def _method_over_bodies(
     run = run._replace(state=state_tree.unflatten(state[1][count:]))
     constants, layout = constants[:count], layout._replace(shared=layout.shared[:count])
     held, one = lax.stop_gradient(constants), method.control
-    halt = None if method.halt is None else partial(layout.over(method.halt), held)
+    halt = None if method.halt is None else partial(layout.vmap_over_bodies(method.halt), held)
 
     def control(again: bool, *numbers: Any) -> Any:
-        return layout.over(partial(one, again))(held, *numbers)
+        return layout.vmap_over_bodies(partial(one, again))(held, *numbers)
 
     project = jax.vmap(method.project, -1, -1) if layout.bodies else method.project
-    field = layout.over(method.field)
+    field = layout.vmap_over_bodies(method.field)
     method = method._replace(field=field, project=project, halt=halt, control=control)
     return method, run, layout, constants
 
@@ -167,10 +167,14 @@ def _run_bodies(
     if record or (run.between.shape[0] and layout.bodies):
         between, end, kept = adaptive_loop.record_run(method, constants, run)
     elif run.between.shape[0]:
-        between, end = adaptive_loop.states_of_one_body(method, constants, run)
+        between, end = adaptive_loop.run_one_body(method, constants, run)
     else:
-        between, end = run.y0[None][:0], adaptive_loop.end_of_run(method, constants, run)
-    return [between, *adaptive_loop.pack(end), *jax.tree.leaves(kept if record else None)]
+        between, end = run.y0[None][:0], adaptive_loop.loop_state_at_end(method, constants, run)
+    return [
+        between,
+        *adaptive_loop.pack_loop_state(end),
+        *jax.tree.leaves(kept if record else None),
+    ]
 
 
 # Two lists of truth values: whether each constant has a tangent, and whether each array of a run
@@ -204,11 +208,13 @@ def _parts_of_recorded_run(
     method, run, layout, constants = _method_over_bodies(
         method, trees, layout, constants, each[:whole]
     )
-    starts = len(jax.eval_shape(adaptive_loop.pack, adaptive_loop.initial_loop_state(run)))
+    starts = len(
+        jax.eval_shape(adaptive_loop.pack_loop_state, adaptive_loop.initial_loop_state(run))
+    )
     *kept, rows, counts = each[whole : whole + starts + 2]
     there = moving[0][: len(constants)]
     layout, constants = layout.broadcast_to_bodies(constants, there, run.t0)
-    field = layout.over(one)
+    field = layout.vmap_over_bodies(one)
 
     def of_moving(chosen: Arrays, t: Array, y: Array) -> Array:
         rest = iter(chosen)
@@ -241,7 +247,7 @@ def _tangents_of_states(
         moving, method, trees, layout, constants, each
     )
     rest = iter(along[len(chosen) :])
-    smooth = adjoint.smooth_numbers(run)
+    smooth = adjoint.arrays_with_derivatives(run)
     still = zip(smooth, moving[1], strict=False)
     of_run = Smooth(*(next(rest) if moves else jnp.zeros_like(a) for a, moves in still))
 
@@ -272,5 +278,5 @@ def _cotangents_of_inputs(
     method, chosen, run, record, bars = _parts_of_recorded_run(
         moving, method, trees, layout, constants, each
     )
-    total, of_run = adjoint.cotangents(method, chosen, run, record, bars, any(moving[1][:3]))
+    total, of_run = adjoint.cotangents_of_run(method, chosen, run, record, bars, any(moving[1][:3]))
     return [*total, *(a for a, moves in zip(of_run, moving[1], strict=False) if moves)]

@@ -30,12 +30,16 @@ from rigidjax.motion.equations import (
 )  # fmt: skip
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import validation
-from rigidjax.solve.adaptive import integrate
-from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_of_body
+from rigidjax.solve.adaptive import integrate_with_diffrax
+from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_or_nonfinite_input
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.linear_map import nan_derivatives
+from rigidjax.solve.linear_map import nan_derivatives_where_not_finite
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.momentum import by_momentum, momentum_changes, with_body_rates
+from rigidjax.solve.momentum import (
+    changing_inertia_of_torque,
+    equations_by_momentum,
+    with_body_rates,
+)
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.sides import declared_jumps, on_sides
@@ -228,7 +232,8 @@ def solve(
         if scene is not None:
             stats["drift"] = scene.drift(ts, ys)
     inputs = (setup.body, setup.torque, given, ts)
-    return nan_derivatives(ys, inputs), stats, result_of_body(result, setup.body)
+    ys = nan_derivatives_where_not_finite(ys, inputs)
+    return ys, stats, result_or_nonfinite_input(result, setup.body)
 
 
 def _integrate(
@@ -243,9 +248,9 @@ def _integrate(
     of steps; the result of diffrax, which says why the run ended; and the end of the run, a tuple
     of its time, s, its state, and the length of the step that would follow, s.
     """
-    form = by_momentum(setup.body, state0, setup.torque)
+    form = equations_by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
-    state0 = state0 if form is None else form.enter(ts[0], state0)
+    state0 = state0 if form is None else form.replace_rate_by_momentum(ts[0], state0)
     along, jumps, dt0, sign, halt = ts, None, setup.dt0, None, watch
     if setup.seeks_stops:
         sign = setup.sign
@@ -254,7 +259,7 @@ def _integrate(
             jumps = [*jumps, _multiply_by_direction(sign, setup.cuts)]
     elif dt0 is not None:
         dt0 = dt0 * jnp.sign(ts[-1] - ts[0])
-    out = integrate(
+    out = integrate_with_diffrax(
         setup.solver, field, along, state0, setup.step_controller(), jumps=jumps, halt=halt,
         dt0=dt0, max_steps=setup.max_steps, adjoint=setup.adjoint,
         progress_meter=setup.progress_meter,
@@ -264,7 +269,7 @@ def _integrate(
     if out.missed is not None:
         stats["switches_missed"] = out.missed
     last_time = _multiply_by_direction(sign, out.last_time)
-    last = out.last if form is None else form.leave(last_time, out.last)
+    last = out.last if form is None else form.restore_body_rate(last_time, out.last)
     return with_body_rates(form, ts, out.ys), stats, out.result, (last_time, last, out.next_step)
 
 
@@ -314,7 +319,7 @@ def raise_unless_complete(ys: Any, result: dfx.RESULTS, torque: Any = None) -> A
     `result` is the result of diffrax, which says why the run ended; `torque` is the torque, which
     decides on the advice in the message. The end by an event is no error.
     """
-    if momentum_changes(torque) is not None:
+    if changing_inertia_of_torque(torque) is not None:
         ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
     shortest = _shortest_step_words(jax.tree.leaves(ys)[0].dtype)
@@ -338,7 +343,7 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
     if not _checks.is_known((missed, state0, ts)) or not np.any(np.asarray(missed)):
         return
     state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
-    form = by_momentum(setup.body, state0, setup.torque)
+    form = equations_by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
     analysis = analysis_of(trace_program(lambda t, y: field(t, y, None), ts[0], state0).closed)
     lines = [] if analysis is None else list(dict.fromkeys(s.line for s in analysis.switches))

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve.batching import Arrays, lift
+from rigidjax.solve.batching import Arrays, add_leading_axes
 from rigidjax.solve.tableaus import Tableau
 
 # field(constants, t, y) → dy/dt, for t (*bodies), y (n, *bodies).
@@ -120,7 +120,7 @@ def stages(
         number = jnp.where(dense, number, np.int32(w.plain))
     begun = (times, places, empty)
     times, places, slopes = lax.fori_loop(np.int32(0), number, stage, begun)
-    h = lift(step.h.astype(step.y.dtype), step.y)
+    h = add_leading_axes(step.h.astype(step.y.dtype), step.y)
     return Stages(times, places, slopes, step.y + h * _weighted_sum(w.b, slopes), number)
 
 
@@ -139,7 +139,9 @@ def _stage(
     A state has n numbers; `*bodies` is one last axis for the bodies of a batch, or no axis.
     """
     # The dtype of the time may differ from that of the state.
-    y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _weighted_sum(w.a[i], slopes)
+    y = step.y + add_leading_axes(step.h.astype(step.y.dtype), step.y) * _weighted_sum(
+        w.a[i], slopes
+    )
     t = jnp.where(w.last[i], step.end, step.t + w.c[i].astype(step.t.dtype) * step.h)
     return t, y, field(constants, t, y)
 
@@ -191,7 +193,7 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     # would be a kernel of its own.
     rows = weights(tableau, dtype).errors[:, : slopes.shape[1]]
     found = jnp.sum(rows.reshape(len(rows), 1, -1, *ones) * slopes[None], 2)
-    found = lift(h.astype(dtype), found) * found
+    found = add_leading_axes(h.astype(dtype), found) * found
     if len(rows) == 1:
         return found[0]
     which = np.repeat(np.eye(len(sizes)), sizes, axis=1)
@@ -228,7 +230,7 @@ def pull_back(
         m = there.number - 1 - i
         below, seeds = both
         seed = w.b[m] * cotangent + _weighted_sum(w.a[:, m], below)
-        bar = lift(h, seed) * seed
+        bar = add_leading_axes(h, seed) * seed
         if of_slopes is not None:
             bar = bar + of_slopes[:, m]
         pull = jax.vjp(lambda y: field(constants, there.times[m], y), there.places[:, m])[1]
@@ -242,7 +244,7 @@ def pull_back(
     every = jax.vmap(lambda c, t, y: field(c, t, y), (0, 0, 1), 1)
     own = [jnp.broadcast_to(c, (count, *c.shape)) for c in constants]
     pull = jax.vjp(lambda c, t: every(c, t, there.places), own, there.times)[1]
-    bars = lift(h, seeds) * seeds
+    bars = add_leading_axes(h, seeds) * seeds
     by_own, by_times = pull(bars if of_slopes is None else bars + of_slopes)
     by_constants = [jnp.sum(by, 0) for by in by_own]
     by_length = jnp.sum(seeds * there.slopes, (0, 1)).astype(by_times.dtype)

@@ -16,8 +16,8 @@ from rigidjax.frames import AbstractScene, MovingFrame
 from rigidjax.motion.coupled import Coupled
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
-from rigidjax.solve.crossings import Event, solve_until, start_with_checked_condition
-from rigidjax.solve.error import estimate_error_of_run, solve_to
+from rigidjax.solve.crossings import Event, check_condition_and_add_torque_states, solve_until_event
+from rigidjax.solve.error import estimate_error_of_run, solve_to_accuracy
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.run import (
@@ -257,7 +257,7 @@ def _solve_to_accuracy(
     - `accuracy`: the largest error that is allowed at the saved times: rad for rotations; for any
       other array of the state, a part of its largest length in the run.
     """
-    found, run, search = solve_to(setup, state0, times, jnp.asarray(accuracy, times.dtype))
+    found, run, search = solve_to_accuracy(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
     sol = _solve_run(found, event, state0, times, None if event is not None else run)
     error = estimate_error_of_run(found, times, sol._states, sol.stats["num_steps"], search)
@@ -285,8 +285,12 @@ def _solve_run(setup: Any, event: Any, state0: Any, times: Array, run: Any = Non
             ys, stats, result = solve(setup, state0, times)
         else:
             event = event if isinstance(event, Event) else Event(event)
-            state0 = start_with_checked_condition(event, setup.body, state0, setup.torque, times[0])
-            ys, stats, result, event_time, event_state = solve_until(setup, event, state0, times)
+            state0 = check_condition_and_add_torque_states(
+                event, setup.body, state0, setup.torque, times[0]
+            )
+            ys, stats, result, event_time, event_state = solve_until_event(
+                setup, event, state0, times
+            )
     except RuntimeError as error:
         raise words_of_steps(
             setup, state0, times, _checks.error_without_equinox_text(error)

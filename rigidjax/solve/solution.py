@@ -19,7 +19,7 @@ from rigidjax.motion.conserved import drift
 from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.manifold import dimension, minus_small, parts_by_name, plus, rotation_slices
 from rigidjax.motion.torques.states import require_no_own_states
-from rigidjax.solve.error import Error, estimate_error_of_run, largest_in_run
+from rigidjax.solve.error import Error, estimate_error_of_run, largest_length_in_run
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, solve
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
@@ -275,7 +275,7 @@ def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Arra
     start = jax.tree.map(lambda leaf: leaf[0], ys)
     each = parts_by_name(start, jnp.ones(dimension(start), ts.dtype)).values()
     both = zip(each, jax.tree.leaves(ys), strict=True)
-    sizes = jnp.concatenate([a.reshape(-1) * largest_in_run(b) for a, b in both])
+    sizes = jnp.concatenate([a.reshape(-1) * largest_length_in_run(b) for a, b in both])
     sizes = jnp.where(sizes > 0, sizes, 1)
     # A turn by δθ changes q by half of δθ.
     for turned in rotation_slices(start):

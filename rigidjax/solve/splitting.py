@@ -33,8 +33,12 @@ from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import evaluate_torque, may_read_rate
 from rigidjax.rotation import quaternion
-from rigidjax.solve.explicit import NestedInterpolation, cubic_rows, direction_and_length
-from rigidjax.solve.magnus import require_attitude
+from rigidjax.solve.explicit import (
+    NestedInterpolation,
+    cubic_coefficients,
+    direction_and_length_of_step,
+)
+from rigidjax.solve.magnus import require_attitude_equations
 from rigidjax.solve.tableaus import parse_numbers
 
 
@@ -242,7 +246,7 @@ def frame_of(field: Any, y0: Any) -> Frame:
     body rate.
     """
     # If the torque reads the body rate, a kick is no exact flow, and the order would fall to 1.
-    torque = require_attitude("Splitting", field, y0, "DormandPrince8").euler.torque
+    torque = require_attitude_equations("Splitting", field, y0, "DormandPrince8").euler.torque
     if may_read_rate(torque):
         raise TypeError(
             f"Splitting: the torque {type(torque).__name__} depends on the body rate (damping, a "
@@ -348,7 +352,7 @@ def _quintic_coefficients(
     **Returns** a tree like the state, whose arrays (5, …) have the five coefficients in the form
     that `runge_kutta.nested`, which evaluates the polynomial, takes.
     """
-    way, length = direction_and_length(terms, t0, t1)
+    way, length = direction_and_length_of_step(terms, t0, t1)
     h = way * length
 
     def slopes(t: Any, y: Any) -> tuple[Any, Any]:
@@ -363,7 +367,7 @@ def _quintic_coefficients(
     # changes, which the sign of `h` does; second derivatives keep their sign.
     def rows(a: Array, b: Array, k: Array, m: Array, u: Array, v: Array) -> Array:
         step = jnp.asarray(h, a.dtype)
-        rise, second, third = cubic_rows(b - a, step, k, m)
+        rise, second, third = cubic_coefficients(b - a, step, k, m)
         fourth = 0.5 * (step**2 * u + 2 * second - 2 * third)
         fifth = 0.5 * (step**2 * v + 2 * second + 4 * third) - fourth
         return jnp.stack([rise, second, third, fourth, fifth])

@@ -14,9 +14,9 @@ from jaxtyping import Array, ArrayLike, PyTree
 from rigidjax._types import RealLike
 from rigidjax.solve.adaptive_loop import (
     NONFINITE,
+    acceptance_and_next_step_size,
     finite,
-    next_step,
-    previous_number,
+    previous_float,
     row_of_each_body,
     starting_step,
 )
@@ -98,7 +98,7 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
             return error / (self.atol + self.rtol * jnp.maximum(jnp.abs(left), jnp.abs(right)))
 
         still = lax.stop_gradient((y_error, y0, y1_candidate))
-        keep, length = next_step(
+        keep, length = acceptance_and_next_step_size(
             self.norm(jax.tree.map(over_tolerance, *still)), error_order, t1 - t0
         )
         left = jnp.where(keep, t1, t0)
@@ -281,7 +281,7 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         none = jnp.full_like(self.stops[:1], jnp.inf)
         stop = row_of_each_body(jnp.concatenate([self.stops, none]), index)
         still = lax.stop_gradient(stop)
-        gap = jnp.where(jnp.isinf(still), 0, previous_number(still) - still)
+        gap = jnp.where(jnp.isinf(still), 0, previous_float(still) - still)
         return stop, stop + gap
 
     def adapt_step_size(

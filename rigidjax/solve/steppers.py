@@ -30,10 +30,10 @@ from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import quaternion_product, squared_quaternion_length
 from rigidjax.rotation.linalg3 import components
 from rigidjax.solve import splitting
-from rigidjax.solve.components import Atoms, join, split
-from rigidjax.solve.equal_steps import StepWithLoopedStages, change_in
+from rigidjax.solve.components import Atoms, join_scalars, split_into_scalars
+from rigidjax.solve.equal_steps import StepWithLoopedStages, change_in_step
 from rigidjax.solve.explicit import AbstractExplicit, RungeKutta4
-from rigidjax.solve.magnus import Magnus4, change_and_turn, require_blind
+from rigidjax.solve.magnus import Magnus4, momentum_change_and_turn, require_independent_of_attitude
 from rigidjax.solve.splitting import AbstractSplitting
 
 # Runs of at least this many steps use `Carrying`, with which a run without derivatives takes a
@@ -130,7 +130,7 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
     turning = _inertia_and_torque(field, y0)
     solver = cheapest(field) if solver is None else solver
     if isinstance(solver, Magnus4) and isinstance(y0, Attitude) and turning is not None:
-        require_blind(turning.torque)
+        require_independent_of_attitude(turning.torque)
         return (
             _stepper_of_free_body(turning.inertia, y0)
             if turning.torque is None
@@ -147,8 +147,12 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
         )
     if turning is not None:
         return _stepper_of_explicit_method(solver, turning, y0)
-    slope = lambda inputs: lambda t, y: split(bind(field, inputs)(t, join(y, y0), None))  # noqa: E731
-    return _stepper_of_slope(solver, slope, split(y0), lambda y: join(y, y0), y0)
+
+    def slope_under(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
+        return lambda t, y: split_into_scalars(bind(field, inputs)(t, join_scalars(y, y0), None))
+
+    start = split_into_scalars(y0)
+    return _stepper_of_slope(solver, slope_under, start, lambda y: join_scalars(y, y0), y0)
 
 
 class _InertiaAndTorque(NamedTuple):
@@ -197,7 +201,9 @@ def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         slope = lambda _, p: _free_momentum_derivative(weights, gaps, p)  # noqa: E731
-        dp, turn = change_and_turn(slope, partial(splitting.rate_of, weights), t, end, h, y[4:])
+        dp, turn = momentum_change_and_turn(
+            slope, partial(splitting.rate_of, weights), t, end, h, y[4:]
+        )
         return (*quaternion_product(y[:4], turn), *dp)
 
     def state(y: Atoms) -> Attitude:
@@ -248,7 +254,7 @@ def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
     carries from step to step are the quaternion and the angular momentum in body axes.
     """
     body, weights, torque = turning
-    start, rate = split(state0), partial(matvec, weights)
+    start, rate = split_into_scalars(state0), partial(matvec, weights)
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         law = bind(torque, inputs)
@@ -257,9 +263,9 @@ def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
             omega = barrier(rate(p))
             # The torque gets a `Spin`, a state without an attitude.
             value = evaluate_torque(law, t, Spin(jnp.stack(omega)), body)
-            return add(cross(p, omega), split(value))
+            return add(cross(p, omega), split_into_scalars(value))
 
-        dp, turn = change_and_turn(slope, rate, t, end, h, y[4:])
+        dp, turn = momentum_change_and_turn(slope, rate, t, end, h, y[4:])
         return (*quaternion_product(y[:4], turn), *dp)
 
     def state(y: Atoms) -> Attitude:
@@ -281,7 +287,7 @@ def _stepper_of_explicit_method(
     body axes.
     """
     body, weights, torque = turning
-    start = split(state0)
+    start = split_into_scalars(state0)
     many = len(start) - 3
 
     def slope_under(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
@@ -294,14 +300,14 @@ def _stepper_of_explicit_method(
             omega = barrier(matvec(weights, p))
             pushed = cross(p, omega)
             if law is not None:
-                value = evaluate_torque(law, t, join((*q, *omega), state0), body)
-                pushed = add(pushed, split(value))
+                value = evaluate_torque(law, t, join_scalars((*q, *omega), state0), body)
+                pushed = add(pushed, split_into_scalars(value))
             return (*half_product(q, omega), *pushed) if many else pushed
 
         return slope
 
     def state(y: Atoms) -> Any:
-        return join((*y[:many], *matvec(weights, y[many:])), state0)
+        return join_scalars((*y[:many], *matvec(weights, y[many:])), state0)
 
     momentum = matvec(_entries_of_symmetric_matrix(body.tensor), start[many:])
     return _stepper_of_slope(solver, slope_under, (*start[:many], *momentum), state, state0)
@@ -328,7 +334,9 @@ def _stepper_of_slope(
     """
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
-        return _change_to_unit_length(y, change_in(solver, slope_under(inputs), t, h, y, end), like)
+        return _change_to_unit_length(
+            y, change_in_step(solver, slope_under(inputs), t, h, y, end), like
+        )
 
     return Stepper(start, change, state)
 
@@ -345,7 +353,7 @@ def _change_to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
     # Without the barrier each part of the quaternion computes the whole change again.
     change = barrier(change)
     after, moved = (
-        motion_of(join(part, like)).q for part in (jax.tree.map(jnp.add, y, change), change)
+        motion_of(join_scalars(part, like)).q for part in (jax.tree.map(jnp.add, y, change), change)
     )
     after, moved = components(after), components(moved)
     # A rounding error of the excess |q|² − 1 only changes the length of q and does not turn the
@@ -357,7 +365,7 @@ def _change_to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
     # steps bring the length back to 1.
     less = barrier(excess * (0.5 - excess * (0.375 - 0.3125 * excess)))
     q = jnp.stack([d - less * a for d, a in zip(moved, after, strict=True)])
-    return split(eqx.tree_at(lambda s: motion_of(s).q, join(change, like), q))
+    return split_into_scalars(eqx.tree_at(lambda s: motion_of(s).q, join_scalars(change, like), q))
 
 
 def _stepper_of_splitting(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:

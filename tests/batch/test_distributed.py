@@ -26,9 +26,11 @@ def test_a_damaged_share_is_named(tmp_path, cut):
 
 def test_a_share_of_another_tree_is_named(tmp_path):
     distributed.save(np.arange(3.0), tmp_path)
-    with pytest.raises(ValueError, match=r"like has 2 arrays, .*share-0.npz holds 1"):
+    with pytest.raises(
+        ValueError, match=r"a file of 2 arrays, as `like` has, got .*share-0.npz with 1"
+    ):
         distributed.recover((np.zeros(3), np.zeros(3)), tmp_path)
-    with pytest.raises(FileNotFoundError, match="no share"):
+    with pytest.raises(FileNotFoundError, match="wanted a folder with files share"):
         distributed.recover(np.zeros(3), tmp_path / "none")
 
 

@@ -98,7 +98,7 @@ def test_a_gpu_takes_steps_in_pieces(monkeypatch):
 
 def test_bodies_of_an_odd_number(monkeypatch):
     monkeypatch.setattr(sharding, "platform", lambda: "gpu")
-    division = sharding.division_of(4, None, None, np.dtype(float), 4)
+    division = sharding.divide_batch(4, None, None, np.dtype(float), 4)
 
     def doubled(x):
         return sharding.map_bodies(lambda s, x: s * x, jnp.asarray(2.0), x, division)

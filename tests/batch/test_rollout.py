@@ -9,7 +9,7 @@ import pytest
 from once import once
 
 import rigidjax as rj
-from rigidjax.batch.sharding import division_of, map_bodies
+from rigidjax.batch.sharding import divide_batch, map_bodies
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.solve import fixed
 
@@ -307,7 +307,7 @@ def test_words(unhooked):
 
 def test_chunks_cover_all():
     each = jnp.arange(7.0)
-    division = division_of(3, None, None, each.dtype, 7)
+    division = divide_batch(3, None, None, each.dtype, 7)
     found = map_bodies(lambda s, x: s * x, jnp.asarray(2.0), each, division)
     assert np.array_equal(found, 2 * np.arange(7.0))
 

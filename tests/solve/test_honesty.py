@@ -53,7 +53,7 @@ def test_an_accuracy_holds_for_a_pulse_between_steps():
 
 
 def test_smooth_laws_of_time_have_no_sudden_times():
-    from rigidjax.solve.error import _sudden_times
+    from rigidjax.solve.error import _times_of_sudden_torque
 
     ts = jnp.linspace(0.0, 30.0, 7)
     smooth = {
@@ -64,10 +64,10 @@ def test_smooth_laws_of_time_have_no_sudden_times():
     }
     for name, law in smooth.items():
         sol = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), ts, law)
-        times = _sudden_times(sol._setup, sol.ts, sol._states)
+        times = _times_of_sudden_torque(sol._setup, sol.ts, sol._states)
         assert not np.any(times), name
     still = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), ts, rj.torques.Damping([0.1, 0.1, 0.1]))
-    assert _sudden_times(still._setup, still.ts, still._states).size == 0
+    assert _times_of_sudden_torque(still._setup, still.ts, still._states).size == 0
 
 
 class PulseOfAngle(eqx.Module):
@@ -80,13 +80,13 @@ class PulseOfAngle(eqx.Module):
 
 
 def test_constant_pieces_are_not_searched_for_sudden_times():
-    from rigidjax.solve.error import _sudden_times
+    from rigidjax.solve.error import _times_of_sudden_torque
 
     edges, rng = jnp.linspace(0.0, 9.0, 31), np.random.default_rng(3)
 
     def sudden(law):
         sol = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), [0.0, 8.0], law)
-        return np.asarray(_sudden_times(sol._setup, sol.ts, sol._states))
+        return np.asarray(_times_of_sudden_torque(sol._setup, sol.ts, sol._states))
 
     pulses = rj.torques.Pulses(edges, jnp.asarray(rng.normal(size=(30, 3))))
     assert sudden(pulses).size == 0
@@ -167,7 +167,11 @@ def test_a_flat_body_has_a_difference_on_one_side(moments):
 
 
 def test_smooth_functions_agree_with_their_differences():
-    from rigidjax.solve.difference import sides_of, slopes_of, values_at
+    from rigidjax.solve.difference import (
+        slopes_by_derivative_and_values,
+        step_and_two_points,
+        values_at_two_points,
+    )
     from rigidjax.solve.error import FunctionError
 
     rng = np.random.default_rng(5)
@@ -182,10 +186,12 @@ def test_smooth_functions_agree_with_their_differences():
             x = jnp.asarray(rng.normal(size=2))
             value, slope = f(x), jax.jacfwd(f)(x)
             error = FunctionError(value, 1e-10 * jnp.abs(value), slope, 1e-9 * jnp.abs(slope))
-            step, sides = sides_of(x, value, error.value_error, slope)
-            values = values_at(lambda x, _: f(x), sides, jnp.zeros(2))
-            assert not np.any(slopes_of(x, value, step, sides, values, error).differ)
+            step, sides = step_and_two_points(x, value, error.value_error, slope)
+            values = values_at_two_points(lambda x, _: f(x), sides, jnp.zeros(2))
+            assert not np.any(
+                slopes_by_derivative_and_values(x, value, step, sides, values, error).differ
+            )
             wrong = eqx.tree_at(lambda e: e.derivative, error, 0.9 * slope)
-            slopes = slopes_of(x, value, step, sides, values, wrong)
+            slopes = slopes_by_derivative_and_values(x, value, step, sides, values, wrong)
             missed = np.abs(slopes.difference - slopes.derivative)
             assert np.any(slopes.differ) or missed.max() < 0.02 * np.abs(slopes.difference).max()

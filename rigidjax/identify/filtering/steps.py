@@ -43,7 +43,7 @@ from rigidjax.motion.torques.composite import parts_of
 from rigidjax.rotation.kernels import to_unit_length
 from rigidjax.rotation.linalg3 import cross
 from rigidjax.solve import equations_of_motion
-from rigidjax.solve.equal_steps import advance
+from rigidjax.solve.equal_steps import state_after_step
 from rigidjax.solve.tableaus import KUTTA4
 
 
@@ -162,7 +162,9 @@ class Dynamics(eqx.Module):
             change = self.field(t + elapsed, motion, None)
             return self.with_torques(change, [*white, *torques]), slopes
 
-        motion, torques = advance(KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques))
+        motion, torques = state_after_step(
+            KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques)
+        )
         if isinstance(motion, HasAttitude):
             motion = eqx.tree_at(lambda s: s.q, motion, to_unit_length(motion.q))
         return ExtendedState(motion, torques, x.walks)

@@ -26,10 +26,10 @@ from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.motion.torques.states import freeze_own_states
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
-from rigidjax.solve.components import split
-from rigidjax.solve.equal_steps import advance, roll_steps
+from rigidjax.solve.components import split_into_scalars
+from rigidjax.solve.equal_steps import loop_stages_of_low_order, state_after_step
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.fixed_loop import first_rows, inputs_at_start, step
+from rigidjax.solve.fixed_loop import fill_first_rows, take_equal_step, torque_inputs_at_start
 from rigidjax.solve.steppers import cheapest, stepper_of
 from rigidjax.solve.tableaus import KUTTA4
 
@@ -111,7 +111,7 @@ class FixedSteps(AbstractIntegrator):
     ) -> PyTree:
         y0 = with_own_states(body, state0, torque, ts[0])
         field = equations_of_motion(body, y0, torque)
-        return fixed(roll_steps(self.solver), field, ts, y0, self.substeps, self.last)
+        return fixed(loop_stages_of_low_order(self.solver), field, ts, y0, self.substeps, self.last)
 
     def refine(self) -> AbstractIntegrator:
         if self.substeps > FINEST:
@@ -248,25 +248,25 @@ class HeldSteps(AbstractIntegrator):
         count, size = ts.shape[0] - 1, (ts[1] - ts[0]).astype(state0.omega.dtype)
         before = max((len(rows) - ts.shape[0] for rows in inputs.values()), default=0)
         start = with_own_states(
-            body, state0, bind(torque, inputs_at_start(torque, size, inputs)), 0.0
+            body, state0, bind(torque, torque_inputs_at_start(torque, size, inputs)), 0.0
         )
         field = equations_of_motion(body, start, torque)
-        stepper = stepper_of(roll_steps(cheapest(field)), field, start)
+        stepper = stepper_of(loop_stages_of_low_order(cheapest(field)), field, start)
 
         def take_step(y: PyTree, i: Array) -> tuple[PyTree, PyTree]:
-            y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
+            y = take_equal_step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
             return y, stepper.state(y)
 
         def warm_up(y: PyTree, i: Array) -> tuple[PyTree, None]:
             # The torque's own states follow the inputs, while the body keeps its initial state.
             y, _ = take_step(y, i)
-            return split(Coupled(start.motion, stepper.state(y).own)), None
+            return split_into_scalars(Coupled(start.motion, stepper.state(y).own)), None
 
         y0 = stepper.start
         if before and isinstance(start, Coupled):
             y0, _ = lax.scan(warm_up, y0, jnp.arange(-before, 0, dtype=jnp.int32))
         still = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *jnp.shape(a))), start)
-        later = first_rows(count if self.last is None else self.last, take_step, y0, still)
+        later = fill_first_rows(count if self.last is None else self.last, take_step, y0, still)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, later)
 
 
@@ -278,7 +278,7 @@ def shift_in_time(field: Callable[..., Any], t: Array, state: PyTree, offset: Ar
     """
     h = offset / 4.0
     for index in range(4):
-        state = advance(KUTTA4, lambda t, y: field(t, y, None), t + index * h, h, state)
+        state = state_after_step(KUTTA4, lambda t, y: field(t, y, None), t + index * h, h, state)
     return state
 
 
