@@ -57,7 +57,7 @@ class BodyBatch(NamedTuple):
 
 def inertia_state_and_torque(
     shared: PyTree, row: PyTree, constants: PyTree
-) -> tuple[Inertia | MassProperties, Spin | Attitude | Rigid, Torque | None]:
+) -> tuple[Inertia | MassProperties, Any, Torque | None]:
     """Return the inertia, the initial state and the torque of one body of a batch.
 
     **Arguments:**

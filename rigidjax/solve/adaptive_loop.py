@@ -7,7 +7,7 @@ get the steps of this segment.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import diffrax as dfx
 import jax
@@ -518,7 +518,7 @@ def _attempt_step(
     return after, row, (step, there.slopes)
 
 
-def _choose_for_each_body(condition: bool | Array, new: PyTree, old: PyTree) -> PyTree:
+def _choose_for_each_body(condition: Literal[True] | Array, new: PyTree, old: PyTree) -> PyTree:
     """Return the arrays of `new` for the bodies for which `condition` is true, else those of `old`.
 
     - `condition`: one truth value for each body, or the constant `True`, for which `new` is

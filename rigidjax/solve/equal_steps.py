@@ -39,8 +39,9 @@ def loop_stages_of_low_order(solver: dfx.AbstractSolver) -> Any:
 
     - `solver`: the method.
     """
-    is_low_order = isinstance(solver, AbstractExplicit) and solver.tableau.order <= 5
-    return StepWithLoopedStages(solver) if is_low_order else solver
+    if isinstance(solver, AbstractExplicit) and solver.tableau.order <= 5:
+        return StepWithLoopedStages(solver)
+    return solver
 
 
 def change_in_step(
