@@ -1,10 +1,9 @@
 """Check and convert the arguments of elliptic functions."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from rigidjax import _checks
@@ -13,18 +12,21 @@ from rigidjax.rotation.barrier import match_batch_axes
 # The arguments and results of all functions are real numbers, of shapes that broadcast.
 Real = Float[ArrayLike, "..."]
 RealOrArray = Float[Array, "..."]
+# The change of an argument in a derivative; a change that is known to be zero is a `SymbolicZero`.
+Tangent = ArrayLike | SymbolicZero
 
 
-def to_common_dtype(**named: Real) -> tuple[RealOrArray, ...]:
+def to_common_dtype(**numbers_by_name: Real) -> tuple[RealOrArray, ...]:
     """Convert numbers or arrays to arrays of one dtype and one shape, and return the arrays in the
     order of the arguments.
 
-    The keyword of an argument is its name in error messages. Python numbers take the dtype of the
-    arrays, and the shapes are broadcast. A `TypeError` is raised for half precision, a `ValueError`
-    for shapes that do not broadcast.
+    The keyword of an argument is the name of the argument in error messages. Python numbers take
+    the dtype of the arrays, and the shapes are broadcast. A `TypeError` is raised for half
+    precision, a `ValueError` for shapes that do not broadcast.
     """
     arrays = {
-        name: _checks.array_of_shape(value, (), name, batched=True) for name, value in named.items()
+        name: _checks.array_of_shape(value, (), name, batched=True)
+        for name, value in numbers_by_name.items()
     }
     dtype = jnp.result_type(*arrays.values())
     try:
@@ -35,7 +37,9 @@ def to_common_dtype(**named: Real) -> tuple[RealOrArray, ...]:
     return tuple(jnp.broadcast_to(array.astype(dtype), shape) for array in arrays.values())
 
 
-def complement_pair(name: str, value: Real, complement: Real | None) -> dict[str, Any]:
+def number_and_complement(
+    name: str, value: Real, complement: Real | None
+) -> dict[str, RealOrArray]:
     """Return a number and its complement (1 minus the number), as a dictionary with the keys `name`
     and `name` + "1".
 
@@ -63,24 +67,23 @@ def complement_pair(name: str, value: Real, complement: Real | None) -> dict[str
 
 
 @jax.custom_jvp
-def exact_complement(value: RealOrArray, complement: RealOrArray) -> Any:
-    """Return `value` as a function of its complement alone, where `complement` is 1 − `value`.
-
-    The derivative with respect to `complement` is −1, and the derivative with respect to `value` is
-    0.
+def value_by_complement(value: RealOrArray, complement: RealOrArray) -> RealOrArray:
+    """Return `value` as a function of its complement alone, where `complement` is 1 − `value`: the
+    result is `value` itself, but its derivative with respect to `complement` is −1, and its
+    derivative with respect to `value` is 0.
     """
     return match_batch_axes(value, complement)
 
 
-@exact_complement.defjvp
-def _exact_complement_jvp(
-    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[Any, Any]:
+@value_by_complement.defjvp
+def _value_by_complement_jvp(
+    primals: tuple[RealOrArray, RealOrArray], tangents: tuple[PyTree, PyTree]
+) -> tuple[RealOrArray, PyTree]:
     """Return two things: a number x as a function of its complement 1 − x alone; and its tangent
     (the change in a derivative), which is −1 times the tangent of the complement. By this rule JAX
-    differentiates `exact_complement`.
+    differentiates `value_by_complement`.
 
     - `primals`: the pair of x and 1 − x, two numbers or arrays.
     - `tangents`: the pair of their tangents; the tangent of x is not used.
     """
-    return exact_complement(*primals), -tangents[1]
+    return value_by_complement(*primals), -tangents[1]

@@ -8,16 +8,20 @@ definition as an integral. The derivatives are integrals of the same kind (DLMF 
 """
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
-from rigidjax.elliptic.arguments import Real, RealOrArray, to_common_dtype
-from rigidjax.elliptic.carlson_r import directional_derivative, nan_below_zero, r_integral, scale_of
+from rigidjax.elliptic.arguments import Real, RealOrArray, Tangent, to_common_dtype
+from rigidjax.elliptic.carlson_r import (
+    largest_argument_or_one,
+    nan_where_negative,
+    r_integral,
+    r_integral_derivative,
+)
 
 # After this number of steps the series is exact for ratios over the whole range of the dtype.
 _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}
@@ -35,7 +39,7 @@ def rf(x: Real, y: Real, z: Real) -> RealOrArray:
     >>> float(rf(4.0, 4.0, 4.0))
     0.5
     """
-    return _rf(to_common_dtype(x=x, y=y, z=z))
+    return _rf_by_duplication(to_common_dtype(x=x, y=y, z=z))
 
 
 def rd(x: Real, y: Real, z: Real) -> RealOrArray:
@@ -50,7 +54,7 @@ def rd(x: Real, y: Real, z: Real) -> RealOrArray:
     >>> float(rd(4.0, 4.0, 4.0))
     0.125
     """
-    return _rd(to_common_dtype(x=x, y=y, z=z))
+    return _rd_by_duplication(to_common_dtype(x=x, y=y, z=z))
 
 
 def rj_(x: Real, y: Real, z: Real, p: Real) -> RealOrArray:
@@ -86,11 +90,11 @@ def rc(x: Real, y: Real) -> RealOrArray:
     # The root √0 has no derivative: keep it out of the branch that is not taken.
     factor = jnp.sqrt(jnp.where(below, x / length, 1))
     positive = jnp.where(below, -y, y)
-    return factor * _rf((jnp.where(below, x - y, x), positive, positive))
+    return factor * _rf_by_duplication((jnp.where(below, x - y, x), positive, positive))
 
 
 @jax.custom_jvp
-def _rf(arguments: tuple[Array, ...]) -> Array:
+def _rf_by_duplication(arguments: tuple[Array, ...]) -> Array:
     """Return Carlson's integral of the first kind, R_F(x, y, z) = ½ ∫₀^∞
     dt/√((t + x)(t + y)(t + z)), by duplication (DLMF 19.36.1).
 
@@ -98,7 +102,7 @@ def _rf(arguments: tuple[Array, ...]) -> Array:
 
     If two of them are 0, the result is infinite; if one of them is negative, the result is NaN.
     """
-    scale = scale_of(arguments)
+    scale = largest_argument_or_one(arguments)
     x, y, z = (a / scale for a in arguments)
     for _ in range(_STEPS[np.dtype(x.dtype)]):
         step = _duplication_shift(x, y, z)
@@ -110,11 +114,13 @@ def _rf(arguments: tuple[Array, ...]) -> Array:
     # The series is DLMF 19.36.1.
     series = 1 - e2 / 10 + e3 / 14 + e2**2 / 24 - 3 * e2 * e3 / 44
     series = series - 5 * e2**3 / 208 + 3 * e3**2 / 104 + e2**2 * e3 / 16
-    return _value_in_domain(series / jnp.sqrt(mean * scale), arguments)
+    return _with_infinity_and_nan_outside_domain(series / jnp.sqrt(mean * scale), arguments)
 
 
-@partial(_rf.defjvp, symbolic_zeros=True)
-def _rf_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
+@partial(_rf_by_duplication.defjvp, symbolic_zeros=True)
+def _rf_by_duplication_jvp(
+    primals: tuple[tuple[Array, ...]], tangents: tuple[tuple[Tangent, ...]]
+) -> tuple[Array, Array]:
     """Return Carlson's integral R_F(x, y, z) and its tangent (its change for a change of the
     arguments), from ∂R_F/∂z = −R_D(x, y, z)/6 and the same formula with x or y in the place of z
     (DLMF 19.18.1). By this rule JAX differentiates R_F.
@@ -127,12 +133,12 @@ def _rf_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[
     tangent = jnp.zeros_like(a[0])
     for i, direction in enumerate(directions):
         if not isinstance(direction, SymbolicZero):
-            tangent = tangent - _rd((*a[:i], *a[i + 1 :], a[i])) * direction / 6
-    return _rf(a), tangent
+            tangent = tangent - _rd_by_duplication((*a[:i], *a[i + 1 :], a[i])) * direction / 6
+    return _rf_by_duplication(a), tangent
 
 
 @jax.custom_jvp
-def _rd(arguments: tuple[Array, ...]) -> Array:
+def _rd_by_duplication(arguments: tuple[Array, ...]) -> Array:
     """Return Carlson's integral of the second kind, R_D(x, y, z) = (3/2) ∫₀^∞ dt/((t + z)
     √((t + x)(t + y)(t + z))), by duplication (DLMF 19.36.2).
 
@@ -142,7 +148,7 @@ def _rd(arguments: tuple[Array, ...]) -> Array:
     If z = 0 or x = y = 0, the result is infinite; if one of the three is negative, the result is
     NaN.
     """
-    scale = scale_of(arguments)
+    scale = largest_argument_or_one(arguments)
     x, y, z = (a / scale for a in arguments)
     total, weight = jnp.zeros_like(x), 3.0
     for _ in range(_STEPS[np.dtype(x.dtype)]):
@@ -163,11 +169,13 @@ def _rd(arguments: tuple[Array, ...]) -> Array:
     series = series + 45 * e2**2 * e3 / 272 - 9 * (e3 * e4 + e2 * e5) / 68
     value = total + weight / 3 * series / (mean * jnp.sqrt(mean))
     value = jnp.where(arguments[2] == 0, jnp.inf, value)
-    return _value_in_domain(value / scale / jnp.sqrt(scale), arguments)
+    return _with_infinity_and_nan_outside_domain(value / scale / jnp.sqrt(scale), arguments)
 
 
-@partial(_rd.defjvp, symbolic_zeros=True)
-def _rd_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
+@partial(_rd_by_duplication.defjvp, symbolic_zeros=True)
+def _rd_by_duplication_jvp(
+    primals: tuple[tuple[Array, ...]], tangents: tuple[tuple[Tangent, ...]]
+) -> tuple[Array, Array]:
     """Return Carlson's integral R_D(x, y, z) and its tangent (its change for a change of the
     arguments). With R_D = (3/2) ∫₀^∞ (t + x)^{−1/2} (t + y)^{−1/2} (t + z)^{−3/2} dt, the tangent
     is a sum of integrals of this kind, in each of which the power of one factor is lower by 1. By
@@ -178,7 +186,9 @@ def _rd_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[
       be zero is a `SymbolicZero`.
     """
     (arguments,), (directions,) = primals, tangents
-    return _rd(arguments), 1.5 * directional_derivative((0.5, 0.5, 1.5), arguments, directions)
+    return _rd_by_duplication(arguments), 1.5 * r_integral_derivative(
+        (0.5, 0.5, 1.5), arguments, directions
+    )
 
 
 def _duplication_shift(x: Array, y: Array, z: Array) -> Array:
@@ -189,7 +199,7 @@ def _duplication_shift(x: Array, y: Array, z: Array) -> Array:
     return a * b + b * c + c * a
 
 
-def _value_in_domain(value: Array, arguments: tuple[Array, ...]) -> Array:
+def _with_infinity_and_nan_outside_domain(value: Array, arguments: tuple[Array, ...]) -> Array:
     """Return the value of a Carlson integral, with infinity in place of it where two or three of
     the arguments are 0, and NaN where an argument is negative or NaN.
 
@@ -197,4 +207,4 @@ def _value_in_domain(value: Array, arguments: tuple[Array, ...]) -> Array:
     - `arguments`: the three arguments of the integral, arrays of the shape of `value`.
     """
     x, y, z = (a == 0 for a in arguments)
-    return nan_below_zero(jnp.where((x & y) | (y & z) | (z & x), jnp.inf, value), arguments)
+    return nan_where_negative(jnp.where((x & y) | (y & z) | (z & x), jnp.inf, value), arguments)

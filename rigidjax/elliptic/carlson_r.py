@@ -14,15 +14,14 @@ arguments of very different sizes.
 import functools
 import math
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
-from rigidjax.elliptic.arguments import RealOrArray
+from rigidjax.elliptic.arguments import RealOrArray, Tangent
 
 # With these numbers of nodes the step is h < 0.5 (float64) or h < 0.9 (float32) for arguments in
 # ratios of 1e35.
@@ -42,7 +41,7 @@ def r_integral(powers: tuple[float, ...], arguments: tuple[RealOrArray, ...]) ->
     The result is infinite if the integral diverges at 0, NaN for a negative argument, and accurate
     to round-off for ratios of the aᵢ up to 1e35 (to 1e-13 at 1e60).
     """
-    scale = scale_of(arguments)
+    scale = largest_argument_or_one(arguments)
     dtype = np.dtype(arguments[0].dtype)
     unit = _UNIT[dtype]
     scaled = [a / scale * unit for a in arguments]
@@ -68,13 +67,15 @@ def r_integral(powers: tuple[float, ...], arguments: tuple[RealOrArray, ...]) ->
     value = product.sum(0) * step * unit**excess
     value = _divide_by_power(value, scale, excess)
     value = jnp.where(at_zero > 0, value, jnp.inf)
-    return nan_below_zero(value, arguments)
+    return nan_where_negative(value, arguments)
 
 
 @partial(r_integral.defjvp, symbolic_zeros=True)
 def _r_integral_jvp(
-    powers: tuple[float, ...], primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[Any, Any]:
+    powers: tuple[float, ...],
+    primals: tuple[tuple[Array, ...]],
+    tangents: tuple[tuple[Tangent, ...]],
+) -> tuple[Array, Array]:
     """Return the integral H = ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt and its tangent (its change for a change of
     the arguments aᵢ), from ∂H/∂aᵢ = −bᵢ H, with bᵢ + 1 in place of bᵢ on the right. By this rule
     JAX differentiates `r_integral`.
@@ -85,13 +86,13 @@ def _r_integral_jvp(
       `SymbolicZero`.
     """
     (arguments,), (directions,) = primals, tangents
-    return r_integral(powers, arguments), directional_derivative(powers, arguments, directions)
+    return r_integral(powers, arguments), r_integral_derivative(powers, arguments, directions)
 
 
-def directional_derivative(
+def r_integral_derivative(
     powers: tuple[float, ...],
     arguments: tuple[Array, ...],
-    directions: tuple[Array | SymbolicZero, ...],
+    directions: tuple[Tangent, ...],
 ) -> Array:
     """Return the derivative of the integral ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt along a change of its
     arguments aᵢ.
@@ -108,7 +109,7 @@ def directional_derivative(
     return tangent
 
 
-def nan_below_zero(value: Array, arguments: tuple[Array, ...]) -> Array:
+def nan_where_negative(value: Array, arguments: tuple[Array, ...]) -> Array:
     """Return `value`, but NaN where one of the `arguments`, arrays of the shape of `value`, is
     negative or NaN.
     """
@@ -116,7 +117,7 @@ def nan_below_zero(value: Array, arguments: tuple[Array, ...]) -> Array:
     return jnp.where(good, value, jnp.nan)
 
 
-def scale_of(arguments: tuple[Array, ...]) -> Array:
+def largest_argument_or_one(arguments: tuple[Array, ...]) -> Array:
     """Return the largest of the `arguments` (arrays of one shape), or 1 where all are 0.
 
     The integrals of Carlson are homogeneous: if the arguments are divided by this number, no square

@@ -15,23 +15,23 @@ functions, one for each half period (`jacobi_near_one.py`).
 
 import math
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
 from rigidjax.elliptic.arguments import (
     Real,
     RealOrArray,
-    complement_pair,
-    exact_complement,
+    Tangent,
+    number_and_complement,
     to_common_dtype,
+    value_by_complement,
 )
 from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, sncndn_near_one
-from rigidjax.elliptic.legendre import complete_integral, incomplete_integral, mean_iterates
+from rigidjax.elliptic.legendre import agm_iterates, complete_integral, incomplete_integral
 from rigidjax.rotation.stumpff import power_of_minus_one, split_half_turns
 
 # If cn and dn are below this number, integrals over sd² depend on the ratio of cn and dn only, with
@@ -58,8 +58,8 @@ def sncndn(
     >>> [round(float(x), 12) for x in sncndn(1.0, 0.5)]
     [0.803001824896, 0.595976567672, 0.823161001632]
     """
-    u, m, m1 = to_common_dtype(u=u, **complement_pair("m", m, m1))
-    s, c, d, _ = _functions_and_half_turns(u, exact_complement(m, m1), m1)
+    u, m, m1 = to_common_dtype(u=u, **number_and_complement("m", m, m1))
+    s, c, d, _ = _sncndn_and_half_turns(u, value_by_complement(m, m1), m1)
     return s, c, d
 
 
@@ -72,13 +72,13 @@ def am(u: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     >>> round(float(am(1.0, 0.5)), 12)
     0.932315079884
     """
-    u, m, m1 = to_common_dtype(u=u, **complement_pair("m", m, m1))
-    s, c, _, turns = _functions_and_half_turns(u, exact_complement(m, m1), m1)
+    u, m, m1 = to_common_dtype(u=u, **number_and_complement("m", m, m1))
+    s, c, _, turns = _sncndn_and_half_turns(u, value_by_complement(m, m1), m1)
     sign = power_of_minus_one(turns)
     return jnp.arctan2(sign * s, sign * c) + math.pi * turns
 
 
-def _functions_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array, Array]:
+def _sncndn_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array, Array]:
     """Return four arrays: Jacobi's elliptic functions sn(u|m), cn(u|m) and dn(u|m) for any real
     parameter m; and the whole number n of half turns in the amplitude φ (the angle with sin φ = sn
     and cos φ = cn), so that φ − nπ lies between −π/2 and π/2.
@@ -97,13 +97,13 @@ def _functions_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Array, Arr
     inner_m = jnp.where(above, 1, m) / divisor
     inner_m1 = jnp.where(above, -m1, m1) / divisor
 
-    s, c, d = _sncndn(v, inner_m, inner_m1)
-    turns = _reduce_argument(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
+    s, c, d = _sncndn_up_to_one(v, inner_m, inner_m1)
+    turns = _reduce_to_half_period(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
     return (s / root, jnp.where(above, d, c), jnp.where(above, c, d), jnp.where(above, 0, turns))
 
 
 @jax.custom_jvp
-def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
+def _sncndn_up_to_one(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
     """Return Jacobi's elliptic functions sn(u|m), cn(u|m) and dn(u|m) for a parameter m ≤ 1, three
     arrays.
 
@@ -112,7 +112,7 @@ def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
       with respect to u and m1 alone.
     - `m1`: 1 − m.
     """
-    turns, angle, rows = _reduce_argument(u, m1)
+    turns, angle, rows = _reduce_to_half_period(u, m1)
     sign = power_of_minus_one(turns)
     theta = jnp.abs(angle)
     # Bulirsch's recursion carries cot²φ, which must not overflow near 0 or near a half period.
@@ -143,8 +143,10 @@ def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
     return s, c, d
 
 
-@partial(_sncndn.defjvp, symbolic_zeros=True)
-def _sncndn_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
+@partial(_sncndn_up_to_one.defjvp, symbolic_zeros=True)
+def _sncndn_up_to_one_jvp(
+    primals: tuple[Array, Array, Array], tangents: tuple[Tangent, Tangent, Tangent]
+) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
     """Return two triples: Jacobi's elliptic functions sn, cn and dn; and their tangents (their
     changes) for changes of the argument u and of 1 − m, where m is the parameter. By this rule JAX
     differentiates the three functions.
@@ -154,7 +156,7 @@ def _sncndn_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tu
       by 1 − m. A change that is known to be zero is a `SymbolicZero`.
     """
     (u, m, m1), (du, _, dm1) = primals, tangents
-    s, c, d = _sncndn(u, m, m1)
+    s, c, d = _sncndn_up_to_one(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
         # The derivatives with respect to u are DLMF 22.13.1–3.
@@ -174,13 +176,13 @@ def _derivatives_by_m(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Arra
     - `m`: the parameter, the square of the modulus, ≤ 1; it must equal 1 − m1.
     - `m1`: 1 − m.
     """
-    return _derivatives_from_integral(u, m, m1)
+    return _derivatives_by_m_from_integral(u, m, m1)
 
 
 @partial(_derivatives_by_m.defjvp, symbolic_zeros=True)
 def _derivatives_by_m_jvp(
-    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[Any, Any]:
+    primals: tuple[Array, Array, Array], tangents: tuple[Tangent, Tangent, Tangent]
+) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
     """Return two triples: the derivatives of Jacobi's functions sn, cn and dn with respect to the
     parameter m; and the tangents (the changes) of these derivatives for changes of the argument u
     and of 1 − m. By this rule JAX takes second derivatives of the three functions.
@@ -193,7 +195,7 @@ def _derivatives_by_m_jvp(
     sm, cm, dm = slopes = _derivatives_by_m(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
-        s, c, d = _sncndn(u, m, m1)
+        s, c, d = _sncndn_up_to_one(u, m, m1)
         ds, dc = (cm * d + c * dm) * du, -(sm * d + s * dm) * du
         dd = -(s * c + m * (sm * c + s * cm)) * du
     if not isinstance(dm1, SymbolicZero):
@@ -202,20 +204,20 @@ def _derivatives_by_m_jvp(
         near = (m1 < LARGEST_M1) & (jnp.abs(u) > 1)
         middle, one = jnp.full_like(m1, 0.5), jnp.ones_like(m1)
         far_m, far_m1 = jnp.where(near, middle, m), jnp.where(near, middle, m1)
-        _, far = jax.jvp(partial(_derivatives_from_integral, u), (far_m, far_m1), (one, -one))
+        _, far = jax.jvp(partial(_derivatives_by_m_from_integral, u), (far_m, far_m1), (one, -one))
         near_m = jnp.where(near, m, 1 - LARGEST_M1)
         near_m1 = jnp.where(near, m1, LARGEST_M1)
 
-        def first(a: Array, b: Array) -> Any:
+        def first_derivatives(a: Array, b: Array) -> tuple[Array, Array, Array]:
             return jax.jvp(partial(sncndn_near_one, u), (a, b), (one, -one))[1]
 
-        _, close = jax.jvp(first, (near_m, near_m1), (one, -one))
+        _, close = jax.jvp(first_derivatives, (near_m, near_m1), (one, -one))
         ss, cc, d2 = (jnp.where(near, a, b) for a, b in zip(close, far, strict=True))
         ds, dc, dd = ds - ss * dm1, dc - cc * dm1, dd - d2 * dm1
     return slopes, (ds, dc, dd)
 
 
-def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
+def _derivatives_by_m_from_integral(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
     """Return the derivatives of Jacobi's functions sn(u|m), cn(u|m) and dn(u|m) with respect to the
     parameter m at a fixed argument u, three arrays.
 
@@ -226,8 +228,8 @@ def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Array, Ar
     where X = −½ ∫₀^u sd²(v) dv and sd = sn/dn. Carlson's integral R_D gives X, after whole half
     periods are taken off u.
     """
-    s, c, d = _sncndn(u, m, m1)
-    turns = _reduce_argument(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
+    s, c, d = _sncndn_up_to_one(u, m, m1)
+    turns = _reduce_to_half_period(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = power_of_minus_one(turns)
     # X grows as 1/dn² and must not overflow. If cn and dn are tiny, X depends, except for a factor,
     # only on the ratio of cn and dn (to the square of the floor): multiply cn and dn by the same
@@ -241,7 +243,7 @@ def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Array, Ar
     return c * d * x, -s * d * x * up, -(0.5 * s * s / d + m * s * c * x) * up
 
 
-def _reduce_argument(u: Array, m1: Array) -> tuple[Array, Array, list[tuple[Array, Array]]]:
+def _reduce_to_half_period(u: Array, m1: Array) -> tuple[Array, Array, list[tuple[Array, Array]]]:
     """Return three things about the argument u of Jacobi's functions of parameter m, written as
     u = 2Kn + r with |r| ≤ K, where 2K is the half period: the whole number n; the angle πr/(2K),
     rad; and the list of pairs of arithmetic and geometric means that starts from 1 and √m1 and ends
@@ -251,6 +253,6 @@ def _reduce_argument(u: Array, m1: Array) -> tuple[Array, Array, list[tuple[Arra
     - `m1`: 1 − m. For m1 = 0 the half period is infinite, n is 0, and the other two results mean
       nothing.
     """
-    rows = mean_iterates(jnp.where(m1 == 0, 1, m1))
+    rows = agm_iterates(jnp.where(m1 == 0, 1, m1))
     turns, angle = split_half_turns(u * rows[-1][0])
     return jnp.where(m1 == 0, 0, turns), angle, rows

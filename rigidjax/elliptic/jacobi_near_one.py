@@ -12,12 +12,10 @@ derivative of an explicit sum. The sums give the second derivatives; ∂F/∂m w
 them as m1 → 0.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
 from rigidjax.elliptic.arguments import RealOrArray
 from rigidjax.rotation.stumpff import power_of_minus_one
@@ -86,8 +84,8 @@ def _power_times_exp(base: Array, exponent: Array, power: Array) -> Array:
 
 @_power_times_exp.defjvp
 def _power_times_exp_jvp(
-    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[Any, Any]:
+    primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
+) -> tuple[Array, Array]:
     """Return p^n e^y and its tangent (its change) for changes of p and y: the rule by which JAX
     differentiates `_power_times_exp`.
 

@@ -12,15 +12,20 @@ difference of large numbers. The textbook formulas (DLMF 19.4) divide such diffe
 
 import math
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
-from rigidjax.elliptic.arguments import Real, RealOrArray, complement_pair, to_common_dtype
+from rigidjax.elliptic.arguments import (
+    Real,
+    RealOrArray,
+    Tangent,
+    number_and_complement,
+    to_common_dtype,
+)
 from rigidjax.elliptic.carlson import rd, rf
 from rigidjax.elliptic.carlson_r import r_integral
 from rigidjax.rotation.stumpff import split_half_turns
@@ -45,7 +50,7 @@ def ellipk(m: Real, m1: Real | None = None) -> RealOrArray:
     >>> round(float(ellipk(1.0, 1e-30)), 12)
     35.925070756031
     """
-    _, m1 = to_common_dtype(**complement_pair("m", m, m1))
+    _, m1 = to_common_dtype(**number_and_complement("m", m, m1))
     return _complete_first_kind(m1)
 
 
@@ -59,7 +64,7 @@ def ellipe(m: Real, m1: Real | None = None) -> RealOrArray:
     >>> float(ellipe(1.0))
     1.0
     """
-    _, m1 = to_common_dtype(**complement_pair("m", m, m1))
+    _, m1 = to_common_dtype(**number_and_complement("m", m, m1))
     return complete_integral((0, -1, 0), m1)
 
 
@@ -79,7 +84,9 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
     >>> round(float(ellippi(0.5, 0.5)), 12)
     2.701287762095
     """
-    _, n1, _, m1 = to_common_dtype(**complement_pair("n", n, n1), **complement_pair("m", m, m1))
+    _, n1, _, m1 = to_common_dtype(
+        **number_and_complement("n", n, n1), **number_and_complement("m", m, m1)
+    )
     return complete_integral((0, 0, 1), m1, n1)
 
 
@@ -94,7 +101,7 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     >>> round(float(ellipf(1.0, 0.5)), 12)
     1.083216772845
     """
-    phi, _, m1 = to_common_dtype(phi=phi, **complement_pair("m", m, m1))
+    phi, _, m1 = to_common_dtype(phi=phi, **number_and_complement("m", m, m1))
     return _integral_at_any_amplitude((0, 0, 0), phi, m1)
 
 
@@ -110,7 +117,7 @@ def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     >>> round(float(ellipeinc(1.0, 0.5)), 12)
     0.927329883624
     """
-    phi, _, m1 = to_common_dtype(phi=phi, **complement_pair("m", m, m1))
+    phi, _, m1 = to_common_dtype(phi=phi, **number_and_complement("m", m, m1))
     return _integral_at_any_amplitude((0, -1, 0), phi, m1)
 
 
@@ -132,7 +139,7 @@ def ellippiinc(
     1.288978174245
     """
     _, n1, phi, _, m1 = to_common_dtype(
-        **complement_pair("n", n, n1), phi=phi, **complement_pair("m", m, m1)
+        **number_and_complement("n", n, n1), phi=phi, **number_and_complement("m", m, m1)
     )
     return _integral_at_any_amplitude((0, 0, 1), phi, m1, n1)
 
@@ -167,8 +174,10 @@ def incomplete_integral(
 
 @partial(incomplete_integral.defjvp, symbolic_zeros=True)
 def _incomplete_integral_jvp(
-    orders: tuple[int, int, int], primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[Any, Any]:
+    orders: tuple[int, int, int],
+    primals: tuple[Array, Array, Array, Array],
+    tangents: tuple[Tangent, Tangent, Tangent, Tangent],
+) -> tuple[Array, Array]:
     """Return Legendre's incomplete integral I_jkl(φ, m, n) = ∫₀^φ sin^{2j}θ Δ^{−(2k+1)}
     (1 − n sin²θ)^{−l} dθ, with Δ = √(1 − m sin²θ), and its tangent (its change). By this rule JAX
     differentiates `incomplete_integral`.
@@ -211,7 +220,7 @@ def complete_integral(orders: tuple[int, int, int], m1: Array, n1: Array | None 
     return incomplete_integral(orders, one, jnp.zeros_like(m1), m1, one if n1 is None else n1)
 
 
-def mean_iterates(m1: Array) -> list[tuple[Array, Array]]:
+def agm_iterates(m1: Array) -> list[tuple[Array, Array]]:
     """Return the pairs of arithmetic and geometric means in the order of the iteration, from (1,
     √m1) to their common value.
 
@@ -231,14 +240,14 @@ def _complete_first_kind(m1: Array) -> Array:
 
     - `m1`: 1 − m, where m is the parameter; K is infinite for m1 = 0.
     """
-    a, b = mean_iterates(m1)[-1]
+    a, b = agm_iterates(m1)[-1]
     return jnp.where(m1 == 0, jnp.inf, math.pi / (a + b))
 
 
 @_complete_first_kind.defjvp
 def _complete_first_kind_jvp(
-    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[Any, Any]:
+    primals: tuple[Array], tangents: tuple[Tangent]
+) -> tuple[Array, Array]:
     """Return Legendre's complete integral of the first kind K(m) and its tangent (its change) for a
     change of 1 − m: the rule by which JAX differentiates K.
 

@@ -15,15 +15,15 @@ from rigidjax.exact.jacobi_duplication import (
     Elliptic,
     HalfPeriod,
     Modulus,
-    clip_at_rest,
-    duplicate,
+    clip_time_on_separatrix,
     elliptic_functions,
+    functions_at_double_time,
     half_period,
 )
 from rigidjax.rotation.barrier import barrier, compiled_as_one_kernel
 
 
-class Orbit(NamedTuple):
+class ClosedFormConstants(NamedTuple):
     """Hold the constants of a free motion, in principal axes that are labelled 1, 2, 3 in ascending
     or descending order of their moments I₁, I₂, I₃.
     """
@@ -42,7 +42,7 @@ class Orbit(NamedTuple):
 
 
 @compiled_as_one_kernel
-def orbit(moments: Triple, momentum: Triple) -> Orbit:
+def closed_form_constants(moments: Triple, momentum: Triple) -> ClosedFormConstants:
     """Return the constants of a free motion, from which its body momentum and its rotation follow
     at any time.
 
@@ -69,7 +69,7 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
     phase_factor = d13 * h * mu
     m = Modulus(p, q, gap)
     m, mu, phase_factor, half = barrier((m, mu, phase_factor, half_period(m, mu, phase_factor)))
-    return Orbit(a, d12, d13, d23, (p1, p2, p3), h, m, mu, phase_factor, half, swap)
+    return ClosedFormConstants(a, d12, d13, d23, (p1, p2, p3), h, m, mu, phase_factor, half, swap)
 
 
 class ReducedTime(NamedTuple):
@@ -91,11 +91,11 @@ def reduce_time(u: Scalar, half_period: Scalar, modulus: Modulus) -> ReducedTime
     """
     count = jnp.round(u / half_period)
     rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half_period)
-    return ReducedTime(count, rest, clip_at_rest(rest, modulus))
+    return ReducedTime(count, rest, clip_time_on_separatrix(rest, modulus))
 
 
-def restore_periods(
-    constants: Orbit, functions: Elliptic, half_time: ReducedTime
+def restore_half_periods(
+    constants: ClosedFormConstants, functions: Elliptic, half_time: ReducedTime
 ) -> tuple[Elliptic, Scalar]:
     """Return two things: the elliptic functions S, C, D at a time, from their values at the reduced
     time; and that part of the phase ξ (an angle) at this time which `functions` does not contain.
@@ -129,7 +129,7 @@ def restore_periods(
     )
 
 
-def restore_identity(functions: Elliptic, modulus: Modulus) -> Elliptic:
+def restore_elliptic_identity(functions: Elliptic, modulus: Modulus) -> Elliptic:
     """Return the elliptic functions S, C, D with the larger of C² and D² computed again from the
     smaller, by D² − C² = (p − q)S².
 
@@ -150,7 +150,7 @@ def restore_identity(functions: Elliptic, modulus: Modulus) -> Elliptic:
     )
 
 
-def momentum_at(constants: Orbit, functions: Elliptic) -> Triple:
+def momentum_from_functions(constants: ClosedFormConstants, functions: Elliptic) -> Triple:
     """Return the three components of the body momentum of a free motion at the time of the elliptic
     functions.
 
@@ -159,7 +159,7 @@ def momentum_at(constants: Orbit, functions: Elliptic) -> Triple:
     - `functions`: the elliptic functions S, C and D at the time that is meant.
     """
     p1, p2, p3 = constants.P
-    functions = restore_identity(functions, constants.modulus)
+    functions = restore_elliptic_identity(functions, constants.modulus)
     y1 = p1 * functions.C - constants.d23 * p2 * p3 * functions.S * functions.D
     y2 = p2 * functions.C * functions.D + constants.d13 * p1 * p3 * functions.S
     y3 = p3 * functions.D - constants.d12 * p1 * p2 * functions.S * functions.C
@@ -174,14 +174,14 @@ def momentum_at(constants: Orbit, functions: Elliptic) -> Triple:
 
 
 @compiled_as_one_kernel
-def momentum_and_turn(constants: Orbit, t: Scalar) -> tuple[Triple, Four]:
+def momentum_and_rotation(constants: ClosedFormConstants, t: Scalar) -> tuple[Triple, Four]:
     """Return two things: the body momentum at the time t; and the quaternion (w, x, y, z) of the
     rotation of the body from time 0 to t. Both have components along the principal axes.
 
     `constants` are the constants of the motion.
     """
     half_time = reduce_time(0.5 * t, constants.half.time, constants.modulus)
-    return motion_from_functions(
+    return momentum_and_rotation_from_functions(
         constants,
         elliptic_functions(half_time.near, constants.modulus, constants.mu, constants.phase_factor),
         half_time,
@@ -189,8 +189,8 @@ def momentum_and_turn(constants: Orbit, t: Scalar) -> tuple[Triple, Four]:
     )
 
 
-def motion_from_functions(
-    constants: Orbit, functions: Elliptic, half_time: ReducedTime, t: Scalar
+def momentum_and_rotation_from_functions(
+    constants: ClosedFormConstants, functions: Elliptic, half_time: ReducedTime, t: Scalar
 ) -> tuple[Triple, Four]:
     """Return two things: the body momentum at the time t; and the quaternion (w, x, y, z) of the
     rotation of the body from time 0 to t. Both have components along the principal axes.
@@ -199,10 +199,12 @@ def motion_from_functions(
     - `functions`: the elliptic functions S, C, D and their phase ξ at the time `half_time.near`.
     - `half_time`: the time t/2, reduced by whole half periods.
     """
-    functions, phase = barrier(restore_periods(constants, functions, half_time))
-    full = barrier(duplicate(functions, constants.modulus, constants.mu, constants.phase_factor))
-    _, k2, k3 = barrier(momentum_at(constants, functions))
-    m1, m2, m3 = barrier(momentum_at(constants, full))
+    functions, phase = barrier(restore_half_periods(constants, functions, half_time))
+    full = barrier(
+        functions_at_double_time(functions, constants.modulus, constants.mu, constants.phase_factor)
+    )
+    _, k2, k3 = barrier(momentum_from_functions(constants, functions))
+    m1, m2, m3 = barrier(momentum_from_functions(constants, full))
 
     # The turn is the product (c, s Π(0)) ⊗ b of two quaternions: the first turns about the initial
     # momentum, and b = (b0, 0, b2, b3) turns about an axis in the plane of axes 2 and 3.

@@ -27,15 +27,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
 from rigidjax.exact import sigma_form
 from rigidjax.exact.closed_form import (
-    Orbit,
-    momentum_and_turn,
-    motion_from_functions,
-    orbit,
+    ClosedFormConstants,
+    closed_form_constants,
+    momentum_and_rotation,
+    momentum_and_rotation_from_functions,
     reduce_time,
 )
 from rigidjax.exact.components3 import (
@@ -52,7 +52,7 @@ from rigidjax.exact.components3 import (
     matvec,
     symmetric_rows,
 )  # fmt: skip
-from rigidjax.exact.jacobian import integrals, jacobian_and_integral
+from rigidjax.exact.jacobian import elliptic_functions_and_integrals, momentum_jacobian_and_integral
 from rigidjax.exact.principal_axes import (
     combine_columns,
     components_along,
@@ -76,39 +76,50 @@ _LOOPED = 1000
 
 # The body momentum Π(t), the quaternion of the rotation from time 0 to t, and the body rate Ω(t).
 Motion = tuple[Triple, Four, Triple]
+# The differences and off-diagonal entries of K = I⁻¹, the six entries of K, and twice the energy.
+InverseInertiaAndEnergy = tuple[Differences, Six, Scalar]
 # The derivatives of the three components of a vector with respect to ten variables.
-Rows = tuple[Float[Array, "10"], ...]
+VectorDerivatives = tuple[Float[Array, "10"], ...]
 
 
 @jax.custom_jvp
-def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
+def free_momentum_and_rotation(inertia: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
     """Return two things: the body momentum Π(t) of a free body; and the quaternion (w, x, y, z) of
     its rotation from time 0 to t. Both have components along the principal axes.
 
-    - `moments`: the entries (I11, I22, I33, I12, I13, I23) of the inertia tensor in principal axes,
+    - `inertia`: the entries (I11, I22, I33, I12, I13, I23) of the inertia tensor in principal axes,
       with I11 ≤ I22 ≤ I33. The last three entries are zero in value, but their derivatives are not.
     - `momentum`: the three components of Π(0).
     - `t`: the time, of either sign.
     """
-    return momentum_and_turn(orbit(moments[:3], momentum), t)
+    return momentum_and_rotation(closed_form_constants(inertia[:3], momentum), t)
 
 
-@flow.defjvp
-def _flow_jvp(primals, tangents):
+@free_momentum_and_rotation.defjvp
+def _free_momentum_and_rotation_jvp(
+    primals: tuple[Six, Triple, Scalar], tangents: tuple[Six, Triple, Scalar]
+) -> tuple[tuple[Triple, Four], tuple[Triple, Four]]:
     """Return two pairs: the body momentum Π(t) of a free body and the quaternion of its rotation
-    from time 0 to t, both along the principal axes, as `flow` gives them; and the changes of these
-    two for a change of the inputs. By this rule JAX differentiates `flow`.
+    from time 0 to t, both along the principal axes, as `free_momentum_and_rotation` gives them; and
+    the changes of these two for a change of the inputs. By this rule JAX differentiates
+    `free_momentum_and_rotation`.
 
-    - `primals`: the three inputs of `flow`: the six entries (11, 22, 33, 12, 13, 23) of the inertia
-      tensor in principal axes, the three components of Π(0), and the time t.
+    - `primals`: the three inputs of `free_momentum_and_rotation`: the six entries (11, 22, 33, 12,
+      13, 23) of the inertia tensor in principal axes, the three components of Π(0), and the time t.
     - `tangents`: the changes of these three inputs, in the same form.
     """
     motion, rows, _ = motion_and_derivatives(*primals)
-    d_out, d_turn, _ = _change_of_motion(motion, rows, _variables_and_changes(primals, tangents)[3])
+    d_out, d_turn, _ = _change_of_motion(
+        motion, rows, _derivative_variables_and_changes(primals, tangents)[3]
+    )
     return motion[:2], (d_out, d_turn)
 
 
-def _variables_and_changes(primals: tuple, tangents: tuple) -> tuple:
+def _derivative_variables_and_changes(
+    primals: tuple[Six, Triple, Scalar], tangents: tuple[Six, Triple, Scalar]
+) -> tuple[
+    InverseInertiaAndEnergy, InverseInertiaAndEnergy, Float[Array, "10"], Float[Array, "10"]
+]:
     """Return four things that the derivative rules of a free motion share: three values that follow
     from the inputs, (differences, K, E₂); the changes of these three values; the ten variables
     (10,) with respect to which all derivatives are taken; and the changes (10,) of the ten
@@ -123,17 +134,17 @@ def _variables_and_changes(primals: tuple, tangents: tuple) -> tuple:
     E₂ = Π·KΠ is twice the energy. The ten variables are d12, d23, k12, k13, k23, the three of Π(0),
     k33 and t.
     """
-    reciprocals, changes = jax.jvp(inverse_inertia_and_energy, primals[:2], tangents[:2])
+    inverse_inertia, changes = jax.jvp(inverse_inertia_and_energy, primals[:2], tangents[:2])
     return (
-        reciprocals,
+        inverse_inertia,
         changes,
-        derivative_variables(reciprocals, *primals[1:]),
+        derivative_variables(inverse_inertia, *primals[1:]),
         derivative_variables(changes, *tangents[1:]),
     )
 
 
 def _change_of_motion(
-    motion: Motion, derivative_rows: "MotionDerivatives", change: Float[Array, "10"]
+    motion: Motion, derivative_rows: "MotionDerivatives", change_of_variables: Float[Array, "10"]
 ) -> Motion:
     """Return the changes of the body momentum Π(t) of a free body, of the quaternion of its
     rotation from time 0 to t, and of its body rate Ω(t), for a given change of the ten variables.
@@ -143,31 +154,33 @@ def _change_of_motion(
       rotation vector, in the body frame, by which the rotation changes; for each vector three
       arrays (10,), one for each component, with the derivative with respect to each of the ten
       variables.
-    - `change`: (10,) the change of the variables: of d12, d23, k12, k13, k23, of the three
-      components of Π(0), of k33 and of t, where kij are the entries of the inverse K of the inertia
-      tensor in principal axes, and dij = kii − kjj.
+    - `change_of_variables`: (10,) the change of the variables: of d12, d23, k12, k13, k23, of the
+      three components of Π(0), of k33 and of t, where kij are the entries of the inverse K of the
+      inertia tensor in principal axes, and dij = kii − kjj.
     """
-    out, theta, rate = (tuple(jnp.sum(row * change) for row in three) for three in derivative_rows)
+    out, theta, rate = (
+        tuple(jnp.sum(row * change_of_variables) for row in three) for three in derivative_rows
+    )
     return out, half_product(motion[1], theta), rate
 
 
-class MotionConstants(NamedTuple):
+class FreeMotionConstants(NamedTuple):
     """Hold the constants of a free motion as plain values, through which no derivative is taken.
 
     - `axes`: (3, 3) the matrix whose columns are the principal axes, in the body frame.
     - `moments`: the three principal moments, ascending.
     - `momentum`: the three components of the body momentum at time 0 along the principal axes.
-    - `orbit`: the constants from which the closed form is evaluated.
+    - `closed_form`: the constants from which the closed form is evaluated.
     """
 
     axes: Mat3
     moments: Triple
     momentum: Triple
-    orbit: Orbit
+    closed_form: ClosedFormConstants
 
 
 @compiled_as_one_kernel
-def set_up(tensor: Mat3, omega: Vec3) -> MotionConstants:
+def free_motion_constants(tensor: Mat3, omega: Vec3) -> FreeMotionConstants:
     """Return the principal axes of a body, and the constants of its free motion in these axes.
 
     - `tensor`: (3, 3) the inertia tensor, body frame.
@@ -175,34 +188,39 @@ def set_up(tensor: Mat3, omega: Vec3) -> MotionConstants:
     """
     moments, axes = principal_frame(tensor)
     momentum = matvec(moments, components_along(axes, omega))
-    return MotionConstants(axes, moments[:3], momentum, orbit(moments[:3], momentum))
+    return FreeMotionConstants(
+        axes, moments[:3], momentum, closed_form_constants(moments[:3], momentum)
+    )
 
 
 @jax.custom_jvp
-def body_motion(
-    tensor: Mat3, omega: Vec3, constants: MotionConstants, t: Float[Array, "*n"]
+def body_rate_and_rotation(
+    tensor: Mat3, omega: Vec3, constants: FreeMotionConstants, t: Float[Array, "*n"]
 ) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 4"]]:
     """Return two things, both in the body frame: the body rate Ω(t) of a free body; and the
     quaternion (w, x, y, z) of its rotation from time 0 to t.
 
     - `tensor`: (3, 3) the inertia tensor.
     - `omega`: (3,) the body rate Ω(0).
-    - `constants`: the result of `set_up` for `tensor` and `omega`. The value comes from `constants`
-      alone, and the derivative goes to `tensor`, `omega` and `t`.
+    - `constants`: the result of `free_motion_constants` for `tensor` and `omega`. The value comes
+      from `constants` alone, and the derivative goes to `tensor`, `omega` and `t`.
     - `t`: one time, or an array (n,) of times; the results then are (n, 3) and (n, 4).
     """
     del tensor, omega
-    return _at_each_time(lambda time: _body_motion_at(constants, time), t)
+    return _evaluate_at_each_time(lambda time: _rate_and_rotation_at(constants, time), t)
 
 
-@body_motion.defjvp
-def _body_motion_jvp(primals, tangents):
+@body_rate_and_rotation.defjvp
+def _rate_and_rotation_jvp(
+    primals: tuple[Mat3, Vec3, FreeMotionConstants, Float[Array, "*n"]],
+    tangents: tuple[Mat3, Vec3, Any, Float[Array, "*n"]],
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Return two pairs: the body rate Ω(t) of a free body and the quaternion of its rotation from
-    time 0 to t, both in the body frame, as `body_motion` gives them; and the changes of these two
-    for a change of the inputs. By this rule JAX differentiates `body_motion`.
+    time 0 to t, both in the body frame, as `body_rate_and_rotation` gives them; and the changes of
+    these two for a change of the inputs. By this rule JAX differentiates `body_rate_and_rotation`.
 
-    - `primals`: the four inputs of `body_motion`: the inertia tensor (3, 3), the body rate Ω(0)
-      (3,), the constants of the motion, and the time t, one or (n,) times.
+    - `primals`: the four inputs of `body_rate_and_rotation`: the inertia tensor (3, 3), the body
+      rate Ω(0) (3,), the constants of the motion, and the time t, one or (n,) times.
     - `tangents`: the changes of these four inputs, in the same form; the change of the constants is
       not used.
     """
@@ -211,9 +229,9 @@ def _body_motion_jvp(primals, tangents):
     # The derivative is a product of two matrices, of which only the left one depends on time. The
     # part that is transposed for reverse mode is therefore short, and the right matrix is compiled
     # once.
-    first = _input_derivatives(jnp.concatenate([tensor.ravel(), omega]), constants)
-    out, (rates, thetas) = _at_each_time(
-        lambda time: _body_motion_and_derivatives(tensor, omega, constants, time), t
+    first = _variable_derivatives_by_body(jnp.concatenate([tensor.ravel(), omega]), constants)
+    out, (rates, thetas) = _evaluate_at_each_time(
+        lambda time: _rate_and_rotation_with_derivatives(tensor, omega, constants, time), t
     )
     # Sum products of entries: on a GPU a product of matrices is rounded to ten bits in float32.
     change = jnp.sum(first * jnp.concatenate([d_tensor.ravel(), d_omega])[None], axis=-1)
@@ -223,24 +241,26 @@ def _body_motion_jvp(primals, tangents):
         jnp.stack([jnp.sum(row * change, axis=-1) for row in rows], axis=-1)
         for rows in (rates, thetas)
     )
-    return out, (d_rate, _quaternion_change(out[1], theta))
+    return out, (d_rate, _quaternion_change_by_small_rotation(out[1], theta))
 
 
 @functools.partial(jnp.vectorize, signature="(n),(m)->(n)")
-def _quaternion_change(turn: Quat, theta: Vec3) -> Quat:
+def _quaternion_change_by_small_rotation(q: Quat, rotation_vector: Vec3) -> Quat:
     """Return the change ½ q ⊗ (0, θ) (4,) of a unit quaternion q for a small change of its
     rotation.
 
-    - `turn`: q (4,), (w, x, y, z).
-    - `theta`: θ (3,), rad, body frame, the rotation vector of a small rotation of the body after
-      the rotation q.
+    - `q`: (4,), (w, x, y, z).
+    - `rotation_vector`: θ (3,), rad, body frame, the rotation vector of a small rotation of the
+      body after the rotation q.
 
     Arrays (…, 4) and (…, 3) are combined pair by pair.
     """
-    return jnp.stack(half_product(components(turn), components(theta)))
+    return jnp.stack(half_product(components(q), components(rotation_vector)))
 
 
-def _at_each_time(function: Callable[[Scalar], Any], t: Float[Array, "*n"]) -> Any:
+def _evaluate_at_each_time(
+    function: Callable[[Scalar], PyTree[Array]], t: Float[Array, "*n"]
+) -> PyTree[Array]:
     """Return the values of a function of time at the time t, or at each of the times t.
 
     - `function`: takes one time and returns any tree of arrays.
@@ -253,7 +273,7 @@ def _at_each_time(function: Callable[[Scalar], Any], t: Float[Array, "*n"]) -> A
 
 
 @compiled_as_one_kernel
-def _body_motion_at(constants: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
+def _rate_and_rotation_at(constants: FreeMotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
     """Return two things at the time t, both in the body frame: the body rate Ω(t) (3,) of a free
     body; and the quaternion (4,) of its rotation from time 0 to t.
 
@@ -261,7 +281,7 @@ def _body_motion_at(constants: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
       0, and the numbers from which the closed form is evaluated.
     - `t`: the time.
     """
-    momentum, (w, *axis) = momentum_and_turn(constants.orbit, t)
+    momentum, (w, *axis) = momentum_and_rotation(constants.closed_form, t)
     rate = tuple(p / i for p, i in zip(momentum, constants.moments, strict=True))
     return jnp.stack(combine_columns(constants.axes, rate)), jnp.stack(
         [w, *combine_columns(constants.axes, tuple(axis))]
@@ -269,7 +289,7 @@ def _body_motion_at(constants: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
 
 
 def _moments_and_momentum(
-    tensor: Mat3, omega: Vec3, constants: MotionConstants
+    tensor: Mat3, omega: Vec3, constants: FreeMotionConstants
 ) -> tuple[Six, Triple]:
     """Return two things in principal axes, as differentiable functions of the inertia tensor and
     the body rate: the six entries (11, 22, 33, 12, 13, 23) of the tensor; and the three components
@@ -285,8 +305,8 @@ def _moments_and_momentum(
 
 
 @compiled_as_one_kernel
-def _input_derivatives(
-    body: Float[Array, "12"], constants: MotionConstants
+def _variable_derivatives_by_body(
+    tensor_and_rate: Float[Array, "12"], constants: FreeMotionConstants
 ) -> Float[Array, "9 12"]:
     """Return the derivatives (9, 12) of nine variables of a free motion with respect to the inertia
     tensor and the body rate.
@@ -295,15 +315,15 @@ def _input_derivatives(
     and k33. Here kij are the entries of the inverse of the inertia tensor, in principal axes, and
     dij = kii − kjj.
 
-    - `body`: (12,) the nine entries of the inertia tensor, then the three of the body rate Ω(0),
-      all in the body frame.
+    - `tensor_and_rate`: (12,) the nine entries of the inertia tensor, then the three of the body
+      rate Ω(0), all in the body frame.
     - `constants`: the constants of the motion, from which the principal axes and moments are taken.
     """
-    tensor, omega, axes = body[:9].reshape(3, 3), body[9:], constants.axes
+    tensor, omega, axes = tensor_and_rate[:9].reshape(3, 3), tensor_and_rate[9:], constants.axes
     moments, momentum = _moments_and_momentum(tensor, omega, constants)
     # In principal axes, δK = −K δI K is −BᵀδI B with B = A K, where the columns of A are the axes.
     # The products are written as sums of products of entries, for the reason given in
-    # `_body_motion_jvp`.
+    # `_rate_and_rotation_jvp`.
     k = jnp.stack(symmetric_rows(inverse_inertia_and_energy(moments, momentum)[1]))
     b = jnp.sum(axes[:, :, None] * k[None], axis=1)
     d_k = lambda i, j: -(b[:, None, i] * b[None, :, j]).ravel()  # noqa: E731
@@ -317,9 +337,9 @@ def _input_derivatives(
 
 
 @compiled_as_one_kernel
-def _body_motion_and_derivatives(
-    tensor: Mat3, omega: Vec3, constants: MotionConstants, t: Scalar
-) -> tuple[tuple[Vec3, Quat], tuple[Rows, Rows]]:
+def _rate_and_rotation_with_derivatives(
+    tensor: Mat3, omega: Vec3, constants: FreeMotionConstants, t: Scalar
+) -> tuple[tuple[Vec3, Quat], tuple[VectorDerivatives, VectorDerivatives]]:
     """Return two pairs, both in the body frame: the body rate Ω(t) and the quaternion of the
     rotation from time 0 to t of a free body; and the derivatives of Ω(t) and of θ, where θ is the
     small rotation vector by which the rotation changes, each as three arrays (10,), one for each
@@ -356,21 +376,24 @@ class MotionDerivatives(NamedTuple):
     body from time 0 to t: δR = R hat(θ), where hat(θ) is the matrix of the cross product with θ.
     """
 
-    momentum: Rows
-    theta: Rows
-    rate: Rows
+    momentum: VectorDerivatives
+    theta: VectorDerivatives
+    rate: VectorDerivatives
+
+
+# The motion, its derivatives, and the pair from which the derivatives are computed.
+MotionAndDerivatives = tuple[Motion, MotionDerivatives, tuple[VectorDerivatives, Six]]
 
 
 @jax.custom_jvp
 @compiled_as_one_kernel
-def motion_and_derivatives(
-    moments: Six, momentum: Triple, t: Scalar
-) -> tuple[Motion, MotionDerivatives, tuple[Rows, Six]]:
+def motion_and_derivatives(moments: Six, momentum: Triple, t: Scalar) -> MotionAndDerivatives:
     """Return three things: the motion of a free body, which is (Π(t), quaternion of the rotation
     from time 0 to t, body rate Ω(t)); the derivatives of the motion; and the pair (rows, G) from
     which the derivatives are computed.
 
-    - `moments`: the six entries of the inertia tensor in principal axes, as for `flow`.
+    - `moments`: the six entries of the inertia tensor in principal axes, as for
+      `free_momentum_and_rotation`.
     - `momentum`: the three components of the body momentum Π(0).
     - `t`: the time.
 
@@ -379,8 +402,8 @@ def motion_and_derivatives(
     k12, k13, k23, the three components of Π(0), k33 and t, where kij are the entries of the inverse
     of the inertia tensor and dij = kii − kjj (see `derivative_variables`).
     """
-    (out, turn), rows, g = _flow_and_first_derivatives(
-        orbit(moments[:3], momentum), moments, momentum, t
+    (out, turn), rows, g = _momentum_and_rotation_with_derivatives(
+        closed_form_constants(moments[:3], momentum), moments, momentum, t
     )
     _, k, energy2 = inverse_inertia_and_energy(moments, momentum)
     motion = out, turn, matvec(k, out)
@@ -390,7 +413,9 @@ def motion_and_derivatives(
 # The second derivatives come from `sigma_form`, where the motion is a function of the whole inertia
 # tensor: this function is smooth to any order.
 @motion_and_derivatives.defjvp
-def _motion_and_derivatives_jvp(primals, tangents):
+def _motion_and_derivatives_jvp(
+    primals: tuple[Six, Triple, Scalar], tangents: tuple[Six, Triple, Scalar]
+) -> tuple[MotionAndDerivatives, MotionAndDerivatives]:
     """Return two things: the motion of a free body and its first derivatives, as
     `motion_and_derivatives` gives them; and the changes of all these numbers for a change of the
     inputs. By this rule JAX takes second derivatives of a free motion.
@@ -401,9 +426,9 @@ def _motion_and_derivatives_jvp(primals, tangents):
     - `tangents`: the changes of these three inputs, in the same form.
     """
     motion, rows, parts = motion_and_derivatives(*primals)
-    (body, *k), (_, *d_k), inputs, change = _variables_and_changes(primals, tangents)
+    (body, *k), (_, *d_k), inputs, change = _derivative_variables_and_changes(primals, tangents)
     d_motion = _change_of_motion(motion, rows, change)
-    d_parts = _changes_of_first_derivatives(body, inputs, change)
+    d_parts = _changes_of_momentum_derivatives(body, inputs, change)
     at, changes = (*k, *primals[1:], motion, *parts), (*d_k, *tangents[1:], d_motion, *d_parts)
     return (motion, rows, parts), (d_motion, jax.jvp(_motion_derivatives, at, changes)[1], d_parts)
 
@@ -414,7 +439,7 @@ def _motion_derivatives(
     momentum: Triple,
     t: Scalar,
     motion: Motion,
-    momentum_rows: Rows,
+    momentum_rows: VectorDerivatives,
     momentum_integral: Six,
 ) -> MotionDerivatives:
     """Return the derivatives of a free motion (of its body momentum Π(t), rotation and body rate
@@ -478,20 +503,20 @@ def _motion_derivatives(
 
 
 def derivative_variables(
-    reciprocals: tuple[Differences, Six, Scalar], momentum: Triple, t: Scalar
+    inverse_inertia: InverseInertiaAndEnergy, momentum: Triple, t: Scalar
 ) -> Float[Array, "10"]:
-    """Return d12, d23, k12, k13, k23, Π(0), k33 and t (10,): all derivatives of this module are
-    taken with respect to these ten variables.
+    """Return the ten variables (10,) with respect to which all derivatives of this module are
+    taken: d12, d23, k12, k13, k23, the three components of Π(0), k33 and t.
 
-    - `reciprocals`: the result of `inverse_inertia_and_energy`, or the change of this result.
-    - `momentum`, `t`: the body momentum Π(0) and the time, or their changes if `reciprocals` is a
-      change.
+    - `inverse_inertia`: the result of `inverse_inertia_and_energy`, or the change of this result.
+    - `momentum`, `t`: the body momentum Π(0) and the time, or their changes if `inverse_inertia` is
+      a change.
 
     Here kij are the entries of K = I⁻¹, and dij = kii − kjj. The variable k33 is the least diagonal
     entry. With k33, the thickness of a rod changes d12 alone; with k11 instead, the thickness would
     change both k11 and d12 by a term of 1/I₁², and the two terms would cancel.
     """
-    differences, k, _ = reciprocals
+    differences, k, _ = inverse_inertia
     return jnp.stack(
         [
             differences.d12,
@@ -507,9 +532,9 @@ def derivative_variables(
 
 
 @compiled_as_one_kernel
-def _flow_and_first_derivatives(
-    constants: Orbit, moments: Six, momentum: Triple, t: Scalar
-) -> tuple[tuple[Triple, Four], Rows, Six]:
+def _momentum_and_rotation_with_derivatives(
+    constants: ClosedFormConstants, moments: Six, momentum: Triple, t: Scalar
+) -> tuple[tuple[Triple, Four], VectorDerivatives, Six]:
     """Return three things: the pair of the body momentum Π(t) of a free body and the quaternion of
     its rotation from time 0 to t; the derivatives of Π(t) − Π(0) with respect to ten variables, as
     three arrays (10,), one for each component; and the six entries (11, 22, 33, 12, 13, 23) of the
@@ -524,7 +549,7 @@ def _flow_and_first_derivatives(
     entries of the inverse of the inertia tensor and dij = kii − kjj.
     """
     half_time = reduce_time(0.5 * t, constants.half.time, constants.modulus)
-    half_time_integrals = integrals(
+    half_time_integrals = elliptic_functions_and_integrals(
         half_time.near, constants.modulus, constants.mu, constants.phase_factor
     )
     f = half_time_integrals.f._replace(
@@ -535,15 +560,21 @@ def _flow_and_first_derivatives(
     whole = jnp.where(none, 0.0, 2.0 * half_time.halves) * jnp.where(none, 0.0, constants.half.time)
     body, _, _ = inverse_inertia_and_energy(moments, momentum)
     half = half_time_integrals._replace(f=f)
-    rows, g = jacobian_and_integral(
+    rows, g = momentum_jacobian_and_integral(
         body, momentum, t, half, half_time.halves, whole, constants.half.mean
     )
-    return motion_from_functions(constants, half_time_integrals.f, half_time, t), rows, g
+    return (
+        momentum_and_rotation_from_functions(constants, half_time_integrals.f, half_time, t),
+        rows,
+        g,
+    )
 
 
-def _changes_of_first_derivatives(
-    inverse_inertia: Differences, inputs: Float[Array, "10"], change: Float[Array, "10"]
-) -> tuple[Rows, Six]:
+def _changes_of_momentum_derivatives(
+    inverse_inertia: Differences,
+    variables: Float[Array, "10"],
+    change_of_variables: Float[Array, "10"],
+) -> tuple[VectorDerivatives, Six]:
     """Return two changes for a change of the ten variables of a free motion: the change of the
     derivatives of the body momentum Π(t) with respect to these variables, as three arrays (10,),
     one for each component of Π; and the change of the six entries (11, 22, 33, 12, 13, 23) of the
@@ -551,9 +582,9 @@ def _changes_of_first_derivatives(
 
     - `inverse_inertia`: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
       inertia tensor, in principal axes.
-    - `inputs`: (10,) the variables d12, d23, k12, k13, k23, the three of Π(0), k33 and t, where kij
-      are the entries of K and dij = kii − kjj.
-    - `change`: (10,) the change of the variables.
+    - `variables`: (10,) the variables d12, d23, k12, k13, k23, the three of Π(0), k33 and t, where
+      kij are the entries of K and dij = kii − kjj.
+    - `change_of_variables`: (10,) the change of the variables.
 
     The motion is taken from the module `sigma_form`, where it is a smooth function of the whole
     inertia tensor.
@@ -562,7 +593,7 @@ def _changes_of_first_derivatives(
     def of_inputs(x):
         d12, d23, k12, k13, k23, p1, p2, p3, _, time = x
         d13 = inverse_inertia.d13 + ((d12 - inverse_inertia.d12) + (d23 - inverse_inertia.d23))
-        return sigma_form.momentum_and_integral(
+        return sigma_form.momentum_and_outer_product_integral(
             Differences(d12, d13, d23, k12, k13, k23), (p1, p2, p3), time
         )
 
@@ -571,11 +602,11 @@ def _changes_of_first_derivatives(
         column = lambda e: jax.jvp(of_inputs, (x,), (e,))[1]  # noqa: E731
         return jax.lax.map(column, jnp.eye(10, dtype=x.dtype))
 
-    (_, by_inputs), (d_rows, _) = jax.jvp(columns, (inputs,), (change,))
-    return d_rows, tuple(jnp.sum(g * change) for g in by_inputs)
+    (_, by_inputs), (d_rows, _) = jax.jvp(columns, (variables,), (change_of_variables,))
+    return d_rows, tuple(jnp.sum(g * change_of_variables) for g in by_inputs)
 
 
-def inverse_inertia_and_energy(moments: Six, momentum: Triple) -> tuple[Differences, Six, Scalar]:
+def inverse_inertia_and_energy(moments: Six, momentum: Triple) -> InverseInertiaAndEnergy:
     """Return three things: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
     inertia tensor, each with all its digits; the six entries of K; and E₂ = Π·KΠ, which is twice
     the energy.

@@ -104,7 +104,7 @@ class FreeSolver(dfx.AbstractSolver):
         # The direction is −1 if diffrax integrates backwards, in which case its times are −t.
         inertia, direction = (
             _free_euler_equations(terms).inertia,
-            jnp.asarray(field_of(terms)[1], jnp.result_type(t0)),
+            jnp.asarray(field_and_direction(terms)[1], jnp.result_type(t0)),
         )
         y1 = FreeBody(inertia, y0)(direction * (t1 - t0))
         error = jax.tree.map(jnp.zeros_like, y0)
@@ -118,7 +118,7 @@ class FreeSolver(dfx.AbstractSolver):
         return terms.vf(t0, y0, args)
 
 
-def field_of(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
+def field_and_direction(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
     """Return two things from inside the terms of a diffrax solver: the vector field; and the
     direction of time, 1 or −1, with which diffrax wraps the term.
     """
@@ -137,7 +137,7 @@ def _free_euler_equations(terms: PyTree[dfx.AbstractTerm]) -> EulerEquations:
 
     A `ValueError` is raised for any other terms.
     """
-    field, _ = field_of(terms)
+    field, _ = field_and_direction(terms)
     euler = field.euler if isinstance(field, AttitudeEquations) else field
     term = getattr(terms, "term", terms)
     if not isinstance(term, dfx.ODETerm) or not isinstance(euler, EulerEquations):

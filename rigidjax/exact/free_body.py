@@ -14,7 +14,11 @@ from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, S
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
-from rigidjax.exact.derivatives import MotionConstants, body_motion, set_up
+from rigidjax.exact.derivatives import (
+    FreeMotionConstants,
+    body_rate_and_rotation,
+    free_motion_constants,
+)
 from rigidjax.motion import Attitude, Rigid
 from rigidjax.rotation.kernels import quaternion_product
 from rigidjax.rotation.linalg3 import components
@@ -38,7 +42,7 @@ class FreeBody(eqx.Module):
     tensor: Mat3
     omega: Vec3
     exponent: Array
-    setting: MotionConstants
+    setting: FreeMotionConstants
 
     def __init__(self, inertia: Inertia, state0: HasSpin):
         inertia = _checked_inertia(inertia, state0)
@@ -46,7 +50,7 @@ class FreeBody(eqx.Module):
         self.exponent = largest_binary_exponent(state0.omega)
         self.tensor = times_power_of_two(inertia.tensor, -largest_binary_exponent(inertia.tensor))
         self.omega = times_power_of_two(state0.omega, -self.exponent)
-        self.setting = set_up(*jax.lax.stop_gradient((self.tensor, self.omega)))
+        self.setting = free_motion_constants(*jax.lax.stop_gradient((self.tensor, self.omega)))
         self.state0 = state0
 
     def __call__(self, t: ScalarLike) -> HasSpin:
@@ -68,7 +72,7 @@ class FreeBody(eqx.Module):
         turned = jnp.abs(t) * jnp.max(jnp.abs(self.state0.omega))
         t = jnp.where(turned <= 1 / jnp.finfo(t.dtype).eps, t, jnp.nan)
         since = times_power_of_two(t, self.exponent)
-        omega, turn = body_motion(self.tensor, self.omega, self.setting, since)
+        omega, turn = body_rate_and_rotation(self.tensor, self.omega, self.setting, since)
         omega = times_power_of_two(omega, self.exponent)
         state = eqx.tree_at(lambda s: s.omega, self.state0, omega)
         if not isinstance(state, HasAttitude):

@@ -54,7 +54,7 @@ class Modulus(NamedTuple):
     gap: Scalar
 
 
-class Limits(NamedTuple):
+class IterationLimits(NamedTuple):
     """Hold the number of doublings, the number of steps of the arithmetic–geometric mean, and the
     limits of the motion for one dtype.
     """
@@ -65,7 +65,7 @@ class Limits(NamedTuple):
     rest: float  # the value of √max(p, q) |u| beyond which a separatrix motion rests
 
 
-def dtype_limits(dtype) -> Limits:
+def iteration_limits(dtype: jnp.dtype) -> IterationLimits:
     """Return the numbers of steps and the limits of the elliptic functions for the dtype float32 or
     float64.
 
@@ -74,31 +74,35 @@ def dtype_limits(dtype) -> Limits:
     must not underflow.
     """
     wide = dtype == jnp.float64
-    return Limits(9, 11, 1e-64, 75.0) if wide else Limits(7, 9, 1e-33, 20.0)
+    return IterationLimits(9, 11, 1e-64, 75.0) if wide else IterationLimits(7, 9, 1e-33, 20.0)
 
 
-def is_endless(modulus: Modulus) -> Bool[Array, ""]:
+def is_aperiodic(modulus: Modulus) -> Bool[Array, ""]:
     """Return whether the motion with the parameters `modulus` has no period: on the separatrix, for
     a sphere, and at rest.
     """
-    return jnp.abs(modulus.gap) <= dtype_limits(modulus.p.dtype).floor * jnp.maximum(
+    return jnp.abs(modulus.gap) <= iteration_limits(modulus.p.dtype).floor * jnp.maximum(
         modulus.p, modulus.q
     )
 
 
-def clip_at_rest(u: Scalar, modulus: Modulus) -> Scalar:
-    """Return the time u, which was reduced by whole half periods, clipped on the separatrix to the
-    time after which the motion is at rest.
+def clip_time_on_separatrix(reduced_time: Scalar, modulus: Modulus) -> Scalar:
+    """Return a time, clipped on the separatrix to the time after which the motion is at rest.
 
-    `modulus` holds the parameters of the elliptic functions, which tell whether the motion is on
-    the separatrix. For every other motion u is returned unchanged.
+    - `reduced_time`: the time, from which whole half periods were subtracted.
+    - `modulus`: the parameters of the elliptic functions, which tell whether the motion is on the
+      separatrix. For every other motion the time is returned unchanged.
     """
     big = jnp.maximum(modulus.p, modulus.q)
-    rest = dtype_limits(u.dtype).rest / jnp.sqrt(jnp.where(big > 0, big, 1.0))
-    return jnp.where(is_endless(modulus) & (big > 0), jnp.clip(u, -rest, rest), u)
+    rest = iteration_limits(reduced_time.dtype).rest / jnp.sqrt(jnp.where(big > 0, big, 1.0))
+    return jnp.where(
+        is_aperiodic(modulus) & (big > 0), jnp.clip(reduced_time, -rest, rest), reduced_time
+    )
 
 
-def duplicate(functions: Elliptic, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Elliptic:
+def functions_at_double_time(
+    functions: Elliptic, modulus: Modulus, mu: Scalar, phase_factor: Scalar
+) -> Elliptic:
     """Return the elliptic functions S, C, D and the phase ξ at the time 2u, from their values at
     the time u.
 
@@ -126,7 +130,9 @@ def duplicate(functions: Elliptic, modulus: Modulus, mu: Scalar, phase_factor: S
     return Elliptic(2.0 * S * C * D * r, C2, D2, x2 * scale, y2 * scale)
 
 
-def taylor_series(time: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Elliptic:
+def elliptic_taylor_series(
+    time: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar
+) -> Elliptic:
     """Compute the elliptic functions S, C, D and the phase ξ at a short time by Taylor series,
     exact to round-off for `√max(p, q) |time| ≤ 0.15`.
 
@@ -151,14 +157,14 @@ def taylor_series(time: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scal
     ]
     S = time * (functools.reduce(operator.add, terms) + 1.0)
     s = S * S
-    xi = phase_factor * growth_integral(S, modulus, mu)
+    xi = phase_factor * third_kind_integral_series(S, modulus, mu)
     z = xi * xi
     tangent = xi * (1.0 + z * (1 / 3 + z * (2 / 15 + z * (17 / 315))))
     one = jnp.ones_like(s)
     return Elliptic(S, jnp.sqrt(1.0 - modulus.p * s), jnp.sqrt(1.0 - modulus.q * s), one, tangent)
 
 
-def growth_integral(S: Scalar, modulus: Modulus, mu: Scalar) -> Scalar:
+def third_kind_integral_series(S: Scalar, modulus: Modulus, mu: Scalar) -> Scalar:
     """Return the integral ∫ S²/(1 + μS²) du over the time from 0 to u, for a small value `S` of the
     elliptic function at u.
 
@@ -191,12 +197,14 @@ def elliptic_functions(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Sc
     - `mu`: the number μ, between 0 and √(pq).
     - `phase_factor`: the constant factor κ.
 
-    The function `closed_form.orbit` computes `modulus`, `mu` and `phase_factor` for a body.
+    The function `closed_form_constants` computes `modulus`, `mu` and `phase_factor` for a body.
     """
-    n = dtype_limits(u.dtype).doublings
-    f = taylor_series(u * 2.0**-n, modulus, mu, phase_factor)
+    n = iteration_limits(u.dtype).doublings
+    f = elliptic_taylor_series(u * 2.0**-n, modulus, mu, phase_factor)
     # A loop compiles eight times sooner than nine copies of its body.
-    return jax.lax.fori_loop(0, n, lambda _, g: duplicate(g, modulus, mu, phase_factor), f)
+    return jax.lax.fori_loop(
+        0, n, lambda _, g: functions_at_double_time(g, modulus, mu, phase_factor), f
+    )
 
 
 class HalfPeriod(NamedTuple):
@@ -227,7 +235,7 @@ def half_period(modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> HalfPerio
     at_rest = big <= 0
     big = jnp.where(at_rest, 1.0, big)
     gap = jnp.abs(modulus.gap)
-    endless = is_endless(modulus)
+    endless = is_aperiodic(modulus)
     # Compute in units of λ: XLA may multiply the divisors below into one product, which must not
     # underflow.
     w = small / big
@@ -240,7 +248,7 @@ def half_period(modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> HalfPerio
     point, half, one = jnp.sqrt(1.0 + mu / big), jnp.full_like(a, 0.5), jnp.ones_like(a)
     start = (a, b, c, ratio, half, point, one, one)
     a, *_, total, _, _, sum_parts = jax.lax.fori_loop(
-        0, dtype_limits(a.dtype).agm, _arithmetic_geometric_mean_step, start
+        0, iteration_limits(a.dtype).agm, _arithmetic_geometric_mean_step, start
     )
     time = math.pi / (a * jnp.sqrt(big))
     # With turn = κ μ, the phase ξ of a quarter period is κ (π/2a) ½ μ/(λ² + μ) Σ, where Σ is

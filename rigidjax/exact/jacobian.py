@@ -18,18 +18,19 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
 from rigidjax.exact.components3 import Six, Triple
 from rigidjax.exact.jacobi_duplication import (
     Elliptic,
     Modulus,
-    dtype_limits,
-    duplicate,
-    growth_integral,
-    taylor_series,
+    elliptic_taylor_series,
+    functions_at_double_time,
+    iteration_limits,
+    third_kind_integral_series,
 )
-from rigidjax.exact.sigma_form import Differences, invariants
+from rigidjax.exact.sigma_form import Differences, motion_invariants
 
 
 class Integrals(NamedTuple):
@@ -43,15 +44,15 @@ class Integrals(NamedTuple):
     y: Scalar
 
 
-def jacobian_and_integral(
+def momentum_jacobian_and_integral(
     inverse_inertia: Differences,
     momentum: Triple,
     t: Scalar,
     half_time_integrals: Integrals,
     halves: Scalar,
-    whole_periods: Scalar,
-    mean_square: Scalar,
-) -> tuple[tuple, Six]:
+    duration_of_halves: Scalar,
+    mean_of_s_squared: Scalar,
+) -> tuple[tuple[Float[Array, "10"], ...], Six]:
     """Return two things: the derivatives of Π(t) − Π(0) with respect to ten variables, as three
     arrays (10,), one for each component of the body momentum Π; and the six entries of the matrix G
     = ∫ Π Πᵀ dt from 0 to t.
@@ -65,19 +66,21 @@ def jacobian_and_integral(
     - `half_time_integrals`: the elliptic functions and integrals at half of the reduced time. C and
       D belong to the axes as `inverse_inertia` numbers them.
     - `halves`: the number of half periods by which the time t was reduced.
-    - `whole_periods`: the length of these half periods together.
-    - `mean_square`: the mean of S² over a period, where S is the first elliptic function.
+    - `duration_of_halves`: the length of these half periods together.
+    - `mean_of_s_squared`: the mean of S² over a period, where S is the first elliptic function.
     """
     d12, d13, d23 = inverse_inertia[:3]
     p1, p2, p3 = momentum
-    _, A1, A2, A3, q, p, gap, *_ = invariants(inverse_inertia, momentum)
+    _, A1, A2, A3, q, p, gap, *_ = motion_invariants(inverse_inertia, momentum)
     m = Modulus(p, q, gap)
     three = gap > 0
     top = jnp.where(three, p, q)
-    after = double_argument(half_time_integrals, m, jnp.zeros_like(t), jnp.zeros_like(t))
+    after = functions_and_integrals_at_double_time(
+        half_time_integrals, m, jnp.zeros_like(t), jnp.zeros_like(t)
+    )
     S, C, D, *_ = after.f
-    grown2 = after.y2 + whole_periods * mean_square
-    grown = after.y + whole_periods * (1.0 - top * mean_square) / jnp.where(
+    grown2 = after.y2 + duration_of_halves * mean_of_s_squared
+    grown = after.y + duration_of_halves * (1.0 - top * mean_of_s_squared) / jnp.where(
         halves == 0, 1.0, jnp.abs(gap)
     )
 
@@ -163,7 +166,9 @@ def jacobian_and_integral(
     return rows, (g11, g22, g33, g12, g13, g23)
 
 
-def integrals(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Integrals:
+def elliptic_functions_and_integrals(
+    u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar
+) -> Integrals:
     """Return the elliptic functions S, C, D of a free body at the time u, as `elliptic_functions`
     does, and the integrals of S² and of S²/E² from 0 to u, where E is the one of D and C that has
     no zero.
@@ -172,19 +177,24 @@ def integrals(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> 
     - `modulus`: the parameters p and q of S, C and D.
     - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
     """
-    n = dtype_limits(u.dtype).doublings
-    f = taylor_series(u * 2.0**-n, modulus, mu, phase_factor)
+    n = iteration_limits(u.dtype).doublings
+    f = elliptic_taylor_series(u * 2.0**-n, modulus, mu, phase_factor)
     # The functions S²/D² and S²/C² are S²/(1 + μS²) with μ = −q and μ = −p.
     low = jnp.where(modulus.gap > 0, -modulus.q, -modulus.p)
     first = Integrals(
-        f, growth_integral(f.S, modulus, jnp.zeros_like(u)), growth_integral(f.S, modulus, low)
+        f,
+        third_kind_integral_series(f.S, modulus, jnp.zeros_like(u)),
+        third_kind_integral_series(f.S, modulus, low),
     )
     return jax.lax.fori_loop(
-        0, n, lambda _, g: double_argument(g, modulus, mu, phase_factor), first
+        0,
+        n,
+        lambda _, g: functions_and_integrals_at_double_time(g, modulus, mu, phase_factor),
+        first,
     )
 
 
-def double_argument(
+def functions_and_integrals_at_double_time(
     start: Integrals, modulus: Modulus, mu: Scalar, phase_factor: Scalar
 ) -> Integrals:
     """Return the elliptic functions of a free body and their integrals at the time 2u, from their
@@ -195,6 +205,6 @@ def double_argument(
     - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
     """
     f, three = start.f, modulus.gap > 0
-    after = duplicate(f, modulus, mu, phase_factor)
+    after = functions_at_double_time(f, modulus, mu, phase_factor)
     a, b = f.S / jnp.where(three, f.D, f.C), after.S / jnp.where(three, after.D, after.C)
     return Integrals(after, 2.0 * start.y2 + f.S * f.S * after.S, 2.0 * start.y + a * a * b)

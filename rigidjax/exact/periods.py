@@ -13,7 +13,7 @@ from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
 from rigidjax.exact import sigma_form
 from rigidjax.exact.components3 import HALF, Six, Triple, matvec
 from rigidjax.exact.derivatives import inverse_inertia_and_energy, motion_and_derivatives
-from rigidjax.exact.jacobi_duplication import Modulus, half_period, is_endless
+from rigidjax.exact.jacobi_duplication import Modulus, half_period, is_aperiodic
 from rigidjax.exact.principal_axes import components_along, principal_frame
 
 
@@ -98,9 +98,9 @@ def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Sca
     moments, axes = principal_frame(times_power_of_two(tensor, -largest_binary_exponent(tensor)))
     momentum = matvec(moments, components_along(axes, times_power_of_two(omega, -exponent)))
     body, _, _ = inverse_inertia_and_energy(moments, momentum)
-    v = sigma_form.invariants(body, momentum)
+    v = sigma_form.motion_invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
-    endless = is_endless(jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap)))
+    endless = is_aperiodic(jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap)))
     # If there is no period, the branch that is not taken gets other inputs, so that no derivative
     # is NaN.
     one, zero = jnp.ones_like(h), jnp.zeros_like(h)
@@ -109,7 +109,7 @@ def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Sca
         lambda a, b: jnp.where(endless, a, b), other, (moments, momentum)
     )
     body, _, _ = inverse_inertia_and_energy(safe_moments, safe_momentum)
-    period = sigma_form.period(sigma_form.invariants(body, safe_momentum))
+    period = sigma_form.momentum_period(sigma_form.motion_invariants(body, safe_momentum))
     angle = _precession_angle(safe_moments, safe_momentum, period)
     still = h == 0
     middle = 2.0 * math.pi * moments[1] / jnp.where(still, 1.0, h)
@@ -128,7 +128,7 @@ def _precession_angle(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
     - `period`: the period of the body rate, s.
     """
     body, k, _ = inverse_inertia_and_energy(moments, momentum)
-    v = sigma_form.invariants(body, momentum)
+    v = sigma_form.motion_invariants(body, momentum)
     about_three, h = v.a2 > 0, jnp.sqrt(v.h2)
     mu = jnp.where(about_three, body.d23 * v.a3, body.d12 * v.a1)
     rate = jnp.where(about_three, -body.d13, body.d13) * h * mu
@@ -138,7 +138,9 @@ def _precession_angle(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
 
 
 @_precession_angle.defjvp
-def _precession_angle_jvp(primals, tangents):
+def _precession_angle_jvp(
+    primals: tuple[Six, Triple, Scalar], tangents: tuple[Six, Triple, Scalar]
+) -> tuple[Scalar, Scalar]:
     """Return the angle, rad, by which a principal axis of a free body turns about the momentum in
     one period of the body rate, and the change of this angle for a change of the inputs. By this
     rule JAX differentiates `_precession_angle`.

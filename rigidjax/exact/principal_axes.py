@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from rigidjax._types import Mat3, Scalar, Vec3
 from rigidjax.exact.components3 import Six, Triple
@@ -47,7 +48,9 @@ def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
 
 
 @tensor_in_axes.defjvp
-def _tensor_in_axes_jvp(primals, tangents):
+def _tensor_in_axes_jvp(
+    primals: tuple[Mat3, Mat3, Triple], tangents: tuple[Mat3, PyTree, PyTree]
+) -> tuple[Six, Six]:
     """Return two things: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor I in
     principal axes, AᵀIA; and their change for a change of the tensor, with the axes A held fixed.
     By this rule JAX differentiates `tensor_in_axes`.
@@ -167,21 +170,24 @@ def _rotate_last_two_axes(
 
 
 def _exchange_to_ascending(
-    diagonal: Sequence[Scalar], axes: Sequence[Triple], i: int, j: int
+    eigenvalues: Sequence[Scalar], axes: Sequence[Triple], i: int, j: int
 ) -> tuple[Triple, tuple[Triple, ...]]:
-    """Return two things in ascending order of the entries i and j: the three eigenvalues
-    `diagonal`; and their `axes`, each as three components.
+    """Return two things after a comparison of the eigenvalues i and j: the three eigenvalues; and
+    their three axes, each as three components.
 
-    If diagonal[i] > diagonal[j], the eigenvalues and axes i and j are exchanged, and one of the two
-    axes is reversed, so that the axes stay right-handed.
+    If eigenvalue i is larger than eigenvalue j, the two eigenvalues and their axes are exchanged,
+    and one of the two axes is reversed, so that the axes stay right-handed.
+
+    - `eigenvalues`, `axes`: the three eigenvalues and their three axes before the comparison.
+    - `i`, `j`: two indices, 0 to 2.
     """
-    wrong = diagonal[i] > diagonal[j]
-    diagonal, axes = list(diagonal), list(axes)
-    diagonal[i], diagonal[j] = (
-        jnp.where(wrong, diagonal[j], diagonal[i]),
-        jnp.where(wrong, diagonal[i], diagonal[j]),
+    wrong = eigenvalues[i] > eigenvalues[j]
+    eigenvalues, axes = list(eigenvalues), list(axes)
+    eigenvalues[i], eigenvalues[j] = (
+        jnp.where(wrong, eigenvalues[j], eigenvalues[i]),
+        jnp.where(wrong, eigenvalues[i], eigenvalues[j]),
     )
     a, b = axes[i], axes[j]
     axes[i] = tuple(jnp.where(wrong, y, x) for x, y in zip(a, b, strict=True))
     axes[j] = tuple(jnp.where(wrong, -x, y) for x, y in zip(a, b, strict=True))
-    return tuple(diagonal), tuple(axes)
+    return tuple(eigenvalues), tuple(axes)

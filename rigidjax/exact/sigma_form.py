@@ -15,7 +15,7 @@ reads
     Π(t) ∝ adj(T) Π + σ T (Π × KΠ),   T and σ at t,   |Π(t)| = h
 
 Let now k = Π(t/2), let T and σ be taken at u = t/2, let W be the divisor of the last formula (see
-`Divisor`), and let `Y = ∫₀ᵘ σ² T⁻² du`, with `Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u)`. Then
+`DivisorTerms`), and let `Y = ∫₀ᵘ σ² T⁻² du`, with `Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u)`. Then
 
     G = ∫₀ᵗ Π Πᵀ dt = 2σ/(W det T) (adj(T)k)(adj(T)k)ᵀ − 2 adj(E₂ 1 − h² K) Y.
 
@@ -40,7 +40,12 @@ from jaxtyping import Array
 
 from rigidjax._types import Scalar
 from rigidjax.exact.components3 import Six, Triple, adjugate, commuting_product, determinant, matvec
-from rigidjax.exact.jacobi_duplication import Modulus, clip_at_rest, dtype_limits, is_endless
+from rigidjax.exact.jacobi_duplication import (
+    Modulus,
+    clip_time_on_separatrix,
+    is_aperiodic,
+    iteration_limits,
+)
 from rigidjax.rotation.barrier import barrier
 
 
@@ -106,7 +111,7 @@ class Sigma(NamedTuple):
     y: Six
 
 
-def invariants(inverse_inertia: Differences, momentum: Triple) -> Invariants:
+def motion_invariants(inverse_inertia: Differences, momentum: Triple) -> Invariants:
     """Return the constants of a free motion that its sigma functions need.
 
     - `inverse_inertia`: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
@@ -138,12 +143,12 @@ def invariants(inverse_inertia: Differences, momentum: Triple) -> Invariants:
     )
 
 
-# This many doublings are made in addition to the number in `dtype_limits`: two terms of the series
-# in `sigma_near_zero` are then enough.
+# This many doublings are made in addition to the number in `iteration_limits`: two terms of the
+# series in `sigma_by_taylor_series` are then enough.
 _MORE = 10
 
 
-def sigma_near_zero(u: Scalar, constants: Invariants) -> Sigma:
+def sigma_by_taylor_series(u: Scalar, constants: Invariants) -> Sigma:
     """Return the sigma functions of a free motion at a tiny time, from their Taylor series.
 
     - `u`: the time, so small that two terms of the series are exact to round-off.
@@ -168,7 +173,7 @@ def sigma_near_zero(u: Scalar, constants: Invariants) -> Sigma:
     return _normalised_sigma(s, _add_to_diagonal(t, 1.0), y)
 
 
-def double_sigma(sigma: Sigma, constants: Invariants) -> Sigma:
+def sigma_at_double_time(sigma: Sigma, constants: Invariants) -> Sigma:
     """Return the sigma functions of a free motion at the time 2u, from their values at the time u.
 
     - `sigma`: the values at the time u.
@@ -222,7 +227,7 @@ def double_sigma(sigma: Sigma, constants: Invariants) -> Sigma:
     return after._replace(y=barrier(tuple(2.0 * a + b for a, b in zip(sigma.y, more, strict=True))))
 
 
-class Divisor(NamedTuple):
+class DivisorTerms(NamedTuple):
     """Hold the terms and factors that do not depend on the body momentum Π in the divisor W of the
     addition theorem.
 
@@ -241,37 +246,45 @@ class Divisor(NamedTuple):
     less: Scalar
 
 
-def divisor(inverse_inertia: Differences, constants: Invariants, sigma: Sigma) -> Divisor:
+def momentum_divisor_terms(
+    inverse_inertia: Differences, constants: Invariants, sigma_of_step: Sigma
+) -> DivisorTerms:
     """Return the terms and factors that do not depend on the body momentum Π in the divisor W of
     the addition theorem for Π.
 
     - `inverse_inertia`: the differences and off-diagonal entries of K, the inverse of the inertia
       tensor.
     - `constants`: the invariants of the motion.
-    - `sigma`: the sigma functions at the time by which the theorem advances Π.
+    - `sigma_of_step`: the sigma functions at the duration of the step by which the theorem advances
+      Π.
     """
     one, three = (
         (inverse_inertia.d12, inverse_inertia.d12, inverse_inertia.k12),
         (inverse_inertia.d23, -inverse_inertia.d23, -inverse_inertia.k23),
     )
-    first, (t1, _, t3, t12, t13, t23) = constants.gap > 0, sigma.t
+    first, (t1, _, t3, t12, t13, t23) = constants.gap > 0, sigma_of_step.t
     d, slant, k = (jnp.where(first, a, b) for a, b in zip(one, three, strict=True))
     t, off = jnp.where(first, t1, t3), jnp.where(first, t12, t23)
     less = jnp.where(first, inverse_inertia.k23, inverse_inertia.k12)
     square = t * t + off * off + t13 * t13
-    return Divisor(first, square, inverse_inertia.d13 * d, slant, k, constants.h2 * (less * less))
+    return DivisorTerms(
+        first, square, inverse_inertia.d13 * d, slant, k, constants.h2 * (less * less)
+    )
 
 
-def momentum_and_integral_term(
-    inverse_inertia: Differences, terms: Divisor, sigma: Sigma, momentum: Triple
+def advance_momentum_and_integral_term(
+    inverse_inertia: Differences,
+    divisor_terms: DivisorTerms,
+    sigma_of_step: Sigma,
+    momentum: Triple,
 ) -> tuple[Triple, Six]:
     """Return two things: the body momentum after a step of time u; and the first term of the
     integral G = ∫ Π Πᵀ dt, as the six entries of a symmetric matrix.
 
     - `inverse_inertia`: the differences and off-diagonal entries of K, the inverse of the inertia
       tensor.
-    - `terms`: the terms of the divisor W that do not depend on Π.
-    - `sigma`: the sigma functions σ and T at the time u.
+    - `divisor_terms`: the terms of the divisor W that do not depend on Π.
+    - `sigma_of_step`: the sigma functions σ and T at the time u, the duration of the step.
     - `momentum`: the three components of the body momentum Π before the step.
 
     The first term is 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ, with Π = `momentum`. It belongs to the
@@ -286,36 +299,41 @@ def momentum_and_integral_term(
     u2 = d13 * p1 * p3 + p3 * r1 - p1 * r3
     u3 = -d12 * p1 * p2 + p1 * r2 - p2 * r1
     adj, turned = barrier(
-        (matvec(sigma.adjugate, momentum), matvec(sigma.t, barrier((u1, u2, u3))))
+        (matvec(sigma_of_step.adjugate, momentum), matvec(sigma_of_step.t, barrier((u1, u2, u3))))
     )
-    end = jnp.where(terms.first, p1, p3)
-    z = terms.d * (end * end) + 2.0 * (
-        d13 * (terms.k * (end * p2)) + terms.slant * (k13 * (p1 * p3))
+    end = jnp.where(divisor_terms.first, p1, p3)
+    z = divisor_terms.d * (end * end) + 2.0 * (
+        d13 * (divisor_terms.k * (end * p2)) + divisor_terms.slant * (k13 * (p1 * p3))
     )
-    z = z + (r1 * r1 + r2 * r2 + r3 * r3 - terms.less)
-    r, (a1, a2, a3) = barrier(1.0 / (terms.square + sigma.s * sigma.s * z)), adj
-    c = barrier(2.0 * sigma.s * r / sigma.det)
+    z = z + (r1 * r1 + r2 * r2 + r3 * r3 - divisor_terms.less)
+    r, (a1, a2, a3) = (
+        barrier(1.0 / (divisor_terms.square + sigma_of_step.s * sigma_of_step.s * z)),
+        adj,
+    )
+    c = barrier(2.0 * sigma_of_step.s * r / sigma_of_step.det)
     part = tuple(c * x for x in (a1 * a1, a2 * a2, a3 * a3, a1 * a2, a1 * a3, a2 * a3))
-    return barrier((tuple((a + sigma.s * b) * r for a, b in zip(adj, turned, strict=True)), part))
+    return barrier(
+        (tuple((a + sigma_of_step.s * b) * r for a, b in zip(adj, turned, strict=True)), part)
+    )
 
 
-def momentum_and_integral_by_quarters(
-    inverse_inertia: Differences, momentum: Triple, constants: Invariants, span: Scalar
+def momentum_and_integral_in_four_parts(
+    inverse_inertia: Differences, momentum: Triple, constants: Invariants, duration: Scalar
 ) -> tuple[Triple, Six]:
-    """Return two things: the body momentum Π after the time `span`; and the integral ∫ Π Πᵀ dt over
-    this time, as the six entries of a symmetric matrix.
+    """Return two things: the body momentum Π after the time `duration`; and the integral ∫ Π Πᵀ dt
+    over this time, as the six entries of a symmetric matrix.
 
     - `inverse_inertia`: the differences and off-diagonal entries of K, the inverse of the inertia
       tensor.
     - `momentum`: the three components of Π(0).
     - `constants`: the invariants of the motion.
-    - `span`: the time, of either sign.
+    - `duration`: the time, of either sign.
 
     The time is divided into four equal parts, because the matrix T of the sigma functions has no
     inverse at a quarter period.
     """
-    sigma, hh = sigma_at(0.125 * span, constants), constants.h2
-    terms = barrier(divisor(inverse_inertia, constants, sigma))
+    sigma, hh = sigma_functions_at(0.125 * duration, constants), constants.h2
+    terms = barrier(momentum_divisor_terms(inverse_inertia, constants, sigma))
     k12, k13, k23 = (hh * c for c in inverse_inertia[3:])
     b = (
         -constants.a2 * constants.a3 - k23 * k23,
@@ -329,7 +347,7 @@ def momentum_and_integral_by_quarters(
     def take_eighth(i, state):
         # The integral over each of the four parts is computed from Π at the middle of the part.
         point, total = state
-        point, part = momentum_and_integral_term(inverse_inertia, terms, sigma, point)
+        point, part = advance_momentum_and_integral_term(inverse_inertia, terms, sigma, point)
         odd = i % 2 == 1
         return point, tuple(a + jnp.where(odd, c, 0.0) for a, c in zip(total, part, strict=True))
 
@@ -338,18 +356,18 @@ def momentum_and_integral_by_quarters(
     )
 
 
-def sigma_at(u: Scalar, constants: Invariants) -> Sigma:
+def sigma_functions_at(u: Scalar, constants: Invariants) -> Sigma:
     """Return the sigma functions of a free motion at the time u, from their Taylor series at the
     time u/2ⁿ and n doublings.
 
     `constants` are the invariants of the motion.
     """
-    n = dtype_limits(u.dtype).doublings + _MORE
-    f = sigma_near_zero(u * 2.0**-n, constants)
-    return jax.lax.fori_loop(0, n, lambda _, g: double_sigma(g, constants), f)
+    n = iteration_limits(u.dtype).doublings + _MORE
+    f = sigma_by_taylor_series(u * 2.0**-n, constants)
+    return jax.lax.fori_loop(0, n, lambda _, g: sigma_at_double_time(g, constants), f)
 
 
-def period(constants: Invariants) -> Scalar:
+def momentum_period(constants: Invariants) -> Scalar:
     """Return the time after which the body momentum Π of a free motion repeats, from the invariants
     of the motion.
 
@@ -392,11 +410,11 @@ def period(constants: Invariants) -> Scalar:
     root = barrier(jnp.sqrt(slope(x1, x2, x3)))
     a, b = 0.5 * jnp.sqrt(x1 + x2 + x3 + 2.0 * root), jnp.sqrt(root)
     mean = lambda _, x: (0.5 * (x[0] + x[1]), jnp.sqrt(x[0] * x[1]))  # noqa: E731
-    a, b = jax.lax.fori_loop(0, dtype_limits(a.dtype).agm, mean, (a, b))
+    a, b = jax.lax.fori_loop(0, iteration_limits(a.dtype).agm, mean, (a, b))
     return 2.0 * jnp.pi / a
 
 
-def momentum_and_integral(
+def momentum_and_outer_product_integral(
     inverse_inertia: Differences, momentum: Triple, t: Scalar
 ) -> tuple[Triple, Six]:
     """Return two things: the body momentum Π(t) of a free body; and G = ∫₀ᵗ Π Πᵀ dt, as the six
@@ -407,23 +425,25 @@ def momentum_and_integral(
     - `momentum`: the three components of Π(0).
     - `t`: the time, of either sign and any size.
     """
-    v = barrier(invariants(inverse_inertia, momentum))
+    v = barrier(motion_invariants(inverse_inertia, momentum))
     m = jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap))
-    endless = is_endless(m)
+    endless = is_aperiodic(m)
     # If there is no period, dummy invariants keep NaN out of the derivatives.
     one, zero = jnp.ones_like(t), jnp.zeros_like(t)
     tame = Invariants(one, one, one, one, zero, one, one, zero, zero, zero)
     usual = jax.tree.map(lambda a, b: jnp.where(endless, b, a), v, tame)
-    count = jnp.round(t / jnp.where(endless, jnp.inf, period(jax.lax.stop_gradient(usual))))
+    count = jnp.round(
+        t / jnp.where(endless, jnp.inf, momentum_period(jax.lax.stop_gradient(usual)))
+    )
     several = count != 0
     usual = barrier(jax.tree.map(lambda a, b: jnp.where(several, a, b), v, tame))
-    whole = barrier(period(usual))
-    r = 2.0 * clip_at_rest(0.5 * (t - jnp.where(several, count * whole, 0.0)), m)
+    whole = barrier(momentum_period(usual))
+    r = 2.0 * clip_time_on_separatrix(0.5 * (t - jnp.where(several, count * whole, 0.0)), m)
 
     # Compute the reduced time and one whole period in one loop.
     both = jax.tree.map(lambda *a: jnp.stack(a), (v, r), (usual, whole))
     out, g = jax.lax.map(
-        lambda a: momentum_and_integral_by_quarters(inverse_inertia, momentum, *a), both
+        lambda a: momentum_and_integral_in_four_parts(inverse_inertia, momentum, *a), both
     )
     g = tuple(c[0] + jnp.where(several, count * c[1], 0.0) for c in g)
     return tuple(p[0] for p in out), g
@@ -445,16 +465,16 @@ def _normalised_sigma(sigma: Scalar, t_matrix: Six, integral: Six) -> Sigma:
     return Sigma(sigma, t_matrix, *barrier((adjugate(t_matrix), determinant(t_matrix))), integral)
 
 
-def _scaled_matrix(matrix: Six, factor) -> Six:
+def _scaled_matrix(matrix: Six, factor: Scalar | float) -> Six:
     """Return the six entries of a symmetric matrix, each multiplied by the scalar `factor`."""
     return tuple(c * factor for c in matrix)
 
 
-def _add_to_diagonal(matrix: Six, number) -> Six:
+def _add_to_diagonal(matrix: Six, summand: Scalar | float) -> Six:
     """Return the six entries (11, 22, 33, 12, 13, 23) of the matrix A + x 1, for a symmetric matrix
     A and a number x.
 
     - `matrix`: the six entries of A, in the same order.
-    - `number`: x, a scalar.
+    - `summand`: x, a scalar.
     """
-    return (matrix[0] + number, matrix[1] + number, matrix[2] + number, *matrix[3:])
+    return (matrix[0] + summand, matrix[1] + summand, matrix[2] + summand, *matrix[3:])

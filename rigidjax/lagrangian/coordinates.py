@@ -62,9 +62,9 @@ class LagrangeEquations(eqx.Module):
 
     def __call__(self, t: ScalarLike, y: Coordinates, args: object = None) -> Coordinates:
         q, rate = y.q, y.rate
-        momentum = jax.grad(self._value, argnums=1)
+        momentum = jax.grad(self._lagrangian_value, argnums=1)
         _, carried = jax.jvp(lambda x: momentum(x, rate), (q,), (rate,))
-        push = jax.grad(self._value)(q, rate) - carried
+        push = jax.grad(self._lagrangian_value)(q, rate) - carried
         if self.force is not None:
             push = push + _checks.array_of_shape(self.force(t, q, rate), q.shape, "force")
         return Coordinates(
@@ -76,19 +76,19 @@ class LagrangeEquations(eqx.Module):
 
         It is conserved without a `force`, if L does not depend on the time.
         """
-        momentum = jax.grad(self._value, argnums=1)(y.q, y.rate)
-        return jnp.sum(y.rate * momentum) - self._value(y.q, y.rate)
+        momentum = jax.grad(self._lagrangian_value, argnums=1)(y.q, y.rate)
+        return jnp.sum(y.rate * momentum) - self._lagrangian_value(y.q, y.rate)
 
-    def _value(self, q: Array, rate: Array) -> Scalar:
+    def _lagrangian_value(self, q: Array, q_rate: Array) -> Scalar:
         """Return the value of the Lagrangian, J, a scalar.
 
         - `q`: (n,) the coordinates.
-        - `rate`: (n,) their rates, the derivatives with respect to time.
+        - `q_rate`: (n,) their rates, the derivatives with respect to time.
 
         An error is raised unless the user's function returns one number.
         """
         return _checks.array_of_shape(
-            self.lagrangian(q, rate), (), "lagrangian", hint="one number, J"
+            self.lagrangian(q, q_rate), (), "lagrangian", hint="one number, J"
         )
 
 
@@ -203,22 +203,24 @@ def from_attitude(state: HasAttitude) -> Coordinates:
 
 
 def _solve_for_acceleration(
-    matrix: Float[Array, "n n"], push: Float[Array, " n"]
+    mass_matrix: Float[Array, "n n"], generalised_force: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """Return the second time derivatives q̈ (n,) of n coordinates q, the solution of M q̈ = F.
 
-    - `matrix`: (n, n) M = ∂²L/∂q̇∂q̇, the second derivatives of the Lagrangian L with respect to
-      the rates q̇.
-    - `push`: (n,) F, the sum of the generalised forces and of all terms of Lagrange's equations
-      without q̈.
+    - `mass_matrix`: (n, n) M = ∂²L/∂q̇∂q̇, the second derivatives of the Lagrangian L with respect
+      to the rates q̇.
+    - `generalised_force`: (n,) F, the sum of the generalised forces and of all terms of Lagrange's
+      equations without q̈.
     """
-    n = push.shape[0]
+    n = generalised_force.shape[0]
     if n == 1:
-        return push / matrix[0]
+        return generalised_force / mass_matrix[0]
     if n == 2:
-        (a, b), (c, d) = matrix
-        x, y = push
+        (a, b), (c, d) = mass_matrix
+        x, y = generalised_force
         return jnp.stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)
     if n == 3:
-        return linalg3.solve(matrix, push)
-    return lx.linear_solve(lx.MatrixLinearOperator(matrix), push, lx.LU(), throw=False).value
+        return linalg3.solve(mass_matrix, generalised_force)
+    return lx.linear_solve(
+        lx.MatrixLinearOperator(mass_matrix), generalised_force, lx.LU(), throw=False
+    ).value

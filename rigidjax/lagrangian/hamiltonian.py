@@ -68,7 +68,9 @@ class LiePoisson(eqx.Module):
     hamiltonian: Callable[[Any], Any]
 
     def __call__(self, t: ScalarLike, y: Momentum, args: object = None) -> Momentum:
-        return Momentum(cross(y.pi, jax.grad(lambda p: _checked_scalar(self.hamiltonian(p)))(y.pi)))
+        return Momentum(
+            cross(y.pi, jax.grad(lambda p: _require_scalar_energy(self.hamiltonian(p)))(y.pi))
+        )
 
 
 class LiePoissonWithDirection(eqx.Module):
@@ -85,7 +87,7 @@ class LiePoissonWithDirection(eqx.Module):
     def __call__(
         self, t: ScalarLike, y: MomentumAndDirection, args: object = None
     ) -> MomentumAndDirection:
-        value = lambda p, g: _checked_scalar(self.hamiltonian(p, g))  # noqa: E731
+        value = lambda p, g: _require_scalar_energy(self.hamiltonian(p, g))  # noqa: E731
         turn, pull = jax.grad(value, argnums=(0, 1))(y.pi, y.gamma)
         return MomentumAndDirection(cross(y.pi, turn) + cross(y.gamma, pull), cross(y.gamma, turn))
 
@@ -206,7 +208,7 @@ class HeavyTopHamiltonian(eqx.Module):
         return MomentumAndDirection(pi, quaternion.rotate_inverse(state.q, self.top.gravity))
 
 
-def _checked_scalar(value):
+def _require_scalar_energy(value: Any) -> Scalar:
     """Return the value of a Hamiltonian, J, as a scalar array.
 
     - `value`: what the user's function of the Hamiltonian returned.

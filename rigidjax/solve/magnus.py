@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from rigidjax._types import RealLike
 from rigidjax.exact.components3 import Four, Triple, add, cross
-from rigidjax.exact.diffrax_solver import field_of
+from rigidjax.exact.diffrax_solver import field_and_direction
 from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations, project_to_group
 from rigidjax.motion.torques.base import may_read_attitude
@@ -105,7 +105,7 @@ class Magnus4(dfx.AbstractSolver):
         y0: PyTree,
         args: PyTree,
     ) -> None:
-        field, _ = field_of(terms)
+        field, _ = field_and_direction(terms)
         require_independent_of_attitude(
             require_attitude_equations("Magnus4", field, y0, "RungeKutta4").euler.torque
         )

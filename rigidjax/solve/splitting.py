@@ -26,8 +26,8 @@ from rigidjax.exact.components3 import (
     determinant,
     matvec,
 )
-from rigidjax.exact.derivatives import flow
-from rigidjax.exact.diffrax_solver import field_of
+from rigidjax.exact.derivatives import free_momentum_and_rotation
+from rigidjax.exact.diffrax_solver import field_and_direction
 from rigidjax.exact.principal_axes import combine_columns, components_along, principal_frame
 from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations
@@ -159,7 +159,7 @@ class AbstractSplitting(dfx.AbstractSolver):
         y0: PyTree,
         args: PyTree,
     ) -> Frame:
-        return frame_of(field_of(terms)[0], y0)
+        return frame_of(field_and_direction(terms)[0], y0)
 
     def step(
         self,
@@ -171,7 +171,7 @@ class AbstractSplitting(dfx.AbstractSolver):
         solver_state: Frame,
         made_jump: Bool[ArrayLike, ""],
     ) -> Any:
-        field, way = field_of(terms)
+        field, way = field_and_direction(terms)
         state, h = (y0.q, enter(solver_state, y0.omega)), jnp.asarray(t1 - t0) * way
         dq, dp = compose(self.composition, field, solver_state, jnp.asarray(t0) * way, h, state)
         # Only the change of the momentum is converted to a change of the body rate Ω. To convert
@@ -311,7 +311,7 @@ def compose(
         drift, kick = weights
         length = drift.astype(dtype)
         momentum = add(state[1], change)
-        _, (w, x, y, z) = flow(frame.moments, momentum, length)
+        _, (w, x, y, z) = free_momentum_and_rotation(frame.moments, momentum, length)
         # The components of the momentum along the body axes change, because the axes turn. Only the
         # change is computed and added, so that the rounding error of |Π| is that of the change,
         # which is small.

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from rigidjax._checks import escape_formulas
 from rigidjax.workprecision.pareto import first_answers, pareto_front
-from rigidjax.workprecision.record import Measurement, list_records
+from rigidjax.workprecision.record import Measurement, require_measurements
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,7 +30,7 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
     **Raises:** `ModuleNotFoundError` if matplotlib is missing (`pip install 'rigidjax[view]'`);
     `ValueError` if there is nothing to draw.
     """
-    records = [r for r in list_records(records) if r.error == r.error]
+    records = [r for r in require_measurements(records) if r.error == r.error]
     if not records:
         raise ValueError("draw: wanted records with an error and a time, got none")
     import matplotlib.pyplot as plt
@@ -50,14 +50,14 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
     labels = list(dict.fromkeys((r.label, r.group) for r in records))
     for row, name in zip(axes, names, strict=True):
         if asked:
-            _draw_reached_errors(row[-1], [r for r in asked if r.scene == name], labels)
+            _draw_error_against_tolerance(row[-1], [r for r in asked if r.scene == name], labels)
             row[-1].set_title(escape_formulas(f"{name}: asked and reached"), fontsize=10)
         for axis, (kind, words, times) in zip(row, panels, strict=False):
             of = [r for r in times if (r.scene, r.kind) == (name, kind)]
             if not of:
                 axis.set_axis_off()
                 continue
-            _draw_times(axis, of, labels)
+            _draw_time_against_error(axis, of, labels)
             what = "error of the attitude, rad" if kind == "value" else "relative error"
             if name in ("foucault", "arenstorf") and kind == "value":
                 what = "relative error of the place"
@@ -76,9 +76,9 @@ def _errors_and_times(records: list[Measurement]) -> tuple[list[float], list[flo
     return [max(r.error, 1e-16) for r in records], [1e3 * r.time for r in records]
 
 
-def _curves_of_methods(
+def _records_and_style_of_methods(
     records: list[Measurement], labels: list[tuple[str, str]]
-) -> Iterator[tuple[list, dict]]:
+) -> Iterator[tuple[list[Measurement], dict[str, Any]]]:
     """Yield, for each method that was measured, two things: its measurements in the order of their
     settings; and the style of its curve, as arguments of matplotlib.
 
@@ -105,7 +105,7 @@ def _curves_of_methods(
         )  # fmt: skip
 
 
-def _draw_reached_errors(
+def _draw_error_against_tolerance(
     axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]
 ) -> None:
     """Draw the error that each method reached against the tolerance or accuracy that was asked for,
@@ -116,15 +116,17 @@ def _draw_reached_errors(
       setting.
     - `labels`: the label and the group (`ours`, `jax` or `peer`) of each method.
     """
-    for of, how in _curves_of_methods(records, labels):
+    for of, how in _records_and_style_of_methods(records, labels):
         axis.plot([r.setting for r in of], [max(r.error, 1e-16) for r in of], **how)
     wanted = sorted(r.setting for r in records)
     axis.plot(wanted, wanted, color="0.6", linewidth=6, alpha=0.3, zorder=0, label="as asked")
     axis.set(xlabel="tolerance or accuracy asked for", ylabel="error reached")
-    _style_axis(axis)
+    _set_logarithmic_scales(axis)
 
 
-def _draw_times(axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]) -> None:
+def _draw_time_against_error(
+    axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]
+) -> None:
     """Draw the time of a run against the error for each method, on matplotlib axes, with the Pareto
     fronts (measurements that no other one beats in both error and time).
 
@@ -133,7 +135,7 @@ def _draw_times(axis: "Axes", records: list[Measurement], labels: list[tuple[str
       setting; all are of values, or all of gradients.
     - `labels`: the label and the group (`ours`, `jax` or `peer`) of each method.
     """
-    for of, how in _curves_of_methods(records, labels):
+    for of, how in _records_and_style_of_methods(records, labels):
         bars = [
             [max(1e3 * (r.time - r.time_low), 0.0) for r in of],
             [max(1e3 * (r.time_high - r.time), 0.0) for r in of],
@@ -154,10 +156,10 @@ def _draw_times(axis: "Axes", records: list[Measurement], labels: list[tuple[str
         )
     ringed: dict[str, Any] = dict(color="k", markerfacecolor="none", markersize=9, zorder=5)
     axis.plot(*_errors_and_times(pareto_front(records)), "o", **ringed)
-    _style_axis(axis)
+    _set_logarithmic_scales(axis)
 
 
-def _style_axis(axis: "Axes") -> None:
+def _set_logarithmic_scales(axis: "Axes") -> None:
     """Set logarithmic scales on matplotlib axes, with smaller errors to the right, and add a grid
     and a legend.
     """

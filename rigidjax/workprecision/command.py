@@ -13,9 +13,9 @@ from rigidjax.workprecision.measurement import long_drift, measure, to_float32
 from rigidjax.workprecision.peers import methods
 from rigidjax.workprecision.record import (
     Measurement,
-    differences,
     read_csv,
     records_to_store,
+    sentences_about_changes,
     write_csv,
 )
 from rigidjax.workprecision.standard_scenes import scenes
@@ -109,7 +109,7 @@ def run_subcommand(options: argparse.Namespace) -> int:
         return 2
     if before is None:
         return 0
-    wrong, paced = differences(records, before)
+    wrong, paced = sentences_about_changes(records, before)
     lines = [*(f"moved: {line}" for line in wrong), *(f"time: {line}" for line in paced)]
     print("\n".join(lines or ["nothing moved"]))
     return 1 if wrong else 0
@@ -154,7 +154,7 @@ def summary(records: Iterable[Measurement]) -> str:
     lines: list[str] = []
     for scene in dict.fromkeys(r.scene for r in records):
         if scene.startswith(DRIFT):
-            lines += _drift_lines(scene, [r for r in records if r.scene == scene])
+            lines += _text_lines_of_drifts(scene, [r for r in records if r.scene == scene])
             continue
         for kind in ("value", "gradient"):
             of = [r for r in records if (r.scene, r.kind) == (scene, kind)]
@@ -174,7 +174,7 @@ def summary(records: Iterable[Measurement]) -> str:
     return "\n".join(lines)
 
 
-def _drift_lines(scene: str, records: list[Measurement]) -> list[str]:
+def _text_lines_of_drifts(scene: str, records: list[Measurement]) -> list[str]:
     """Return the lines of text that show the largest drifts, in a long run, of the energy and of
     the momentum along gravity for each method.
 

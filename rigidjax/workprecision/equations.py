@@ -19,8 +19,14 @@ def heavy_top_torque(
     cos: Callable[[Number], Number],
     to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
-    """Return the torque `τ = m c × Rᵀg`; `constants` are m c (3), mass times centre, and gravity g
-    (3).
+    """Return the torque of the weight in body axes, `τ = m c × Rᵀg`, as a function of the time, of
+    the quaternion of the attitude R and of the body rate.
+
+    - `constants`: six numbers, the mass m times the centre of mass c (3), body axes, and gravity g
+      (3), world axes.
+    - `to_body`: a function (q, x, y, z) that returns the vector (x, y, z) of the world in body
+      axes, for the quaternion q.
+    - `inertia`, `sin`, `cos`: not used here; all torques of this module have the same arguments.
     """
     cx, cy, cz, gx, gy, gz = constants
 
@@ -38,10 +44,16 @@ def gravity_gradient_torque(
     cos: Callable[[Number], Number],
     to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
-    """Return the torque `τ = 3n² r × I r` on a circular orbit about a planet.
+    """Return the torque of gravity on a body on a circular orbit about a planet, `τ = 3n² r × I r`,
+    as a function of the time, of the quaternion of the attitude and of the body rate.
 
-    r is the unit vector along the line to the planet, in body axes; `constants` is the orbital rate
-    n alone, and `inertia` has Ixx, Iyy, Izz, Ixy, Ixz, Iyz.
+    Here r is the unit vector along the line to the planet, and τ and r are in body axes.
+
+    - `inertia`: the entries Ixx, Iyy, Izz, Ixy, Ixz, Iyz of the inertia tensor I.
+    - `constants`: one number, the orbital rate n, rad/s.
+    - `sin`, `cos`: the sine and the cosine for these numbers.
+    - `to_body`: a function (q, x, y, z) that returns the vector (x, y, z) of the world in body
+      axes, for the quaternion q.
     """
     (n,) = constants
     ixx, iyy, izz, ixy, ixz, iyz = inertia
@@ -64,9 +76,13 @@ def gyrostat_torque(
     cos: Callable[[Number], Number],
     to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
-    """Return the torque `τ = h × Ω − c Ω` of a wheel at constant speed, and of damping.
+    """Return the torque of a wheel at constant speed and of damping, `τ = h × Ω − c Ω`, in body
+    axes, as a function of the time, of the quaternion of the attitude and of the body rate Ω.
 
-    `constants` are the angular momentum h (3) of the wheel and the damping coefficients c (3).
+    - `constants`: six numbers, the angular momentum h (3) of the wheel and the damping coefficients
+      c (3), one for each body axis.
+    - `inertia`, `sin`, `cos`, `to_body`: not used here; all torques of this module have the same
+      arguments.
     """
     hx, hy, hz, cx, cy, cz = constants
 
@@ -82,7 +98,9 @@ def gyrostat_torque(
 
 
 def to_body_axes(q, x, y, z):
-    """Return `Rᵀ(x, y, z)`, the vector in body axes, for a unit quaternion q of the matrix R."""
+    """Return the vector (x, y, z) of the world in body axes, Rᵀ(x, y, z), as three numbers, where R
+    is the rotation matrix, body → world, of the unit quaternion q.
+    """
     a, b, c, d = q
     return (
         (1 - 2 * (c * c + d * d)) * x + 2 * (b * c + a * d) * y + 2 * (b * d - a * c) * z,
@@ -91,10 +109,15 @@ def to_body_axes(q, x, y, z):
     )
 
 
-def body_rates(inertia: Sequence[Number], torque: Torque | None) -> Callable[[Number, Any], Any]:
-    """Return the vector field `(t, y) → dy/dt` of a body; y has 7 numbers, the quaternion q and Ω.
+def body_vector_field(
+    inertia: Sequence[Number], torque: Torque | None
+) -> Callable[[Number, Any], Any]:
+    """Return the vector field `(t, y) → dy/dt` of a body, where y has 7 numbers: the quaternion q
+    (w, x, y, z) of the attitude, and the body rate Ω.
 
-    `inertia` has Ixx, Iyy, Izz, Ixy, Ixz, Iyz; `torque` is a function of t, q and Ω, or `None`.
+    - `inertia`: the entries Ixx, Iyy, Izz, Ixy, Ixz, Iyz of the inertia tensor.
+    - `torque`: a function of t, q and Ω that returns the torque in body axes, or `None` for a free
+      body.
     """
     ixx, iyy, izz, ixy, ixz, iyz = inertia
     kxx, kyy, kzz = iyy * izz - iyz * iyz, ixx * izz - ixz * ixz, ixx * iyy - ixy * ixy
@@ -124,13 +147,15 @@ def body_rates(inertia: Sequence[Number], torque: Torque | None) -> Callable[[Nu
     return rates
 
 
-def foucault_rates(
+def foucault_vector_field(
     constants: Sequence[Number], sqrt: Callable[[Number], Number]
 ) -> Callable[[Number, Any], Any]:
-    """Return the vector field `(t, y) → dy/dt` of a pendulum on the turning Earth.
+    """Return the vector field `(t, y) → dy/dt` of a pendulum on the turning Earth, where y has 6
+    numbers: the position of the bob from the pivot, and its velocity, in the axes east, north, up.
 
-    y has 6 numbers, the position and velocity in the axes east, north, up; `constants` are g and
-    the components of Ω along north and up.
+    - `constants`: three numbers, the gravity g, and the components of the angular velocity of the
+      Earth along north and up.
+    - `sqrt`: the square root for these numbers, which is not used here.
     """
     g, wn, wu = constants
 
@@ -147,12 +172,15 @@ def foucault_rates(
     return rates
 
 
-def three_body_rates(
+def three_body_vector_field(
     constants: Sequence[Number], sqrt: Callable[[Number], Number]
 ) -> Callable[[Number, Any], Any]:
-    """Return the vector field `(t, y) → dy/dt` of the circular restricted three-body problem.
+    """Return the vector field `(t, y) → dy/dt` of the circular restricted three-body problem, where
+    y has 6 numbers: the position and the velocity in the rotating frame, in the usual units (the
+    distance of the two large bodies, their total mass and the rate of the frame are 1).
 
-    y has 6 numbers, the position and velocity in the rotating frame; `constants` is μ alone.
+    - `constants`: one number μ, the mass of the smaller of the two large bodies.
+    - `sqrt`: the square root for these numbers.
     """
     (mu,) = constants
     nu = 1 - mu

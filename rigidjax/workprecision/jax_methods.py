@@ -29,14 +29,17 @@ MODES = {"forward": jax.jacfwd, "reverse": jax.grad}
 
 # A flow is a function of the scene's numbers and of the setting; it returns the last state as a
 # vector, and the number of steps.
-Flow = Callable[[Any, Any], tuple[Any, Any]]
-Make = Callable[[BenchmarkScene], Flow | None]
+Flow = Callable[[Array, Array], tuple[Array, Array]]
+MakeFlow = Callable[[BenchmarkScene], Flow | None]
 
 
 def compile_flow(scene: BenchmarkScene, flow: Flow) -> PreparedMethod:
-    """Return `flow` compiled for `scene`, once for all settings.
+    """Return a flow compiled for a scene, once for all settings.
 
-    Its arguments are numbers only, as in the call of a user.
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
+    - `flow`: a function of the scene's numbers and of a setting that returns two things: the last
+      state, or a gradient, as one vector; and the number of steps. Both arguments are traced, as if
+      a user gave new numbers at each call.
     """
     numbers = scene.numbers
     start = time.perf_counter()
@@ -56,7 +59,9 @@ def compile_flow(scene: BenchmarkScene, flow: Flow) -> PreparedMethod:
     return PreparedMethod(run, spent, held)
 
 
-def flow_of(scene: BenchmarkScene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]) -> Flow:
+def flow_from_run(
+    scene: BenchmarkScene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]
+) -> Flow:
     """Return the flow of `run` on a scene: a function of the scene's numbers and the setting.
 
     `run(body, state0, ts, setting)` returns two things: the states at `ts`, which are the first and
@@ -71,7 +76,7 @@ def flow_of(scene: BenchmarkScene, run: Callable[[Any, Any, Any, Any], tuple[Any
     return flow
 
 
-def _closed_form_flow(scene: BenchmarkScene) -> Flow | None:
+def _flow_of_closed_form(scene: BenchmarkScene) -> Flow | None:
     """Return the flow of the closed form of the free body, or `None` for a `scene` (a motion to
     run) with a torque or without a body, for which there is no closed form.
 
@@ -84,30 +89,30 @@ def _closed_form_flow(scene: BenchmarkScene) -> Flow | None:
         end: Any = FreeBody(body, start)(ts[1])
         return jax.tree.map(lambda leaf: leaf[None], end), jnp.zeros(())
 
-    return flow_of(scene, run) if scene.torque is None and scene.body is not None else None
+    return flow_from_run(scene, run) if scene.torque is None and scene.body is not None else None
 
 
-def _simulate_flow(scene: BenchmarkScene, accuracy: bool = False) -> Flow | None:
+def _flow_of_simulate(scene: BenchmarkScene, setting_is_accuracy: bool = False) -> Flow | None:
     """Return the flow of `simulate` with its defaults, or `None` for a `scene` (a motion to run)
     without a torque, to which `simulate` applies the closed form.
 
     A flow is a function of the scene's numbers (inertia, initial rate and attitude; or position and
     velocity of a point) and of a setting, here the tolerance; it returns two things: the last state
     as a vector; and the number of steps. The tolerance is traced, so that one compiled program
-    serves all settings. If `accuracy` is true, the setting is not the tolerance but the argument
-    `accuracy` of `simulate`, the wanted error of the result.
+    serves all settings. If `setting_is_accuracy` is true, the setting is not the tolerance but the
+    argument `accuracy` of `simulate`, the wanted error of the result.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         how: dict[str, Any] = dict(rtol=setting, atol=1e-3 * setting)
-        how = dict(accuracy=setting) if accuracy else how
+        how = dict(accuracy=setting) if setting_is_accuracy else how
         out = simulate(body, start, ts, scene.torque, throw=False, max_steps=MOST, **how)
         return out.ys, out.stats["num_steps"]
 
-    return None if scene.torque is None else flow_of(scene, run)
+    return None if scene.torque is None else flow_from_run(scene, run)
 
 
-def _adaptive_flow(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
+def _flow_with_adaptive_steps(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
     """Return the flow of the Runge–Kutta method `solver` in the loop of `simulate` with adaptive
     steps, differentiable in forward and reverse mode.
 
@@ -121,10 +126,12 @@ def _adaptive_flow(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
         out = adaptive(solver, field, ts, start, rtol=setting, atol=1e-3 * setting, max_steps=MOST)
         return out.ys, out.num_steps
 
-    return flow_of(scene, run)
+    return flow_from_run(scene, run)
 
 
-def fixed_steps_flow(scene: BenchmarkScene, solver: AbstractExplicit | AbstractSplitting) -> Flow:
+def flow_with_equal_steps(
+    scene: BenchmarkScene, solver: AbstractExplicit | AbstractSplitting
+) -> Flow:
     """Return the flow of `solver` with equal steps.
 
     A flow is a function of the numbers of the `scene` and of a setting, here the number of steps;
@@ -135,10 +142,10 @@ def fixed_steps_flow(scene: BenchmarkScene, solver: AbstractExplicit | AbstractS
         field, count = equations_of_motion(body, start, scene.torque), setting.astype(int)
         return fixed(solver, field, ts, start, count), count
 
-    return flow_of(scene, run)
+    return flow_from_run(scene, run)
 
 
-def _diffrax_flow(
+def _flow_of_diffrax_loop(
     scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
     """Return the flow of our equations of motion and our state, solved by diffrax's `solver` in
@@ -152,12 +159,12 @@ def _diffrax_flow(
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         field = equations_of_motion(body, start, scene.torque)
-        return _diffrax_solve(field, None, start, solver, adjoint, setting, scene.end)
+        return _solve_with_diffrax(field, None, start, solver, adjoint, setting, scene.end)
 
-    return flow_of(scene, run)
+    return flow_from_run(scene, run)
 
 
-def _handwritten_flow(
+def _flow_of_handwritten_equations(
     scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
     """Return the flow of the equations that a user would write by hand, solved by `solver` in
@@ -171,7 +178,7 @@ def _handwritten_flow(
     """
     plain = scene.plain
     if plain is None:
-        return _diffrax_flow(scene, solver, adjoint)
+        return _flow_of_diffrax_loop(scene, solver, adjoint)
 
     def flow(numbers: Array, setting: Array) -> tuple[Any, Any]:
         start = scene.flatten(scene.assemble(numbers)[1])
@@ -182,13 +189,15 @@ def _handwritten_flow(
         def field(t: Array, y: PyTree, constants: Sequence[Array]) -> Any:
             return by_hand(t, y, *constants)
 
-        ys, steps = _diffrax_solve(field, constants, start, solver, adjoint, setting, scene.end)
+        ys, steps = _solve_with_diffrax(
+            field, constants, start, solver, adjoint, setting, scene.end
+        )
         return ys[-1], steps
 
     return flow
 
 
-def _diffrax_solve(
+def _solve_with_diffrax(
     field: Callable[..., PyTree],
     args: PyTree,
     start: PyTree,
@@ -218,21 +227,21 @@ def _diffrax_solve(
     return out.ys, out.stats["num_steps"]
 
 
-def _compile_for_scene(
-    make: Make, take: Callable[..., Any] | None, scene: BenchmarkScene
+def _compile_value_or_gradient(
+    make_flow: MakeFlow, differentiate: Callable[..., Any] | None, scene: BenchmarkScene
 ) -> PreparedMethod | None:
     """Return a method compiled for a scene, for its value or its gradient, or `None` if the method
     cannot do the scene.
 
-    - `make`: a function of the scene that returns the flow of the method (a function of the scene's
-      numbers and of a setting that returns the last state and the number of steps), or `None` if
-      the method cannot do the scene.
-    - `take`: `jax.grad` or `jax.jacfwd` for the gradient of `scene.loss`, a scalar function of the
-      last state, with respect to the scene's numbers; `None` for the value, which is the last
-      state.
+    - `make_flow`: a function of the scene that returns the flow of the method (a function of the
+      scene's numbers and of a setting that returns the last state and the number of steps), or
+      `None` if the method cannot do the scene.
+    - `differentiate`: `jax.grad` or `jax.jacfwd` for the gradient of `scene.loss`, a scalar
+      function of the last state, with respect to the scene's numbers; `None` for the value, which
+      is the last state.
     - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     """
-    flow = make(scene)
+    flow = make_flow(scene)
     if flow is None:
         return None
 
@@ -241,11 +250,11 @@ def _compile_for_scene(
             end, steps = flow(numbers, setting)
             return scene.loss(end), steps
 
-        assert take is not None
-        return take(loss, has_aux=True)(numbers)
+        assert differentiate is not None
+        return differentiate(loss, has_aux=True)(numbers)
 
     try:
-        return compile_flow(scene, flow if take is None else slopes)
+        return compile_flow(scene, flow if differentiate is None else slopes)
     except TypeError as refused:
         # A splitting method refuses a torque that depends on the rate: such a scene is left out.
         if "Splitting" in str(refused):
@@ -275,36 +284,49 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Ti
     }
     slopes = {
         name: partial(
-            _compile_for_scene, partial(_handwritten_flow, solver=solver, adjoint=adjoint), take
+            _compile_value_or_gradient,
+            partial(_flow_of_handwritten_equations, solver=solver, adjoint=adjoint),
+            take,
         )
         for name, (adjoint, take) in ways.items()
     }
-    value = partial(_compile_for_scene, partial(_handwritten_flow, solver=solver), None)
+    value = partial(
+        _compile_value_or_gradient, partial(_flow_of_handwritten_equations, solver=solver), None
+    )
     name = f"diffrax {type(solver).__name__}"
     return TimedMethod(name, "jax", TOLERANCES, value, slopes if gradients else {})
 
 
-def _own_method(
+def _own_timed_method(
     name: str,
     settings: Sequence[float | int],
-    make: Make,
-    modes: Iterable[str] = (),
-    equal: bool = False,
+    make_flow: MakeFlow,
+    differentiation_modes: Iterable[str] = (),
+    settings_are_step_counts: bool = False,
 ) -> TimedMethod:
     """Return a method of this library in the form that `measure` takes, for its value (the last
     state of a motion) and its gradients.
 
     - `name`: the name of the method.
     - `settings`: the tolerances, or the numbers of equal steps.
-    - `make`: a function of a scene (a motion to run) that returns the flow of the method (a
+    - `make_flow`: a function of a scene (a motion to run) that returns the flow of the method (a
       function of the scene's numbers and of a setting that returns the last state and the number of
       steps), or `None` if the method cannot do the scene.
-    - `modes`: the modes of differentiation that are measured, of `"forward"` and `"reverse"`.
-    - `equal`: whether the settings are numbers of equal steps.
+    - `differentiation_modes`: the modes of differentiation that are measured, of `"forward"` and
+      `"reverse"`.
+    - `settings_are_step_counts`: whether the settings are numbers of equal steps.
     """
-    slopes = {mode: partial(_compile_for_scene, make, MODES[mode]) for mode in modes}
+    slopes = {
+        mode: partial(_compile_value_or_gradient, make_flow, MODES[mode])
+        for mode in differentiation_modes
+    }
     return TimedMethod(
-        name, "ours", settings, partial(_compile_for_scene, make, None), slopes, equal
+        name,
+        "ours",
+        settings,
+        partial(_compile_value_or_gradient, make_flow, None),
+        slopes,
+        settings_are_step_counts,
     )
 
 
@@ -313,21 +335,27 @@ def methods_in_jax() -> list[TimedMethod]:
     eight = solvers.DormandPrince8()
     equal = ((EIGHT, eight), (FOUR, solvers.RungeKutta4()))
     equal += ((EIGHT, solvers.Splitting4()), (EIGHT, solvers.Splitting6()))
-    five, there = solvers.Tsitouras5(), partial(_diffrax_flow, solver=eight)
+    five, there = solvers.Tsitouras5(), partial(_flow_of_diffrax_loop, solver=eight)
     return [
-        _own_method("closed form", (0.0,), _closed_form_flow, MODES),
-        _own_method("simulate", TOLERANCES, _simulate_flow, MODES),
-        _own_method("simulate, accuracy", TOLERANCES, partial(_simulate_flow, accuracy=True)),
-        _own_method("DormandPrince8", TOLERANCES, partial(_adaptive_flow, solver=eight), MODES),
-        _own_method("Tsitouras5", TOLERANCES, partial(_adaptive_flow, solver=five)),
+        _own_timed_method("closed form", (0.0,), _flow_of_closed_form, MODES),
+        _own_timed_method("simulate", TOLERANCES, _flow_of_simulate, MODES),
+        _own_timed_method(
+            "simulate, accuracy", TOLERANCES, partial(_flow_of_simulate, setting_is_accuracy=True)
+        ),
+        _own_timed_method(
+            "DormandPrince8", TOLERANCES, partial(_flow_with_adaptive_steps, solver=eight), MODES
+        ),
+        _own_timed_method(
+            "Tsitouras5", TOLERANCES, partial(_flow_with_adaptive_steps, solver=five)
+        ),
         *(
-            _own_method(
+            _own_timed_method(
                 f"{type(solver).__name__}, equal steps", counts,
-                partial(fixed_steps_flow, solver=solver), equal=True,
+                partial(flow_with_equal_steps, solver=solver), settings_are_step_counts=True,
             )
             for counts, solver in equal
         ),
-        _own_method("DormandPrince8 in diffeqsolve", TOLERANCES, there),
+        _own_timed_method("DormandPrince8 in diffeqsolve", TOLERANCES, there),
         diffrax_method(dfx.Tsit5()),
         diffrax_method(dfx.Dopri8(), gradients=True),
     ]  # fmt: skip

@@ -21,7 +21,7 @@ from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques import HeavyTop
 from rigidjax.solve import fixed, solvers
 from rigidjax.workprecision import peers as known
-from rigidjax.workprecision.jax_methods import fixed_steps_flow
+from rigidjax.workprecision.jax_methods import flow_with_equal_steps
 from rigidjax.workprecision.record import Measurement
 from rigidjax.workprecision.scene import (
     BenchmarkScene,
@@ -111,8 +111,8 @@ def measure(
             if progress is not None:
                 progress(f"{scene.name}: {method.name} {adjoint or 'value'}")
             for setting in _settings_for_scene(scene, method, thin * (2 if adjoint else 1)):
-                jobs += _inspect_run(scene, method, adjoint, setting, ready, right)
-    _time_runs(jobs, rounds)
+                jobs += _run_once_for_errors(scene, method, adjoint, setting, ready, right)
+    _append_measured_times(jobs, rounds)
     records = []
     for job in jobs:
         low, middle, high = (float(p) for p in np.percentile(job.times[1:], [25, 50, 75]))
@@ -128,8 +128,8 @@ def compute_reference(scene: BenchmarkScene, gradients: bool = True) -> Referenc
     100 times the machine epsilon.
     """
     counts = (4000, 2000)
-    numbers, scale = scene.numbers, max(1.0, _turned_angle(scene) / 50)
-    flow = fixed_steps_flow(scene, solvers.DormandPrince8())
+    numbers, scale = scene.numbers, max(1.0, _estimated_turning_angle(scene) / 50)
+    flow = flow_with_equal_steps(scene, solvers.DormandPrince8())
     run = jax.jit(flow)
     take = jax.jit(jax.jacfwd(lambda p, count: scene.loss(flow(p, count)[0])))
     ends, slopes = [], []
@@ -166,7 +166,7 @@ def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
     return dataclasses.replace(low, name=f"{scene.name}, float32", reference=right, plain=None)
 
 
-def _turned_angle(scene: BenchmarkScene) -> float:
+def _estimated_turning_angle(scene: BenchmarkScene) -> float:
     """Return a rough estimate of the angle by which the body turns in the `scene`, rad, at least
     50.
 
@@ -189,13 +189,13 @@ def _settings_for_scene(scene: BenchmarkScene, method: TimedMethod, stride: int)
     """
     settings = list(method.settings)[::-1][::stride][::-1]
     if method.equal:
-        return [float(round(s * _turned_angle(scene) / 50)) for s in settings]
+        return [float(round(s * _estimated_turning_angle(scene) / 50)) for s in settings]
     # With a tolerance below about ten times the machine epsilon every step is rejected.
     least = 10 * float(jnp.finfo(scene.numbers.dtype).eps)
     return [float(s) for s in settings if s == 0 or s > least]
 
 
-def _inspect_run(
+def _run_once_for_errors(
     scene: BenchmarkScene,
     method: TimedMethod,
     adjoint: str,
@@ -218,7 +218,9 @@ def _inspect_run(
     begin = time.perf_counter()
     end, steps = prepared.run(setting)
     first = time.perf_counter() - begin
-    errors = (_gradient_errors if adjoint else _relative_errors)(scene, end, reference)
+    errors = (_gradient_errors if adjoint else _errors_and_drifts_of_final_state)(
+        scene, end, reference
+    )
     if not errors["error"] < WRONG:
         return []
     record = Measurement(
@@ -228,7 +230,7 @@ def _inspect_run(
     return [_TimedRun(record, prepared, [first])]
 
 
-def _relative_errors(
+def _errors_and_drifts_of_final_state(
     scene: BenchmarkScene, final_state: np.ndarray | Array, reference: Reference
 ) -> dict[str, float]:
     """Return, by the names of fields of `Measurement`, the errors of the last state of a run, and
@@ -240,23 +242,23 @@ def _relative_errors(
     - `reference`: the correct last state.
     """
     error, rate = state_errors(scene, final_state, reference.end)
-    energy, momentum = drifts(scene, np.asarray(final_state))
+    energy, momentum = energy_and_momentum_drifts(scene, np.asarray(final_state))
     return {"error": error, "error_rate": rate, "energy": energy, "momentum": momentum}
 
 
 def _gradient_errors(
-    scene: BenchmarkScene, slope: np.ndarray | Array, reference: Reference
+    scene: BenchmarkScene, computed_gradient: np.ndarray | Array, reference: Reference
 ) -> dict[str, float]:
     """Return, by the names of fields of `Measurement`, the relative errors of a gradient: of the
     whole, and of its parts with respect to inertia, initial rate and initial attitude (for a point:
     velocity and position).
 
     - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `slope`: the gradient of `scene.loss`, a scalar function of the last state, with respect to
-      the scene's numbers.
+    - `computed_gradient`: the gradient of `scene.loss`, a scalar function of the last state, with
+      respect to the scene's numbers.
     - `reference`: the correct gradient.
     """
-    gradient, wanted = np.asarray(slope, float), np.asarray(reference.gradient)
+    gradient, wanted = np.asarray(computed_gradient, float), np.asarray(reference.gradient)
 
     def relative_error(part: slice) -> float:
         miss, size = np.linalg.norm(gradient[part] - wanted[part]), np.linalg.norm(wanted[part])
@@ -266,7 +268,9 @@ def _gradient_errors(
     return {"error": relative_error(slice(None)), **parts}
 
 
-def drifts(scene: BenchmarkScene, end: np.ndarray | Array) -> tuple[float, float]:
+def energy_and_momentum_drifts(
+    scene: BenchmarkScene, final_state: np.ndarray | Array
+) -> tuple[float, float]:
     """Return two numbers: the relative drift of the energy; and the largest drift of a momentum.
 
     For a point the two are the relative drift of its first conserved quantity, and NaN.
@@ -274,7 +278,7 @@ def drifts(scene: BenchmarkScene, end: np.ndarray | Array) -> tuple[float, float
     if scene.body is None:
         law: Any = scene_of_force(scene.torque)
         state: Any = scene.state0
-        last = type(state)(end[:3], end[3:])
+        last = type(state)(final_state[:3], final_state[3:])
         kept = law.conserved(0.0, state), law.conserved(scene.end, last)
         name = next(iter(kept[0]), None)
         if name is None:
@@ -282,21 +286,21 @@ def drifts(scene: BenchmarkScene, end: np.ndarray | Array) -> tuple[float, float
         a, b = (float(values[name]) for values in kept)
         return abs(b - a) / max(abs(a), 0.5 * scene.size[1] ** 2), float("nan")
     first: Any = scene.state0
-    last = Attitude(end[:4] / np.linalg.norm(end[:4]), end[4:])
+    last = Attitude(final_state[:4] / np.linalg.norm(final_state[:4]), final_state[4:])
     states = jax.tree.map(lambda *leaves: jnp.stack(leaves), first, last)
     away = drift(jnp.array([0.0, scene.end]), states, scene.body, scene.torque)
     momenta = [float(away[n]) for n in ("momentum", "momentum_along_axis") if n in away]
     return float(away.get("energy", jnp.nan)), max(momenta, default=float("nan"))
 
 
-def _time_runs(jobs: list[_TimedRun], rounds: int) -> None:
-    """Measure the times of the runs `jobs` in turn, and append them, s, to each run.
+def _append_measured_times(runs: list[_TimedRun], rounds: int) -> None:
+    """Measure the times, s, of the runs in turn, and append them to the field `times` of each run.
 
     A run is timed in `rounds` rounds; a run shorter than `SHORT`, s, in three times as many rounds,
     and a run longer than `LONG`, s, in three rounds.
     """
     for turn in range(3 * rounds):
-        for job in jobs:
+        for job in runs:
             first = job.times[0]
             if turn >= (3 if first > LONG else rounds if first > SHORT else 3 * rounds):
                 continue

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from rigidjax import _checks
-from rigidjax.workprecision.record import Measurement, list_records
+from rigidjax.workprecision.record import Measurement, require_measurements
 
 WANTED = (1e-4, 1e-7, 1e-10)
 
@@ -18,7 +18,7 @@ def pareto_front(records: Iterable[Measurement]) -> list[Measurement]:
     All `records` are of one scene and one kind. A record is on the front if no method reaches its
     error in less time; the time of a method is interpolated log–log between its settings.
     """
-    records = [r for r in list_records(records) if r.error == r.error and r.time == r.time]
+    records = [r for r in require_measurements(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
     if len(kinds) > 1:
         words = f"front: wanted records of one scene and kind, got {sorted(kinds)}"
@@ -39,7 +39,7 @@ def first_answers(records: Iterable[Measurement]) -> list[Measurement]:
     """
     return [
         dataclasses.replace(r, time=r.time + c, time_low=r.time_low + c, time_high=r.time_high + c)
-        for r in list_records(records)
+        for r in require_measurements(records)
         for c in [r.compile if r.compile == r.compile else 0.0]
     ]
 
@@ -52,7 +52,9 @@ def time_to(records: Iterable[Measurement], error: float) -> float:
     the error.
     """
     error = _checks.positive_float(error, "error")
-    rungs = sorted((r for r in list_records(records) if r.error == r.error), key=lambda r: r.time)
+    rungs = sorted(
+        (r for r in require_measurements(records) if r.error == r.error), key=lambda r: r.time
+    )
     # A slower setting may have a larger error: only records with a smaller error than all quicker
     # records are used.
     least, seen = math.inf, []
@@ -105,7 +107,7 @@ def choose(records: Iterable[Measurement], wanted: Sequence[float] = WANTED) -> 
     >>> choose([])
     []
     """
-    records = list_records(records)
+    records = require_measurements(records)
     scenes = dict.fromkeys(r.scene for r in records)
     return [
         _choose_for_scene([r for r in records if r.scene == s], s, e)
@@ -169,16 +171,17 @@ def table(lines: Iterable[Choice]) -> str:
         raise TypeError(f"lines: wanted what choose returns, got {type(lines).__name__}")
     for c in lines:
         _checks.require_instance(c, Choice, "lines", requirement="lines of choose")
-        peer = f"{c.peer}, {_in_microseconds(c.peer_time)}" if c.peer else ""
+        peer = f"{c.peer}, {_text_in_microseconds(c.peer_time)}" if c.peer else ""
         rows.append(
-            f"| {c.scene} | {c.wanted:.0e} | {c.method or 'none'} | {_in_microseconds(c.time)} | "
-            f"{c.gradient or 'none'} | {_in_microseconds(c.gradient_time)} | "
-            f"{_in_microseconds(c.default)} "
-            f"({_in_microseconds(c.default_gradient)}) | {peer} |"
+            f"| {c.scene} | {c.wanted:.0e} | {c.method or 'none'} "
+            f"| {_text_in_microseconds(c.time)} | {c.gradient or 'none'} "
+            f"| {_text_in_microseconds(c.gradient_time)} | "
+            f"{_text_in_microseconds(c.default)} "
+            f"({_text_in_microseconds(c.default_gradient)}) | {peer} |"
         )
     return "\n".join(rows)
 
 
-def _in_microseconds(seconds: float) -> str:
+def _text_in_microseconds(seconds: float) -> str:
     """Return a time, given in seconds, as text in µs with three digits, or a dash for NaN."""
     return "–" if seconds != seconds else f"{seconds * 1e6:.3g}"

@@ -25,8 +25,19 @@ TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
 TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
 
+# A run is a function of a setting (a tolerance or a step) that returns two things: the last state,
+# or the gradient, as one vector; and the number of steps.
+RunAtSetting = Callable[[float], tuple[Any, Any]]
+# A function of a scene, of its numbers, of its initial state and of an imported package that
+# returns a run.
+MakeRun = Callable[[BenchmarkScene, np.ndarray, np.ndarray, Any], RunAtSetting]
+# A function of a scene that returns a method compiled for it, or `None` if it cannot do the scene.
+PrepareMethod = Callable[[BenchmarkScene], PreparedMethod | None]
 
-def _python_vector_field(scene: BenchmarkScene, numbers: np.ndarray, **options: Any) -> Any:
+
+def _python_vector_field(
+    scene: BenchmarkScene, numbers: np.ndarray, **options: Any
+) -> Callable[..., Any]:
     """Return the vector field of the handwritten equations of a scene, a function (t, y) that works
     on Python's floats.
 
@@ -47,14 +58,14 @@ def _has_plain_equations(scene: BenchmarkScene) -> bool:
     return scene.plain is not None
 
 
-def _has_weight(scene: BenchmarkScene) -> bool:
+def _has_data_for_mujoco(scene: BenchmarkScene) -> bool:
     """Return whether the `scene` (a motion to run) is of a body, and has the data that MuJoCo
     needs: mass, centre of mass and gravity.
     """
     return scene.notes is not None and "com" in scene.notes and scene.body is not None
 
 
-def _is_plain_and_double(scene: BenchmarkScene) -> bool:
+def _has_plain_equations_in_double(scene: BenchmarkScene) -> bool:
     """Return whether the `scene` (a motion to run) has handwritten equations and is in double
     precision.
     """
@@ -63,9 +74,9 @@ def _is_plain_and_double(scene: BenchmarkScene) -> bool:
     return scene.plain is not None and scene.numbers.dtype == jnp.float64
 
 
-def _make_peer_value(
-    module: str, can: Callable[[BenchmarkScene], bool] = _has_plain_equations
-) -> Callable[[Any], Any]:
+def _method_value_of_package(
+    package: str, can_run: Callable[[BenchmarkScene], bool] = _has_plain_equations
+) -> Callable[[MakeRun], PrepareMethod]:
     """Return a decorator that turns a function `make` into the `value` of a `TimedMethod`: a
     function of a scene (a motion to run) that returns the `PreparedMethod`, or `None` for a scene
     that the package cannot do.
@@ -74,16 +85,16 @@ def _make_peer_value(
     setting. The time that `make` takes is recorded as compile time; the time to import the module
     is not.
 
-    - `module`: the name of the package that is imported.
-    - `can`: a function of a scene that returns whether the package can do the scene.
+    - `package`: the name of the package that is imported.
+    - `can_run`: a function of a scene that returns whether the package can do the scene.
     """
 
-    def decorate(make: Callable[[BenchmarkScene, np.ndarray, np.ndarray, Any], Any]) -> Any:
+    def decorate(make: MakeRun) -> PrepareMethod:
         def prepare(scene: BenchmarkScene) -> PreparedMethod | None:
-            if not can(scene):
+            if not can_run(scene):
                 return None
             numbers, start = (np.asarray(v) for v in (scene.numbers, scene.flatten(scene.state0)))
-            loaded = importlib.import_module(module)
+            loaded = importlib.import_module(package)
             begin = time.perf_counter()
             run = make(scene, numbers, start.astype(float), loaded)
             return PreparedMethod(run, time.perf_counter() - begin)
@@ -94,20 +105,20 @@ def _make_peer_value(
 
 
 def _make_scipy_run(
-    end: float, start: np.ndarray, f: Callable[[float, np.ndarray], np.ndarray]
-) -> Any:
+    end: float, start: np.ndarray, vector_field: Callable[[float, np.ndarray], np.ndarray]
+) -> RunAtSetting:
     """Return a function of the tolerance that solves an equation by SciPy's DOP853, and returns the
     last state and the number of steps.
 
     - `end`: the last time, s; the first is 0.
     - `start`: the initial state as one vector.
-    - `f`: the vector field, a function (t, y) that returns dy/dt.
+    - `vector_field`: the vector field, a function (t, y) that returns dy/dt.
     """
     from scipy.integrate import DOP853
 
     def run(setting: float) -> tuple[Any, Any]:
         # The stepper is called directly: solve_ivp would store every step.
-        stepper = DOP853(f, 0.0, start, end, rtol=setting, atol=1e-3 * setting)
+        stepper = DOP853(vector_field, 0.0, start, end, rtol=setting, atol=1e-3 * setting)
         steps = 0
         while stepper.status == "running":
             stepper.step()
@@ -117,10 +128,10 @@ def _make_scipy_run(
     return run
 
 
-@_make_peer_value("scipy.integrate")
+@_method_value_of_package("scipy.integrate")
 def _prepare_scipy(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, _: ModuleType
-) -> Any:
+) -> RunAtSetting:
     """Return a function of the tolerance that runs the scene by SciPy's DOP853 on Python's floats,
     and returns the last state and the number of steps.
 
@@ -134,10 +145,10 @@ def _prepare_scipy(
     return _make_scipy_run(scene.end, start, lambda t, y: np.array(rates(t, y)))
 
 
-@_make_peer_value("numba")
+@_method_value_of_package("numba")
 def _prepare_numba(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, numba: ModuleType
-) -> Any:
+) -> RunAtSetting:
     """Return a function of the tolerance that runs the scene by SciPy's DOP853 with a vector field
     compiled by numba, and returns the last state and the number of steps.
 
@@ -157,10 +168,10 @@ def _prepare_numba(
     return _make_scipy_run(scene.end, start, f)
 
 
-@_make_peer_value("mujoco", _has_weight)
+@_method_value_of_package("mujoco", _has_data_for_mujoco)
 def _prepare_mujoco(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, mujoco: ModuleType
-) -> Any:
+) -> RunAtSetting:
     """Return a function of the step, s, that runs a body on a ball joint by MuJoCo's own
     Runge–Kutta 4, and returns the last state and the number of steps.
 
@@ -201,41 +212,43 @@ def _prepare_mujoco(
     return run
 
 
-def _heyoka_equations(scene: BenchmarkScene, hy: ModuleType, numbers: Sequence[Any]) -> Any:
+def _heyoka_equations(
+    scene: BenchmarkScene, heyoka: ModuleType, numbers: Sequence[Any]
+) -> list[tuple[Any, Any]]:
     """Return the equations of a scene in heyoka's form: a list of pairs, a variable and its time
     derivative.
 
     - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `hy`: the module heyoka.
+    - `heyoka`: the module heyoka.
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or position and
       velocity of a point), as floats or as parameters of heyoka.
     """
     names = "abcdxyz" if scene.body is not None else ("px", "py", "pz", "vx", "vy", "vz")
-    variables = hy.make_vars(*names)
+    variables = heyoka.make_vars(*names)
     plain: Any = scene.plain
-    rates = plain(numbers, hy.sin, hy.cos, hy.sqrt)(hy.time, variables)
+    rates = plain(numbers, heyoka.sin, heyoka.cos, heyoka.sqrt)(heyoka.time, variables)
     return list(zip(variables, rates, strict=True))
 
 
 def _make_heyoka_run(
-    hy: ModuleType, end: float, start: np.ndarray, system: Any, **options: Any
-) -> Any:
+    heyoka: ModuleType, end: float, start: np.ndarray, equations: Any, **options: Any
+) -> RunAtSetting:
     """Return a function of the tolerance that runs heyoka's Taylor method, and returns the last
     state and the number of steps.
 
     heyoka's order and code depend on the tolerance, so that each tolerance is compiled once.
 
-    - `hy`: the module heyoka.
+    - `heyoka`: the module heyoka.
     - `end`: the last time, s; the first is 0.
     - `start`: the initial state as one vector.
-    - `system`: the equations in heyoka's form.
+    - `equations`: the equations in heyoka's form.
     - `options`: further arguments of `heyoka.taylor_adaptive`.
     """
     made: dict[float, Any] = {}
 
     def run(setting: float) -> tuple[Any, Any]:
         if setting not in made:
-            stepper = hy.taylor_adaptive(system, start, tol=setting, **options)
+            stepper = heyoka.taylor_adaptive(equations, start, tol=setting, **options)
             made[setting] = stepper, stepper.state.copy()
         stepper, first = made[setting]
         stepper.state[:], stepper.time = first, 0.0
@@ -246,10 +259,10 @@ def _make_heyoka_run(
     return run
 
 
-@_make_peer_value("heyoka")
-def _prepare_taylor(
-    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, hy: ModuleType
-) -> Any:
+@_method_value_of_package("heyoka")
+def _prepare_heyoka(
+    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, heyoka: ModuleType
+) -> RunAtSetting:
     """Return a function of the tolerance that runs the scene by heyoka's Taylor method, and returns
     the last state and the number of steps.
 
@@ -257,16 +270,16 @@ def _prepare_taylor(
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
       position and velocity of a point).
     - `start`: the initial state as one vector.
-    - `hy`: the module heyoka.
+    - `heyoka`: the module heyoka.
     """
-    system = _heyoka_equations(scene, hy, list(map(float, numbers)))
-    return _make_heyoka_run(hy, scene.end, start, system)
+    system = _heyoka_equations(scene, heyoka, list(map(float, numbers)))
+    return _make_heyoka_run(heyoka, scene.end, start, system)
 
 
-@_make_peer_value("heyoka")
-def _prepare_taylor_gradient(
-    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, hy: ModuleType
-) -> Any:
+@_method_value_of_package("heyoka")
+def _prepare_heyoka_gradient(
+    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, heyoka: ModuleType
+) -> RunAtSetting:
     """Return a function of the tolerance that computes the gradient of `scene.loss`, a scalar
     function of the last state, by heyoka's variational equations, and returns the gradient and the
     number of steps.
@@ -279,14 +292,16 @@ def _prepare_taylor_gradient(
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
       position and velocity of a point).
     - `start`: the initial state as one vector.
-    - `hy`: the module heyoka.
+    - `heyoka`: the module heyoka.
     """
     size = 6 if scene.body is not None else 0
-    symbols = [hy.par[i] for i in range(size)] or list(numbers)
-    system = _heyoka_equations(scene, hy, [*symbols, *numbers[size:]] if size else symbols)
-    flavour = hy.var_args.vars | hy.var_args.params if size else hy.var_args.vars
-    varied = hy.var_ode_sys(system, flavour, order=1)
-    end_of = _make_heyoka_run(hy, scene.end, start, varied, pars=numbers[:size], compact_mode=True)
+    symbols = [heyoka.par[i] for i in range(size)] or list(numbers)
+    system = _heyoka_equations(scene, heyoka, [*symbols, *numbers[size:]] if size else symbols)
+    flavour = heyoka.var_args.vars | heyoka.var_args.params if size else heyoka.var_args.vars
+    varied = heyoka.var_ode_sys(system, flavour, order=1)
+    end_of = _make_heyoka_run(
+        heyoka, scene.end, start, varied, pars=numbers[:size], compact_mode=True
+    )
     n = len(start)
     chain = np.asarray(jax.jacfwd(lambda p: scene.flatten(scene.assemble(p)[1]))(scene.numbers))
     pull = jax.jit(jax.grad(scene.loss))
@@ -332,10 +347,10 @@ class _GradsolveEnsemble:
         return getattr(self.module, name)(self, self.start, self.numbers, **options)
 
 
-@_make_peer_value("gradsolve", _is_plain_and_double)
+@_method_value_of_package("gradsolve", _has_plain_equations_in_double)
 def _prepare_gradsolve(
-    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
-) -> Any:
+    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, gradsolve: ModuleType
+) -> RunAtSetting:
     """Return a function of the tolerance that runs the scene by gradsolve's method of order 7, and
     returns the last state and the number of steps.
 
@@ -343,9 +358,9 @@ def _prepare_gradsolve(
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
       position and velocity of a point).
     - `start`: the initial state as one vector.
-    - `module`: the module gradsolve.
+    - `gradsolve`: the module gradsolve.
     """
-    ensemble = _GradsolveEnsemble(scene, numbers, start, module)
+    ensemble = _GradsolveEnsemble(scene, numbers, start, gradsolve)
 
     def run(setting: float) -> tuple[Any, Any]:
         try:
@@ -360,10 +375,10 @@ def _prepare_gradsolve(
     return run
 
 
-@_make_peer_value("gradsolve", _is_plain_and_double)
+@_method_value_of_package("gradsolve", _has_plain_equations_in_double)
 def _prepare_gradsolve_gradient(
-    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
-) -> Any:
+    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, gradsolve: ModuleType
+) -> RunAtSetting:
     """Return a function of the tolerance that computes the gradient of `scene.loss`, a scalar
     function of the last state, by gradsolve, through steps that were recorded before, and returns
     the gradient and the number of steps.
@@ -374,9 +389,9 @@ def _prepare_gradsolve_gradient(
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
       position and velocity of a point).
     - `start`: the initial state as one vector.
-    - `module`: the module gradsolve.
+    - `gradsolve`: the module gradsolve.
     """
-    ensemble = _GradsolveEnsemble(scene, numbers, start, module)
+    ensemble = _GradsolveEnsemble(scene, numbers, start, gradsolve)
     made: dict[float, Any] = {}
 
     def gradient_of(setting: float) -> Any:
@@ -399,7 +414,7 @@ def _prepare_gradsolve_gradient(
     return run
 
 
-def methods_outside() -> list[TimedMethod]:
+def methods_of_other_packages() -> list[TimedMethod]:
     """Return the methods of SciPy, numba, MuJoCo, heyoka and gradsolve, as far as they are
     installed.
 
@@ -414,8 +429,8 @@ def methods_outside() -> list[TimedMethod]:
             "heyoka Taylor",
             "peer",
             TAYLOR,
-            _prepare_taylor,
-            {"variational": _prepare_taylor_gradient},
+            _prepare_heyoka,
+            {"variational": _prepare_heyoka_gradient},
         ),
     }
     replay = TimedMethod(
@@ -440,5 +455,5 @@ def methods(group: str | None = None) -> list[TimedMethod]:
     """
     if group is not None:
         _checks.require_option(group, ("ours", "jax", "peer"), "group")
-    available = [*methods_in_jax(), *methods_outside()]
+    available = [*methods_in_jax(), *methods_of_other_packages()]
     return [method for method in available if group in (None, method.group)]

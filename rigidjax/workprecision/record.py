@@ -69,7 +69,9 @@ class Measurement:
 _WORDS = ("scene", "method", "group", "kind", "adjoint")
 
 
-def list_records(records: Iterable[Measurement], name: str = "records") -> list[Measurement]:
+def require_measurements(
+    records: Iterable[Measurement], name: str = "records"
+) -> list[Measurement]:
     """Return the records as a list. **Raises:** `TypeError` for anything else."""
     _checks.require_instance(records, Iterable, name, requirement="records")
     items = list(records)
@@ -108,7 +110,7 @@ def read_csv(path: str | Path) -> list[Measurement]:
         ]
 
 
-def differences(
+def sentences_about_changes(
     records: Iterable[Measurement], stored: Iterable[Measurement]
 ) -> tuple[list[str], list[str]]:
     """Return two lists of sentences: about changed errors and steps; and about changed times.
@@ -119,7 +121,7 @@ def differences(
     median time to that of `diffrax Dopri8`, on the same scene at common settings, has changed by
     more than a factor of 2.
     """
-    records, stored = list_records(records), list_records(stored, "stored")
+    records, stored = require_measurements(records), require_measurements(stored, "stored")
     now = {_run_key(r): r for r in records if r.group != "peer"}
     then = {_run_key(r): r for r in stored if r.group != "peer"}
     wrong, paced = [], []
@@ -135,7 +137,7 @@ def differences(
             wrong.append(f"{_scene_and_label(old)}: error was {old.error:.2g}, is {new.error:.2g}")
         if not math.isnan(old.steps) and abs(new.steps - old.steps) > max(STEPS * old.steps, 1):
             wrong.append(f"{_scene_and_label(old)}: steps were {old.steps:g}, are {new.steps:g}")
-    before, after = _time_ratios(then, set(now)), _time_ratios(now, set(then))
+    before, after = _time_ratios_to_base(then, set(now)), _time_ratios_to_base(now, set(then))
     for label, ratio in after.items():
         if label in before and not 1 / SLOWER <= ratio / before[label] <= SLOWER:
             change = f"was {before[label]:.2g}, is {ratio:.2g}"
@@ -149,7 +151,7 @@ def records_to_store(records: Iterable[Measurement]) -> list[Measurement]:
     The median is that of `BASE` on the same scene; compile times and memory become NaN.
     """
     records = [r for r in records if r.group != "peer"]
-    middle = _median_times(records)
+    middle = _median_time_by_method(records)
     bases = [middle.get((r.scene, "value", BASE), math.nan) for r in records]
     return [
         dataclasses.replace(
@@ -174,7 +176,7 @@ def _scene_and_label(record: Measurement) -> str:
     return f"{record.scene}, {record.kind}, {record.label} at {record.setting:g}"
 
 
-def _median_times(records: Iterable[Measurement]) -> dict[tuple[str, str, str], float]:
+def _median_time_by_method(records: Iterable[Measurement]) -> dict[tuple[str, str, str], float]:
     """Return the median time of a run, s, of each (scene, kind, label), over the settings in the
     `records` (measurements); measurements without a time are left out.
 
@@ -187,16 +189,20 @@ def _median_times(records: Iterable[Measurement]) -> dict[tuple[str, str, str], 
     return {label: sorted(spent)[len(spent) // 2] for label, spent in times.items()}
 
 
-def _time_ratios(table: dict, common: set) -> dict[tuple[str, str, str], float]:
+def _time_ratios_to_base(
+    records_by_key: dict[tuple[str, ...], Measurement], common_keys: set[tuple[str, ...]]
+) -> dict[tuple[str, str, str], float]:
     """Return, by (scene, kind, label), the median time of a method divided by the median time in
     which the method `BASE` (Dopri8 of diffrax) computes the value on the same scene.
 
-    - `table`: measurements by their keys (`_run_key`: scene, kind, label and setting).
-    - `common`: the keys of the measurements over which the medians are taken.
+    - `records_by_key`: measurements by their keys (`_run_key`: scene, kind, label and setting).
+    - `common_keys`: the keys of the measurements over which the medians are taken.
 
     Here the kind is `value` or `gradient`, and the label names the method and the adjoint.
     """
-    middle = _median_times(record for key, record in table.items() if key in common)
+    middle = _median_time_by_method(
+        record for key, record in records_by_key.items() if key in common_keys
+    )
     return {
         label: spent / middle[label[0], "value", BASE]
         for label, spent in middle.items()

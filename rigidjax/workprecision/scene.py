@@ -32,7 +32,7 @@ class Reference(NamedTuple):
     `gradient` of the scalar with respect to the scene's `numbers`, or empty; `gradient_error` the
     estimated error of its entries; `source` a sentence about the method.
 
-    >>> top = stored_answer("heavy top")
+    >>> top = stored_reference("heavy top")
     >>> top is None or top.error < 1e-12
     True
     """
@@ -45,7 +45,7 @@ class Reference(NamedTuple):
 
 
 @functools.cache
-def stored_answer(name: str) -> Reference | None:
+def stored_reference(name: str) -> Reference | None:
     """Return the stored answer to the standard scene of this name, or `None`.
 
     The answers are made by `tests/workprecision/make_references.py` at 40 digits and rounded to

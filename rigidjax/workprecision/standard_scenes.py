@@ -15,7 +15,7 @@ from rigidjax.frames import Point, scenes as places
 from rigidjax.motion import Attitude
 from rigidjax.motion.torques import Damping, Flywheel, GravityGradient, HeavyTop, Sum
 from rigidjax.workprecision import equations
-from rigidjax.workprecision.scene import BenchmarkScene, stored_answer
+from rigidjax.workprecision.scene import BenchmarkScene, stored_reference
 
 # μ, x0, v_y0 and the period of Arenstorf's orbit (Hairer, Nørsett and Wanner, Solving Ordinary
 # Differential Equations I, II.0).
@@ -77,18 +77,21 @@ def _return_unchanged(x: Any) -> Any:
     return x
 
 
-def _library_torque(kind: Callable[..., Any] | None, constants: Sequence[float]) -> Any:
+def _library_torque(
+    handwritten_torque: Callable[..., Any] | None, constants: Sequence[float]
+) -> HeavyTop | Sum | GravityGradient | None:
     """Return the torque of this library that equals a handwritten torque, or `None` for a free
     body.
 
-    - `kind`: the handwritten torque, a function of `workprecision.equations`, or `None`.
+    - `handwritten_torque`: the handwritten torque, a function of `workprecision.equations`, or
+      `None`.
     - `constants`: its constants, such as centre of mass and gravity.
     """
-    if kind is equations.heavy_top_torque:
+    if handwritten_torque is equations.heavy_top_torque:
         return HeavyTop(1.0, constants[:3], constants[3:])
-    if kind is equations.gyrostat_torque:
+    if handwritten_torque is equations.gyrostat_torque:
         return Sum(Flywheel(constants[:3]), Damping(constants[3:]))
-    if kind is equations.gravity_gradient_torque:
+    if handwritten_torque is equations.gravity_gradient_torque:
         (rate,) = constants
         circle = Circle(jnp.asarray(RADIUS), jnp.asarray(rate))
         return GravityGradient(rate**2 * RADIUS**3, circle)
@@ -101,7 +104,7 @@ def _scene_of_body(
     moments: Sequence[float],
     omega: Sequence[float],
     end: float,
-    kind: Callable[..., Any] | None,
+    handwritten_torque: Callable[..., Any] | None,
     constants: Sequence[float],
 ) -> BenchmarkScene:
     """Return a standard scene, a motion to compare methods on, of a rigid body.
@@ -111,8 +114,8 @@ def _scene_of_body(
     - `moments`: the three principal moments of inertia, kg m².
     - `omega`: the initial rate (3,), rad/s, body axes.
     - `end`: the last time, s.
-    - `kind`: the handwritten torque, a function of `workprecision.equations`, or `None` for a free
-      body.
+    - `handwritten_torque`: the handwritten torque, a function of `workprecision.equations`, or
+      `None` for a free body.
     - `constants`: the constants of the torque.
     """
 
@@ -126,18 +129,23 @@ def _scene_of_body(
     ) -> Any:
         exact = tuple(number(c) for c in constants)
         torque = None
-        if kind is not None:
-            torque = wrap(kind(numbers[:6], exact, sin, cos, wrap(equations.to_body_axes)))
-        return wrap(equations.body_rates(numbers[:6], torque))
+        if handwritten_torque is not None:
+            torque = wrap(
+                handwritten_torque(numbers[:6], exact, sin, cos, wrap(equations.to_body_axes))
+            )
+        return wrap(equations.body_vector_field(numbers[:6], torque))
 
     # MuJoCo can do scenes without torque, and scenes whose only torque is that of weight.
     com, gravity = (
-        (constants[:3], constants[3:]) if kind is equations.heavy_top_torque else ((0.0,) * 3,) * 2
+        (constants[:3], constants[3:])
+        if handwritten_torque is equations.heavy_top_torque
+        else ((0.0,) * 3,) * 2
     )
-    weighs = kind in (None, equations.heavy_top_torque)
+    weighs = handwritten_torque in (None, equations.heavy_top_torque)
     return BenchmarkScene(
         name, title, Inertia.from_principal(*moments), Attitude(TILTED, omega),
-        _library_torque(kind, constants), end, plain, stored_answer(name), slow=omega[2] > 1e3,
+        _library_torque(handwritten_torque, constants), end, plain, stored_reference(name),
+        slow=omega[2] > 1e3,
         notes={"mass": 1.0, "com": com, "gravity": gravity} if weighs else None,
     )  # fmt: skip
 
@@ -147,8 +155,8 @@ def _scene_of_point(
     title: str,
     start: Point,
     end: float,
-    law: PyTree,
-    kind: Callable[..., Any],
+    library_equations: PyTree,
+    handwritten_equations: Callable[..., Any],
     constants: Sequence[float],
 ) -> BenchmarkScene:
     """Return a standard scene, a motion to compare methods on, of a particle.
@@ -157,8 +165,9 @@ def _scene_of_point(
     - `title`: the name in words.
     - `start`: the initial position and velocity.
     - `end`: the last time, s, or in the unit of time of the equations.
-    - `law`: the object of this library that has the equations of motion.
-    - `kind`: a function of `workprecision.equations` that makes the same equations by hand.
+    - `library_equations`: the object of this library that has the equations of motion.
+    - `handwritten_equations`: a function of `workprecision.equations` that makes the same equations
+      by hand.
     - `constants`: the constants of these equations.
     """
 
@@ -170,9 +179,11 @@ def _scene_of_point(
         wrap: Callable[..., Any] = _return_unchanged,
         number: Callable[..., Any] = _return_unchanged,
     ) -> Any:
-        return wrap(kind(tuple(number(c) for c in constants), sqrt))
+        return wrap(handwritten_equations(tuple(number(c) for c in constants), sqrt))
 
-    return BenchmarkScene(name, title, None, start, law, end, plain, stored_answer(name))
+    return BenchmarkScene(
+        name, title, None, start, library_equations, end, plain, stored_reference(name)
+    )
 
 
 def _foucault_scene() -> BenchmarkScene:
@@ -183,7 +194,7 @@ def _foucault_scene() -> BenchmarkScene:
     _, north, up = (float(w) for w in law.place.angular_velocity())
     return _scene_of_point(
         "foucault", "Foucault's pendulum", law.start(3.0, 0.0), 600.0, law,
-        equations.foucault_rates, (float(law.place.gravity), north, up),
+        equations.foucault_vector_field, (float(law.place.gravity), north, up),
     )  # fmt: skip
 
 
@@ -194,7 +205,7 @@ def _arenstorf_scene() -> BenchmarkScene:
     mu, x, v, period = ARENSTORF
     return _scene_of_point(
         "arenstorf", "Arenstorf's orbit", Point([x, 0.0, 0.0], [0.0, v, 0.0]), period,
-        orbits.cr3bp(mu), equations.three_body_rates, (mu,),
+        orbits.cr3bp(mu), equations.three_body_vector_field, (mu,),
     )  # fmt: skip
 
 

@@ -36,7 +36,7 @@ from accuracy import (
     value,
 )
 
-from rigidjax.exact.jacobi_duplication import dtype_limits
+from rigidjax.exact.jacobi_duplication import iteration_limits
 
 DIGITS, DERIVATIVE_DIGITS = 60, 90
 CHUNK = 2000
@@ -100,7 +100,7 @@ def _endless(x, dtype):
     order = np.argsort(x[:, :3], axis=1)
     u, w = (np.take_along_axis(a, order, 1) for a in (x[:, :3], x[:, 6:9]))
     share = classes.off_separatrix(u, w)
-    return (share > 0) & (share <= dtype_limits(np.dtype(dtype)).floor)
+    return (share > 0) & (share <= iteration_limits(np.dtype(dtype)).floor)
 
 
 @contextlib.contextmanager
