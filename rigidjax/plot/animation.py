@@ -135,7 +135,7 @@ def tumble(
     body = validation.require_single_body(body, (Inertia, MassProperties), "body")
     moments, q = evenly_spaced_attitudes(ts, states, pictures)
     size = _checks.integer(size, "size", 64)
-    corners, tip, reach = _box_of_drawing(body)
+    corners, tip, reach = _corners_axis_end_and_half_diagonal(body)
     pyplot()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -210,7 +210,7 @@ def player(
     """
     seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
     _, q = evenly_spaced_attitudes(ts, states, pictures)
-    box = _box_of_drawing(body)
+    box = _corners_axis_end_and_half_diagonal(body)
     try:
         import viser
     except ModuleNotFoundError as error:
@@ -224,7 +224,7 @@ def player(
     try:
         server = viser.ViserServer(host="127.0.0.1", verbose=False)
         try:
-            page = _record_page(server, *box, q, seconds)
+            page = _html_of_tumbling_box(server, *box, q, seconds)
         finally:
             server.stop()
     finally:
@@ -232,33 +232,40 @@ def player(
     return Film(page.encode("utf-8"), "html", height)
 
 
-def _record_page(
-    server: Any, corners: np.ndarray, tip: np.ndarray, reach: float, q: np.ndarray, seconds: float
+def _html_of_tumbling_box(
+    server: Any,
+    corners: np.ndarray,
+    longest_axis_end: np.ndarray,
+    half_diagonal: float,
+    q: np.ndarray,
+    seconds: float,
 ) -> str:
     """Draw a tumbling box in a server of viser, and return the HTML page that plays the recorded
     motion.
 
     - `server`: the server, without connected browsers.
     - `corners`: (8, 3) the corners of the box, body axes.
-    - `tip`: (3,) the end of its longest half-axis, body axes, whose path is drawn.
-    - `reach`: the half diagonal of the box.
+    - `longest_axis_end`: (3,) the end of its longest half-axis, body axes, whose path is drawn.
+    - `half_diagonal`: the half diagonal of the box.
     - `q`: (N, 4) the attitudes, body → world, evenly spaced in time.
     - `seconds`: the duration of the film, s.
     """
     scene = server.scene
     scene.set_up_direction("+z")
-    server.initial_camera.position = tuple(1.8 * reach * np.array([1.0, -1.2, 0.7]))
+    server.initial_camera.position = tuple(1.8 * half_diagonal * np.array([1.0, -1.2, 0.7]))
     server.initial_camera.look_at = (0.0, 0.0, 0.0)
-    scene.add_frame("/world", axes_length=1.1 * reach, axes_radius=0.008 * reach)
+    scene.add_frame("/world", axes_length=1.1 * half_diagonal, axes_radius=0.008 * half_diagonal)
     attitude = scene.add_frame("/body", show_axes=False, wxyz=tuple(q[0]))
     for side, ((a, b, c, d), shade) in enumerate(zip(FACES, SHADES, strict=True)):
         faces = np.array([(a, b, c), (a, c, d)], dtype=np.uint32)
         how = dict(color=tuple(round(255 * part) for part in shade), flat_shading=True)
         place = f"/body/side{side}"
         scene.add_mesh_simple(place, corners.astype(np.float32), faces, side="double", **how)
-    tips = (rotation_matrices(q) @ tip).astype(np.float32)
+    tips = (rotation_matrices(q) @ longest_axis_end).astype(np.float32)
     lines = np.stack([tips[:-1], tips[1:]], axis=1)
-    scene.add_line_segments("/trail", points=lines, colors=(90, 90, 90), thickness=0.01 * reach)
+    scene.add_line_segments(
+        "/trail", points=lines, colors=(90, 90, 90), thickness=0.01 * half_diagonal
+    )
     recording = server.get_scene_serializer()
     for one in q:
         attitude.wxyz = tuple(one)
@@ -286,20 +293,22 @@ def evenly_spaced_attitudes(
     return when, between / np.linalg.norm(between, axis=1, keepdims=True)
 
 
-def _box_of_drawing(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray, float]:
+def _corners_axis_end_and_half_diagonal(
+    body: Inertia | MassProperties,
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Return three things, for the uniform box that moves as the body does: its corners (8, 3); the
     end (3,) of its longest half-axis; and half of its diagonal.
 
     Corners and end are in body axes. Lengths are in m for `MassProperties`, and relative to the
     longest half-axis for an `Inertia`.
     """
-    half, turn = box_of(body)
+    half, turn = box_half_lengths_and_axes(body)
     longest = np.argmax(half)
     corners = (CORNERS * half) @ turn.T
     return corners, turn[:, longest] * half[longest], float(np.linalg.norm(half))
 
 
-def box_of(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
+def box_half_lengths_and_axes(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
     """Return two arrays: the half-lengths a (3,) of the body's box; and the axes of the box (3, 3).
 
     The uniform box of mass m has the second moments λ = m a²/3 of the body about its principal

@@ -38,21 +38,21 @@ def inertia_ellipsoid(
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
     ['x, m', 'x, m', 'y, m']
     """
-    best, drawn = _body_and_samples(body, _checks.integer(samples, "samples", 0))
+    best, drawn = _body_and_random_samples(body, _checks.integer(samples, "samples", 0))
     solid = isinstance(best, MassProperties)
     size = 1.0 if solid else float(np.trace(np.asarray(best.second_moment)))
     if not size > 0:
         raise ValueError("body: wanted a body with an extension, got 𝔖 = 0; there is no ellipsoid")
-    shapes = {"body": np.asarray(_matrix_of_ellipsoid(best))[None] / size}
+    shapes = {"body": np.asarray(_ellipsoid_matrix(best))[None] / size}
     if drawn is not None:
-        shapes["cloud"] = np.asarray(jax.vmap(_matrix_of_ellipsoid)(drawn)) / size
+        shapes["cloud"] = np.asarray(jax.vmap(_ellipsoid_matrix)(drawn)) / size
     if truth is not None:
-        other = np.asarray(_matrix_of_ellipsoid(truth))
+        other = np.asarray(_ellipsoid_matrix(truth))
         # If one of the two bodies has no size, only the shapes are compared.
         own = solid and isinstance(truth, MassProperties)
         shapes["truth"] = other[None] / (1.0 if own else float(np.trace(other)))
     ax = axes_of_shape(ax, (3,), ncols=3, figsize=(10.5, 3.9))
-    _draw_outlines(ax, shapes, "m" if solid else "relative size")
+    _draw_ellipsoid_outlines(ax, shapes, "m" if solid else "relative size")
     if len(shapes) > 1:
         how = dict(loc="outside lower center", ncols=3, frameon=False)
         ax[0].figure.legend(*ax[0].get_legend_handles_labels(), **how)
@@ -60,7 +60,7 @@ def inertia_ellipsoid(
     return ax
 
 
-def _body_and_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
+def _body_and_random_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
     """Return two things: the body; and `samples` bodies drawn at random from the uncertainty of a
     fit, as one body with a leading axis, or `None` if `body` is no fit.
 
@@ -84,31 +84,36 @@ def _body_and_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties
     return body.body, jax.vmap(lambda step: body.model.bodies(x + step))(steps)
 
 
-def _draw_outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
+def _draw_ellipsoid_outlines(ax: Any, matrices_by_name: dict[str, np.ndarray], unit: str) -> None:
     """Draw the outlines of ellipsoids r·A⁻¹r = 1 on the planes xy, xz and yz, with a legend.
 
     - `ax`: (3,) matplotlib axes, one for each plane.
-    - `shapes`: the matrices A (n, 3, 3) of n ellipsoids by name: `body` (n = 1), and if given
-      `cloud` (bodies sampled from the uncertainty) and `truth` (n = 1).
+    - `matrices_by_name`: the matrices A (n, 3, 3) of n ellipsoids by name: `body` (n = 1), and if
+      given `cloud` (bodies sampled from the uncertainty) and `truth` (n = 1).
     - `unit`: the unit of length, in the labels.
     """
     # The outline of r·A⁻¹r = 1 reaches √A_ii along axis i. All three panels have the same scale,
     # for comparison.
-    reaches = {name: np.sqrt(np.einsum("nii->ni", shape)) for name, shape in shapes.items()}
+    reaches = {
+        name: np.sqrt(np.einsum("nii->ni", shape)) for name, shape in matrices_by_name.items()
+    }
     reach = 1.1 * max(float(one.max()) for one in reaches.values())
     apart = np.abs(reaches.get("cloud", reaches["body"]) - reaches["body"]).max(initial=0.0)
     wide = apart > 0.01 * reach
     label = "within the uncertainty" if wide else "uncertainty: below a line's width"
     for one, (i, j) in zip(ax, _PLANES, strict=True):
-        if "cloud" in shapes:
-            for shape in shapes["cloud"]:
-                one.plot(*_outline_of_ellipsoid(shape, i, j), color=COLOURS[5], lw=0.5, alpha=0.25)
+        if "cloud" in matrices_by_name:
+            for shape in matrices_by_name["cloud"]:
+                one.plot(*_ellipsoid_outline(shape, i, j), color=COLOURS[5], lw=0.5, alpha=0.25)
             one.plot([], [], color=COLOURS[5], lw=1, label=label)
         one.plot(
-            *_outline_of_ellipsoid(shapes["body"][0], i, j), color=COLOURS[0], lw=2, label="body"
+            *_ellipsoid_outline(matrices_by_name["body"][0], i, j),
+            color=COLOURS[0],
+            lw=2,
+            label="body",
         )
-        if "truth" in shapes:
-            outline = _outline_of_ellipsoid(shapes["truth"][0], i, j)
+        if "truth" in matrices_by_name:
+            outline = _ellipsoid_outline(matrices_by_name["truth"][0], i, j)
             one.plot(*outline, color=COLOURS[1], lw=1.6, ls="--", label="truth")
         one.set_aspect("equal")
         one.set(xlim=(-reach, reach), ylim=(-reach, reach))
@@ -116,7 +121,7 @@ def _draw_outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
         one.grid(alpha=0.3)
 
 
-def _matrix_of_ellipsoid(body: Inertia | MassProperties) -> Any:
+def _ellipsoid_matrix(body: Inertia | MassProperties) -> Any:
     """Return the matrix A (3, 3) of the ellipsoid r·A⁻¹r = 1 that is drawn for a body: 5𝔖/m, m²,
     for a body with mass m, or 𝔖, kg m², for an `Inertia`, where 𝔖 = ∫ r rᵀ dm (3, 3) is its second
     moment of mass.
@@ -126,16 +131,16 @@ def _matrix_of_ellipsoid(body: Inertia | MassProperties) -> Any:
     return body.second_moment
 
 
-def _outline_of_ellipsoid(shape: np.ndarray, i: int, j: int) -> np.ndarray:
+def _ellipsoid_outline(matrix: np.ndarray, i: int, j: int) -> np.ndarray:
     """Return 121 points (2, 121) on the outline of the ellipsoid r·A⁻¹r = 1, as it is seen along a
     coordinate axis.
 
     It is the ellipse of the 2 × 2 block of A for the two other axes.
 
-    - `shape`: (3, 3) the matrix A.
+    - `matrix`: (3, 3) the matrix A.
     - `i`, `j`: the indices, 0 to 2, of the two axes of the picture.
     """
-    values, vectors = np.linalg.eigh(shape[np.ix_((i, j), (i, j))])
+    values, vectors = np.linalg.eigh(matrix[np.ix_((i, j), (i, j))])
     angle = np.linspace(0, 2 * np.pi, 121)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     return vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * circle)

@@ -9,11 +9,13 @@ from jaxtyping import ArrayLike, PyTree
 
 from rigidjax.plot.style import (
     COLOURS,
+    LINE_STYLES,
+    MARKERS,
     RATES,
     TIMES,
     escape_formulas,
     pyplot,
-    readings_of_fit,
+    recording_residuals_and_deviations,
     unit_factor,
 )
 from rigidjax.rotation import quaternion
@@ -31,6 +33,9 @@ def fit(
     """Draw, for each sensor, the data and the fit in the upper row and the residuals in the lower
     row.
 
+    The components along x, y and z can be told apart in grey: their lines are solid, dashed and
+    dash-dotted, their points circles, squares and triangles.
+
     **Arguments:** `fit_result` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit`
     `s`, `min`, `h` or `day`; `rate_unit` `rad/s`, `deg/s`, `rpm` or `deg/day`; `title`. **Returns**
     the matplotlib figure.
@@ -42,25 +47,29 @@ def fit(
     plt = pyplot()
     seconds = unit_factor(time_unit, TIMES, "time_unit")
     rate = unit_factor(rate_unit, RATES, "rate_unit")
-    record, left, _ = readings_of_fit(fit_result, index)
+    record, left, _ = recording_residuals_and_deviations(fit_result, index)
     count = len(record.readings)
     size, how = (max(6.2 * count, 7.5), 6), dict(squeeze=False, layout="constrained")
     figure, axes = plt.subplots(2, count, figsize=size, sharex=True, height_ratios=(2, 1), **how)
-    dense = _dense_states(fit_result, record, index)
+    dense = _dense_times_and_states(fit_result, record, index)
     for column, (reading, errors) in enumerate(zip(record.readings, left, strict=True)):
         upper, lower = axes[:, column]
-        _draw_sensor(upper, lower, record.t, reading, errors, dense, (seconds, rate, rate_unit))
+        _draw_readings_and_residuals(
+            upper, lower, record.t, reading, errors, dense, (seconds, rate, rate_unit)
+        )
         lower.axhline(0, color="0.6", lw=0.8)
         lower.set_xlabel(f"time, {time_unit}")
         upper.margins(x=0.02, y=0.2)
-        upper.legend(loc="upper right", ncols=3, fontsize="small")
+        upper.legend(loc="upper right", ncols=3, fontsize="small", handlelength=2.6)
         upper.set_title(f"{type(reading.sensor).__name__}: points read, lines fitted", fontsize=10)
     if title:
         figure.suptitle(escape_formulas(title))
     return figure
 
 
-def _dense_states(fit_result: Any, record: Any, index: int) -> tuple[np.ndarray, Any] | None:
+def _dense_times_and_states(
+    fit_result: Any, record: Any, index: int
+) -> tuple[np.ndarray, Any] | None:
     """Return two things: 800 evenly spaced times, s; and the fitted states at these times, for a
     smooth line between the readings.
 
@@ -81,7 +90,7 @@ def _dense_states(fit_result: Any, record: Any, index: int) -> tuple[np.ndarray,
     return np.asarray(dense), simulate(body, state0, dense).ys
 
 
-def _draw_sensor(
+def _draw_readings_and_residuals(
     upper_axes: Any,
     lower_axes: Any,
     ts: ArrayLike,
@@ -131,14 +140,16 @@ def _draw_sensor(
             line_t, line = dense_states[0] / seconds, np.asarray(dense_states[1].omega) * scale
     lower_axes.set_ylabel(f"error, {unit}")
     many = seen.sum() > 100
-    mark: dict[str, Any] = {"marker": "." if many else "o", "ls": "", "ms": 2 if many else 5}
-    for axis, (name, colour) in enumerate(zip(names, COLOURS, strict=False)):
+    styles = zip(names, COLOURS, LINE_STYLES, MARKERS, strict=False)
+    for axis, (name, colour, dashes, marker) in enumerate(styles):
+        mark: dict[str, Any] = dict(color=colour, marker=marker, ls="", ms=2 if many else 5)
         if line is not None:
             whole = slice(None) if line_t is not t else seen
-            upper_axes.plot(line_t[whole], line[whole, axis], color=colour, lw=1.2, label=name)
-        upper_axes.plot(t[seen], read[seen, axis], color=colour, alpha=0.6, **mark)
+            how: dict[str, Any] = dict(color=colour, ls=dashes, lw=1.2, label=name)
+            upper_axes.plot(line_t[whole], line[whole, axis], **how)
+        upper_axes.plot(t[seen], read[seen, axis], alpha=0.6, **mark)
         if axis < errors.shape[1]:
-            lower_axes.plot(t[seen], errors[seen, axis] * scale, color=colour, alpha=0.7, **mark)
+            lower_axes.plot(t[seen], errors[seen, axis] * scale, alpha=0.7, **mark)
 
 
 def _body_z_in_world(q: ArrayLike) -> np.ndarray:

@@ -13,7 +13,7 @@ from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion.torques import HeavyTop
 from rigidjax.plot import style
-from rigidjax.plot.style import COLOURS, escape_formulas, rows_on_host
+from rigidjax.plot.style import COLOURS, escape_formulas, time_series_on_host
 
 
 def phase_portrait(
@@ -51,9 +51,9 @@ def phase_portrait(
             getattr(_checks.require_instance(top, HeavyTop, "top"), name), size, f"top.{name}"
         )
     levels = _checks.integer(levels, "levels", 1)
-    across, along, axis, weight, up = _constants_of_top(inertia, top)
+    across, along, axis, weight, up = _symmetric_top_constants(inertia, top)
     m = style.rotation_matrices(style.attitudes_on_host(states))
-    omega = np.einsum("tij,tj->ti", m, rows_on_host(states.omega, 3, "states.omega"))
+    omega = np.einsum("tij,tj->ti", m, time_series_on_host(states.omega, 3, "states.omega"))
     first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], states)
     about_up = float(np.asarray(spatial_angular_momentum(inertia, first)) @ up)
     about_axis = along * float(np.asarray(first.omega) @ axis)
@@ -67,7 +67,7 @@ def phase_portrait(
         turning = (about_up - about_axis * np.cos(theta)) ** 2 / (2 * across * np.sin(theta) ** 2)
         return turning + weight * np.cos(theta)
 
-    ax = style.flat_axes(ax)
+    ax = style.axes_2d_or_new(ax)
     seen = np.isfinite(rate)
     reach = 1.6 * max(float(np.abs(rate[seen]).max(initial=0.0)), 0.2 * np.sqrt(weight / across))
     middle, half = 0.5 * (tilt.max() + tilt.min()), 0.5 * np.ptp(tilt)
@@ -91,11 +91,11 @@ def phase_portrait(
         ax.plot(np.degrees(lowest), 0, color=COLOURS[1], marker="x", ms=8, ls="", label="steady")
     ax.set(xlabel="tilt θ, deg", ylabel="dθ/dt, rad/s", ylim=(-reach, reach))
     ax.set_title(escape_formulas(title) or "phase portrait; thin: equal energy, same momenta")
-    style.legend_below(ax)
+    style.draw_legend_below(ax)
     return ax
 
 
-def _constants_of_top(
+def _symmetric_top_constants(
     inertia: Inertia, top: HeavyTop
 ) -> tuple[float, float, np.ndarray, float, np.ndarray]:
     """Return five constants of a heavy symmetric top: the moments of inertia I₁ across and I₃ about

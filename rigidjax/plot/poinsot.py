@@ -11,7 +11,7 @@ from rigidjax._types import HasAttitude, HasSpin
 from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.plot import style
-from rigidjax.plot.style import COLOURS, escape_formulas, rows_on_host
+from rigidjax.plot.style import COLOURS, escape_formulas, time_series_on_host
 
 
 def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
@@ -28,17 +28,17 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     """
     m = style.rotation_matrices(style.attitudes_on_host(states))
     ax = style.axes_3d_or_new(ax)
-    style.draw_sphere(ax, "0.8", 0.12)
+    style.draw_translucent_sphere(ax, "0.8", 0.12)
     for axis, colour in enumerate(COLOURS[:3]):
         path = m[:, :, axis]
-        style.draw_around_ball(ax, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
+        style.draw_curve_on_sphere(ax, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
         ax.plot(*path[:1].T, color=colour, marker="o", ms=6, ls="")
         ax.plot(*path[-1:].T, color=colour, marker="^", ms=7, ls="")
     # The marks in the legend are grey, since every body axis has such marks.
     for mark, name in (("o", "start"), ("^", "end")):
         ax.plot([], [], [], color="0.4", marker=mark, ms=6, ls="", label=name)
     style.set_equal_scales(ax, 1.0, ("x", "y", "z"))
-    style.legend_below(ax, down=0.06)
+    style.draw_legend_below(ax, distance=0.06)
     ax.set_title(escape_formulas(title) or "body axes on the unit sphere, world frame")
     return ax
 
@@ -78,7 +78,7 @@ def polhode(
     moments, q = inertia.require_invertible().principal()
     i = np.asarray(moments, dtype=float)
     turn = style.rotation_matrices(np.asarray(q, dtype=float)[None])[0]
-    omega = rows_on_host(states.omega, 3, "states.omega")
+    omega = time_series_on_host(states.omega, 3, "states.omega")
     pi = omega @ turn * i
     size = float(np.linalg.norm(pi[0]))
     if not size > 0:
@@ -90,19 +90,19 @@ def polhode(
     # The drawing order is set here, since matplotlib gives a whole surface a single depth and would
     # draw the sphere over the path.
     ax.computed_zorder = False
-    style.draw_sphere(ax, COLOURS[5], 0.15)
+    style.draw_translucent_sphere(ax, COLOURS[5], 0.15)
     semi_axes = np.sqrt(twice_energy * i)
     # The ellipsoid is drawn as meridians and parallels, so that the sphere inside it stays visible.
     how: dict[str, Any] = dict(color=COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
     ax.plot_wireframe(
-        *(semi_axes[:, None, None] * style.sphere_grid()), rstride=4, cstride=6, **how
+        *(semi_axes[:, None, None] * style.grid_on_unit_sphere()), rstride=4, cstride=6, **how
     )
     # If all moments are equal, the energy is constant on the sphere, and there are no lines to
     # draw.
     if i[2] - i[0] > 1e-9 * i[2]:
-        _draw_energy_curves(ax, i, energies)
+        _draw_curves_of_equal_energy(ax, i, energies)
     how = dict(hidden_style={"ls": (0, (1, 1)), "lw": 1.8}, label="this motion", zorder=5)
-    style.draw_around_ball(ax, pi, color=COLOURS[1], lw=2.6, **how)
+    style.draw_curve_on_sphere(ax, pi, color=COLOURS[1], lw=2.6, **how)
     ax.plot(*pi[:1].T, color=COLOURS[1], marker="o", ms=6, ls="", label="start", zorder=6)
     style.set_equal_scales(ax, max(1.0, float(semi_axes.max())), ("Π₁ / h", "Π₂ / h", "Π₃ / h"))
     handles, names = ax.get_legend_handles_labels()
@@ -111,38 +111,38 @@ def polhode(
 
     handles += [Patch(color=COLOURS[5], alpha=0.4), Line2D([], [], color=COLOURS[4], lw=0.8)]
     names += ["momentum sphere", "energy ellipsoid"]
-    style.legend_below(ax, handles, names, down=0.06)
+    style.draw_legend_below(ax, handles, names, distance=0.06)
     ax.set_title(escape_formulas(title) or "polhode, principal axes of the body")
     return ax
 
 
-def _draw_energy_curves(ax: Any, i: np.ndarray, energies: int) -> None:
+def _draw_curves_of_equal_energy(ax: Any, moments: np.ndarray, curve_count: int) -> None:
     """Draw curves of equal energy, and the separatrix (the curve through the middle axis), on the
     unit sphere of the angular momentum.
 
     - `ax`: 3-D axes of matplotlib.
-    - `i`: (3,) the principal moments, ascending.
-    - `energies`: the number of curves besides the separatrix.
+    - `moments`: (3,) the principal moments, ascending.
+    - `curve_count`: the number of curves besides the separatrix.
     """
     import contourpy
 
     def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
         # The pole of the coordinates is along the axis of the middle moment. No closed curve goes
         # round this axis, so that no curve is cut where the longitude jumps by 2π.
-        return style.sphere_points(around, down)[[1, 2, 0]]
+        return style.points_on_unit_sphere(around, down)[[1, 2, 0]]
 
-    inverse = 1 / i
+    inverse = 1 / moments
     around, down = np.linspace(0, 2 * np.pi, 181), np.linspace(0, np.pi, 91)
     level = np.einsum("i,ijk->jk", inverse, on_sphere(around, down[:, None]) ** 2)
     lines = contourpy.contour_generator(around, down, level)
-    values = np.linspace(inverse[2], inverse[0], energies + 2)[1:-1]
+    values = np.linspace(inverse[2], inverse[0], curve_count + 2)[1:-1]
     drawn: list[Any] = [(value, dict(lw=0.6, color="0.35", zorder=3)) for value in values]
-    if min(i[1] - i[0], i[2] - i[1]) > 1e-9 * i[2]:
+    if min(moments[1] - moments[0], moments[2] - moments[1]) > 1e-9 * moments[2]:
         how = dict(lw=1.2, color="0.1", ls="--", label="separatrix", zorder=4)
         drawn.append((inverse[1], how))
     for value, how in drawn:
         for curve in lines.lines(value):
-            style.draw_around_ball(ax, on_sphere(*np.asarray(curve).T).T, **how)
+            style.draw_curve_on_sphere(ax, on_sphere(*np.asarray(curve).T).T, **how)
             how.pop("label", None)
 
 
@@ -162,7 +162,7 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     'ω along e₁, rad/s'
     """
     m = style.rotation_matrices(style.attitudes_on_host(states))
-    omega = np.einsum("tij,tj->ti", m, rows_on_host(states.omega, 3, "states.omega"))
+    omega = np.einsum("tij,tj->ti", m, time_series_on_host(states.omega, 3, "states.omega"))
     each = jax.vmap(lambda state: spatial_angular_momentum(inertia, state))
     momenta = np.asarray(each(jax.tree.map(jnp.asarray, states)), dtype=float)
     size = np.linalg.norm(momenta, axis=1)
@@ -181,7 +181,7 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     first = first / np.linalg.norm(first)
     path = np.stack([omega @ first, omega @ np.cross(up, first)], axis=-1)
 
-    ax = style.flat_axes(ax, figsize=(5.2, 5.0))
+    ax = style.axes_2d_or_new(ax, figsize=(5.2, 5.0))
     ax.plot(*path.T, color=COLOURS[0], lw=1.2)
     ax.plot(*path[0], color=COLOURS[1], marker="o", ms=6, ls="", label="start")
     distance = np.linalg.norm(path, axis=1)
@@ -192,5 +192,5 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     ax.set_aspect("equal")
     ax.set(xlabel="ω along e₁, rad/s", ylabel="ω along e₂, rad/s")
     ax.set_title(escape_formulas(title) or "herpolhode, across the angular momentum")
-    style.legend_below(ax)
+    style.draw_legend_below(ax)
     return ax

@@ -9,7 +9,7 @@ from rigidjax.plot.style import (
     TIMES,
     axes_of_shape,
     escape_formulas,
-    readings_of_fit,
+    recording_residuals_and_deviations,
     unit_factor,
 )
 
@@ -41,7 +41,7 @@ def residuals(
     'lag, samples'
     """
     seconds = unit_factor(time_unit, TIMES, "time_unit")
-    record, left, noises = readings_of_fit(fit_result, index)
+    record, left, noises = recording_residuals_and_deviations(fit_result, index)
     count = len(record.readings)
     ax = axes_of_shape(ax, (count, 4), nrows=count, ncols=4, figsize=(10.5, 2.8 * count))
     t = np.asarray(record.t) / seconds
@@ -55,30 +55,37 @@ def residuals(
 
 
 def _draw_sensor_residuals(
-    row: np.ndarray, t: np.ndarray, standardised: np.ndarray, mask: np.ndarray
+    four_panels: np.ndarray, t: np.ndarray, standardised_residuals: np.ndarray, mask: np.ndarray
 ) -> None:
     """Draw the residuals of one sensor in four panels: over time, as a histogram, as
     autocorrelation, and as power spectrum.
 
-    - `row`: (4,) matplotlib axes, one for each panel.
+    - `four_panels`: (4,) matplotlib axes, one for each panel.
     - `t`: (T,) the T times of the readings, in the unit of the picture.
-    - `standardised`: (T, k) the residuals divided by their standard deviation, for the k axes of
-      the sensor.
+    - `standardised_residuals`: (T, k) the residuals divided by their standard deviation, for the k
+      axes of the sensor.
     - `mask`: (T,) true at times with a reading; other residuals are not drawn.
     """
-    over_time, spread, memory, spectrum = row
-    colours, names = COLOURS[: standardised.shape[1]], "xyz"[: standardised.shape[1]]
-    everything = standardised[mask].ravel()
+    over_time, spread, memory, spectrum = four_panels
+    colours, names = (
+        COLOURS[: standardised_residuals.shape[1]],
+        "xyz"[: standardised_residuals.shape[1]],
+    )
+    everything = standardised_residuals[mask].ravel()
     # With a scale that includes an outlier all other residuals would lie on a line: residuals
     # beyond `reach` are drawn at the border of the panel.
     reach = float(np.clip(np.abs(everything).max(initial=0.0) * 1.1, 4.0, 8.0))
     beyond = int((np.abs(everything) > reach).sum())
-    shown = np.where(np.abs(standardised[mask]) <= reach, standardised[mask], np.nan)
+    shown = np.where(
+        np.abs(standardised_residuals[mask]) <= reach, standardised_residuals[mask], np.nan
+    )
     how: dict[str, Any] = dict(ms=2.5 if mask.sum() > 100 else 5, alpha=0.7)
     for values, colour, name in zip(shown.T, colours, names, strict=True):
         over_time.plot(t[mask], values, ".", color=colour, label=name, **how)
     if beyond:
-        for axis, (values, colour) in enumerate(zip(standardised[mask].T, colours, strict=True)):
+        for axis, (values, colour) in enumerate(
+            zip(standardised_residuals[mask].T, colours, strict=True)
+        ):
             for side, mark in ((1, "^"), (-1, "v")):
                 where = t[mask][side * values > reach]
                 # The triangles of each axis have a height of their own, since an outlier often
@@ -112,7 +119,7 @@ def _draw_sensor_residuals(
 
     number = int(mask.sum())
     lags = np.arange(1, max(2, min(40, number // 2)))
-    for values, colour in zip(standardised[mask].T, colours, strict=True):
+    for values, colour in zip(standardised_residuals[mask].T, colours, strict=True):
         memory.plot(lags, _autocorrelation(values, lags), ".-", color=colour, ms=4, lw=0.8)
         spectrum.plot(*power_spectrum(t[mask], values), color=colour, lw=1)
     band = 2 / np.sqrt(max(number, 1))

@@ -13,6 +13,10 @@ from rigidjax.rotation import quaternion
 # Okabe and Ito's colours, distinct also for colour-blind readers (2008, "Color Universal Design").
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 AXES = "xyz"
+# The components along x, y and z differ in line style and marker, too: a picture is often printed
+# in grey, where colours of equal brightness cannot be told apart.
+LINE_STYLES = ("-", "--", "-.")
+MARKERS = ("o", "s", "^")
 TIMES = {"s": 1.0, "min": 60.0, "h": 3600.0, "day": 86400.0}
 RATES = {"rad/s": 1.0, "deg/s": 180 / np.pi, "rpm": 30 / np.pi, "deg/day": 86400 * 180 / np.pi}
 
@@ -39,7 +43,7 @@ def unit_factor(unit: str, units: dict[str, float], name: str) -> float:
     return units[_checks.require_option(unit, tuple(units), name)]
 
 
-def readings_of_fit(
+def recording_residuals_and_deviations(
     fit_result: Any, index: object
 ) -> tuple[Any, list[np.ndarray], list[np.ndarray]]:
     """Return three things: a recording of a fit; its residuals, an array for each sensor; and the
@@ -68,8 +72,10 @@ def readings_of_fit(
     return record, errors, [np.hypot(noise[which], late) for noise, late in noises]
 
 
-def flat_axes(ax: Any, **options: Any) -> Any:
-    """Return `ax`, or new axes if `ax` is `None`; `options` are arguments of `pyplot.subplots`."""
+def axes_2d_or_new(ax: Any, **options: Any) -> Any:
+    """Return `ax`, or new two-dimensional axes if `ax` is `None`; `options` are arguments of
+    `pyplot.subplots`.
+    """
     if ax is not None:
         return ax
     return pyplot().subplots(layout="constrained", **{"figsize": (6.4, 4.4), **options})[1]
@@ -103,35 +109,37 @@ def axes_of_shape(ax: Any, shape: tuple[int, ...], **options: Any) -> Any:
     return ax
 
 
-def legend_below(ax: Any, *entries: Any, down: float = 0.16) -> None:
-    """Draw the legend below the axes, at a distance of `down` times the height of the axes.
+def draw_legend_below(ax: Any, *entries: Any, distance: float = 0.16) -> None:
+    """Draw the legend below the axes, at a distance of `distance` times the height of the axes.
 
     Inside the axes the legend would cover the curves. `entries` are arguments of `ax.legend`.
     """
-    place = dict(loc="upper center", bbox_to_anchor=(0.5, -down))
+    place = dict(loc="upper center", bbox_to_anchor=(0.5, -distance))
     ax.legend(*entries, **place, ncols=3, fontsize=8, frameon=False)
 
 
-def times_on_host(ts: object, count: int, name: str = "the states have") -> np.ndarray:
+def times_on_host(ts: object, count: int, words_about_count: str = "the states have") -> np.ndarray:
     """Return the times `ts` (T,) as NumPy float64.
 
-    **Raises:** `ValueError` unless T is `count`; the message continues "as `name` …".
+    **Raises:** `ValueError` unless T is `count`; the message names what has `count` entries by
+    `words_about_count`.
     """
     t = _checks.host_array(ts, "ts")
     if t.shape != (count,):
-        raise ValueError(f"ts: wanted ({count},) as {name}, got {t.shape}")
+        raise ValueError(f"ts: wanted ({count},) as {words_about_count}, got {t.shape}")
     return t
 
 
-def rows_on_host(values: object, width: int, name: str) -> np.ndarray:
-    """Return `values` of one body over time (T, width) as NumPy float64.
+def time_series_on_host(values: object, column_count: int, name: str) -> np.ndarray:
+    """Return `values` of one body over time (T, `column_count`) as NumPy float64.
 
-    **Raises:** `ValueError` for another shape, or if no value is finite.
+    `name` is the name of the values in messages. **Raises:** `ValueError` for another shape, or if
+    no value is finite.
     """
     out = _checks.host_array(values, name)
-    if out.ndim != 2 or out.shape[1] != width:
+    if out.ndim != 2 or out.shape[1] != column_count:
         hint = "; draw one body of a batch at a time" if out.ndim == 3 else ""
-        raise ValueError(f"{name}: wanted shape (times, {width}), got {out.shape}{hint}")
+        raise ValueError(f"{name}: wanted shape (times, {column_count}), got {out.shape}{hint}")
     if not np.isfinite(out).any():
         raise ValueError(f"{name}: nothing to draw, every value is NaN or infinite")
     return out
@@ -145,7 +153,7 @@ def attitudes_on_host(states: Any) -> np.ndarray:
     if not hasattr(states, "q"):
         got = type(states).__name__
         raise TypeError(f"states: wanted states with an attitude (Attitude, Rigid), got {got}")
-    return rows_on_host(states.q, 4, "states.q")
+    return time_series_on_host(states.q, 4, "states.q")
 
 
 def rotation_matrices(q: np.ndarray) -> np.ndarray:
@@ -154,13 +162,13 @@ def rotation_matrices(q: np.ndarray) -> np.ndarray:
     return np.asarray(jax.vmap(quaternion.to_matrix)(unit), dtype=float)
 
 
-def sphere_points(longitude: np.ndarray, colatitude: np.ndarray) -> np.ndarray:
+def points_on_unit_sphere(longitude: np.ndarray, colatitude: np.ndarray) -> np.ndarray:
     """Return points (3, …) on the unit sphere from their `longitude` and `colatitude`, rad."""
     ring, height = np.sin(colatitude), np.cos(colatitude)
     return np.stack(np.broadcast_arrays(np.cos(longitude) * ring, np.sin(longitude) * ring, height))
 
 
-def draw_around_ball(
+def draw_curve_on_sphere(
     ax: Any, path: np.ndarray, *, hidden_style: dict[str, Any] | None = None, **style: Any
 ) -> None:
     """Draw a line `path` (T, 3) on the unit sphere, in `hidden_style` where the sphere hides it."""
@@ -176,23 +184,26 @@ def draw_around_ball(
         ax.plot(*line.T, **{**style, **more})
 
 
-def sphere_grid() -> np.ndarray:
+def grid_on_unit_sphere() -> np.ndarray:
     """Return a grid of points (3, 49, 25) on the unit sphere, by longitude and colatitude."""
-    return sphere_points(np.linspace(0, 2 * np.pi, 49)[:, None], np.linspace(0, np.pi, 25))
+    return points_on_unit_sphere(np.linspace(0, 2 * np.pi, 49)[:, None], np.linspace(0, np.pi, 25))
 
 
-def draw_sphere(ax: Any, colour: str, alpha: float) -> None:
+def draw_translucent_sphere(ax: Any, colour: str, alpha: float) -> None:
     """Draw the unit sphere as a translucent surface; `alpha` is its opacity, from 0 to 1."""
-    ax.plot_surface(*sphere_grid(), color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1)
+    ax.plot_surface(
+        *grid_on_unit_sphere(), color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1
+    )
 
 
-def set_equal_scales(ax: Any, reach: float, labels: tuple[str, str, str]) -> None:
-    """Set equal scales, from −`reach` to `reach`, on all three axes, with few ticks and with
-    `labels`.
+def set_equal_scales(ax: Any, half_width: float, labels: tuple[str, str, str]) -> None:
+    """Set equal scales, from −`half_width` to `half_width`, on all three axes, with few ticks and
+    with `labels`.
     """
     from matplotlib.ticker import MaxNLocator
 
-    ax.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
+    limits = (-half_width, half_width)
+    ax.set(xlim=limits, ylim=limits, zlim=limits)
     ax.set_box_aspect((1, 1, 1))
     for axis, label in zip((ax.xaxis, ax.yaxis, ax.zaxis), labels, strict=True):
         # The outer ticks are left out: at the corners of the cube the number at such a tick would

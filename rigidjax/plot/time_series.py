@@ -10,7 +10,14 @@ from jaxtyping import ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import HasSpin
 from rigidjax.plot import style
-from rigidjax.plot.style import COLOURS, RATES, TIMES, escape_formulas, rows_on_host
+from rigidjax.plot.style import (
+    COLOURS,
+    LINE_STYLES,
+    RATES,
+    TIMES,
+    escape_formulas,
+    time_series_on_host,
+)
 from rigidjax.rotation import euler
 
 
@@ -25,6 +32,9 @@ def motion(
     ax: Any = None,
 ) -> Any:
     """Draw the body rate against time, and above it the attitude if the states have one.
+
+    The lines of the three components (or angles) are solid, dashed and dash-dotted in this order,
+    and the line of w is dotted, so that they can be told apart in grey.
 
     **Arguments:** `ts` (T,) s; `states` of one body with a leading time axis, such as `sol.ys`;
     `attitude` the form of the attitude: `quaternion` (w, x, y, z), `axes` (the world z component of
@@ -42,50 +52,52 @@ def motion(
     _checks.require_instance(
         states, HasSpin, "states", requirement="a Spin, an Attitude or a Rigid"
     )
-    omega = rows_on_host(states.omega, 3, "states.omega") * turned
+    omega = time_series_on_host(states.omega, 3, "states.omega") * turned
     t = style.times_on_host(ts, omega.shape[0]) / seconds
     both = hasattr(states, "q")
     count = 2 if both else 1
     ax = style.axes_of_shape(ax, (count,), nrows=count, sharex=True, figsize=(7.2, 2.6 * count))
     if both:
         _draw_attitude(ax[0], t, style.attitudes_on_host(states), attitude)
-    for values, name, colour in zip(omega.T, "xyz", COLOURS[:3], strict=True):
-        ax[-1].plot(t, values, color=colour, label=f"Ω{name}", lw=1.4)
+    for values, name, colour, dashes in zip(omega.T, "xyz", COLOURS[:3], LINE_STYLES, strict=True):
+        ax[-1].plot(t, values, color=colour, ls=dashes, label=f"Ω{name}", lw=1.4)
     ax[-1].set(xlabel=f"time, {time_unit}", ylabel=f"body rate Ω, {rate_unit}")
     for one in ax:
         one.margins(x=0)
         one.grid(alpha=0.3)
         # The legend is beside the axes: inside the axes it would cover a curve.
-        one.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+        one.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, handlelength=2.6)
     if title:
         ax[0].set_title(escape_formulas(title))
     return ax
 
 
-def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, kind: str) -> None:
+def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, form: str) -> None:
     """Draw the attitude of a body against time on matplotlib axes.
 
     - `ax`: the axes.
     - `t`: (T,) the times, in the unit of the picture.
     - `q`: (T, 4) the attitudes, body → world.
-    - `kind`: `quaternion`, `axes` (the components of the body axes along world z) or `angles`
+    - `form`: `quaternion`, `axes` (the components of the body axes along world z) or `angles`
       (3-1-3 Euler angles).
     """
-    _checks.require_option(kind, ("quaternion", "axes", "angles"), "attitude")
-    if kind == "quaternion":
+    _checks.require_option(form, ("quaternion", "axes", "angles"), "attitude")
+    if form == "quaternion":
         names, lines, label = [f"q{n}" for n in "wxyz"], q.T, "attitude q"
-    elif kind == "axes":
+    elif form == "axes":
         names = [f"{n}' · z" for n in "xyz"]
         lines, label = style.rotation_matrices(q)[:, 2, :].T, "body axes along world z"
     else:
-        names, lines, label = ["φ", "θ", "ψ"], _angles_in_degrees(q).T, "3-1-3 angles, deg"
-    colours = (COLOURS[6], *COLOURS[:3]) if len(names) == 4 else COLOURS[:3]
-    for values, name, colour in zip(lines, names, colours, strict=True):
-        ax.plot(t, values, color=colour, label=name, lw=1.4)
+        names, lines, label = ["φ", "θ", "ψ"], _euler_angles_in_degrees(q).T, "3-1-3 angles, deg"
+    colours, line_styles = COLOURS[:3], LINE_STYLES
+    if len(names) == 4:
+        colours, line_styles = (COLOURS[6], *colours), (":", *line_styles)
+    for values, name, colour, dashes in zip(lines, names, colours, line_styles, strict=True):
+        ax.plot(t, values, color=colour, ls=dashes, label=name, lw=1.4)
     ax.set_ylabel(label)
 
 
-def _angles_in_degrees(q: np.ndarray) -> np.ndarray:
+def _euler_angles_in_degrees(q: np.ndarray) -> np.ndarray:
     """Return the 3-1-3 Euler angles (T, 3), degrees, of the attitudes `q` (T, 4); an angle is NaN
     where it jumps by more than 180°, so that its curve is interrupted.
     """

@@ -294,9 +294,9 @@ def test_a_film_has_its_pictures(flip, tmp_path):
 
 
 def test_the_box_of_a_box_is_itself():
-    from rigidjax.plot.animation import box_of
+    from rigidjax.plot.animation import box_half_lengths_and_axes
 
-    half, turn = box_of(rj.shapes.box(3.0, [0.2, 0.6, 0.4]))
+    half, turn = box_half_lengths_and_axes(rj.shapes.box(3.0, [0.2, 0.6, 0.4]))
     np.testing.assert_allclose(half, [0.1, 0.2, 0.3])
     np.testing.assert_allclose(np.abs(turn), [[1, 0, 0], [0, 0, 1], [0, 1, 0]], atol=1e-12)
 
