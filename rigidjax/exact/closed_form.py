@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
-from rigidjax.exact.components3 import Four, Triple
+from rigidjax.exact.components3 import QuaternionEntries, Triple
 from rigidjax.exact.jacobi_duplication import (
     Elliptic,
     HalfPeriod,
@@ -174,7 +174,9 @@ def momentum_from_functions(constants: ClosedFormConstants, functions: Elliptic)
 
 
 @compiled_as_one_kernel
-def momentum_and_rotation(constants: ClosedFormConstants, t: Scalar) -> tuple[Triple, Four]:
+def momentum_and_rotation(
+    constants: ClosedFormConstants, t: Scalar
+) -> tuple[Triple, QuaternionEntries]:
     """Return two things: the body momentum at the time t; and the quaternion (w, x, y, z) of the
     rotation of the body from time 0 to t. Both have components along the principal axes.
 
@@ -191,7 +193,7 @@ def momentum_and_rotation(constants: ClosedFormConstants, t: Scalar) -> tuple[Tr
 
 def momentum_and_rotation_from_functions(
     constants: ClosedFormConstants, functions: Elliptic, half_time: ReducedTime, t: Scalar
-) -> tuple[Triple, Four]:
+) -> tuple[Triple, QuaternionEntries]:
     """Return two things: the body momentum at the time t; and the quaternion (w, x, y, z) of the
     rotation of the body from time 0 to t. Both have components along the principal axes.
 

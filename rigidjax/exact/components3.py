@@ -10,11 +10,11 @@ from jaxtyping import Array
 from rigidjax._types import Scalar
 from rigidjax.rotation.linalg3 import cross_components as cross
 
-# The tuples have 3, 4 and 6 entries. Their types do not state the length, since a type checker
+# These tuples have 3, 4 and 6 entries. Their types do not state the length, since a type checker
 # cannot derive it from a generator.
 Triple = tuple[Scalar, ...]
-Four = tuple[Scalar, ...]
-Six = tuple[Scalar, ...]
+QuaternionEntries = tuple[Scalar, ...]
+SymmetricEntries = tuple[Scalar, ...]
 # For two symmetric matrices a and b, ½ a : b is the sum of the products of their entries, weighted
 # by these numbers.
 HALF = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
@@ -25,7 +25,7 @@ def add(v: Triple, w: Triple) -> Triple:
     return v[0] + w[0], v[1] + w[1], v[2] + w[2]
 
 
-def matvec(matrix: Six, vector: Triple) -> Triple:
+def matvec(matrix: SymmetricEntries, vector: Triple) -> Triple:
     """Return the product of a symmetric matrix and a vector, as three components.
 
     - `matrix`: the entries (11, 22, 33, 12, 13, 23).
@@ -39,7 +39,7 @@ def matvec(matrix: Six, vector: Triple) -> Triple:
     )
 
 
-def commuting_product(left: Six, right: Six) -> Six:
+def commuting_product(left: SymmetricEntries, right: SymmetricEntries) -> SymmetricEntries:
     """Return the product of two symmetric matrices that commute; the product is symmetric, too.
 
     All three matrices are tuples of the entries (11, 22, 33, 12, 13, 23).
@@ -56,7 +56,7 @@ def commuting_product(left: Six, right: Six) -> Six:
     )
 
 
-def symmetric_rows(matrix: Six) -> tuple[Array, ...]:
+def symmetric_rows(matrix: SymmetricEntries) -> tuple[Array, ...]:
     """Return the three rows, each (3,), of the symmetric matrix with the entries (11, 22, 33, 12,
     13, 23).
     """
@@ -64,13 +64,13 @@ def symmetric_rows(matrix: Six) -> tuple[Array, ...]:
     return jnp.stack([a, x, y]), jnp.stack([x, b, z]), jnp.stack([y, z, c])
 
 
-def determinant(matrix: Six) -> Scalar:
+def determinant(matrix: SymmetricEntries) -> Scalar:
     """Return the determinant of the symmetric matrix with the entries (11, 22, 33, 12, 13, 23)."""
     a, b, c, x, y, z = matrix
     return a * b * c + 2.0 * x * y * z - a * z * z - b * y * y - c * x * x
 
 
-def adjugate(matrix: Six) -> Six:
+def adjugate(matrix: SymmetricEntries) -> SymmetricEntries:
     """Return the adjugate of a symmetric matrix, which is its determinant times its inverse; both
     matrices are tuples of the entries (11, 22, 33, 12, 13, 23).
     """
@@ -85,7 +85,7 @@ def adjugate(matrix: Six) -> Six:
     )
 
 
-def half_product(q: Four, vector: Triple) -> Four:
+def half_product(q: QuaternionEntries, vector: Triple) -> QuaternionEntries:
     """Return the four components of ½ q ⊗ (0, v), where ⊗ is the product of quaternions (w, x, y,
     z) and v = `vector`.
 
@@ -101,7 +101,7 @@ def half_product(q: Four, vector: Triple) -> Four:
     )
 
 
-def change_by_inverse_rotation(q: Four, vector: Triple) -> Triple:
+def change_by_inverse_rotation(q: QuaternionEntries, vector: Triple) -> Triple:
     """Return the three components of R(q)ᵀ v − v, where v = `vector` and R(q) is the rotation by
     the unit quaternion q; the change is computed without a difference of large numbers.
     """

@@ -40,8 +40,8 @@ from rigidjax.exact.closed_form import (
 )
 from rigidjax.exact.components3 import (
     HALF,
-    Four,
-    Six,
+    QuaternionEntries,
+    SymmetricEntries,
     Triple,
     add,
     adjugate,
@@ -75,15 +75,17 @@ _STILL = {jnp.dtype("float32"): 5e-3, jnp.dtype("float64"): 5e-6}
 _LOOPED = 1000
 
 # The body momentum Π(t), the quaternion of the rotation from time 0 to t, and the body rate Ω(t).
-Motion = tuple[Triple, Four, Triple]
+Motion = tuple[Triple, QuaternionEntries, Triple]
 # The differences and off-diagonal entries of K = I⁻¹, the six entries of K, and twice the energy.
-InverseInertiaAndEnergy = tuple[Differences, Six, Scalar]
+InverseInertiaAndEnergy = tuple[Differences, SymmetricEntries, Scalar]
 # The derivatives of the three components of a vector with respect to ten variables.
 VectorDerivatives = tuple[Float[Array, "10"], ...]
 
 
 @jax.custom_jvp
-def free_momentum_and_rotation(inertia: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
+def free_momentum_and_rotation(
+    inertia: SymmetricEntries, momentum: Triple, t: Scalar
+) -> tuple[Triple, QuaternionEntries]:
     """Return two things: the body momentum Π(t) of a free body; and the quaternion (w, x, y, z) of
     its rotation from time 0 to t. Both have components along the principal axes.
 
@@ -97,8 +99,9 @@ def free_momentum_and_rotation(inertia: Six, momentum: Triple, t: Scalar) -> tup
 
 @free_momentum_and_rotation.defjvp
 def _free_momentum_and_rotation_jvp(
-    primals: tuple[Six, Triple, Scalar], tangents: tuple[Six, Triple, Scalar]
-) -> tuple[tuple[Triple, Four], tuple[Triple, Four]]:
+    primals: tuple[SymmetricEntries, Triple, Scalar],
+    tangents: tuple[SymmetricEntries, Triple, Scalar],
+) -> tuple[tuple[Triple, QuaternionEntries], tuple[Triple, QuaternionEntries]]:
     """Return two pairs: the body momentum Π(t) of a free body and the quaternion of its rotation
     from time 0 to t, both along the principal axes, as `free_momentum_and_rotation` gives them; and
     the changes of these two for a change of the inputs. By this rule JAX differentiates
@@ -116,7 +119,8 @@ def _free_momentum_and_rotation_jvp(
 
 
 def _derivative_variables_and_changes(
-    primals: tuple[Six, Triple, Scalar], tangents: tuple[Six, Triple, Scalar]
+    primals: tuple[SymmetricEntries, Triple, Scalar],
+    tangents: tuple[SymmetricEntries, Triple, Scalar],
 ) -> tuple[
     InverseInertiaAndEnergy, InverseInertiaAndEnergy, Float[Array, "10"], Float[Array, "10"]
 ]:
@@ -290,7 +294,7 @@ def _rate_and_rotation_at(constants: FreeMotionConstants, t: Scalar) -> tuple[Ve
 
 def _moments_and_momentum(
     tensor: Mat3, omega: Vec3, constants: FreeMotionConstants
-) -> tuple[Six, Triple]:
+) -> tuple[SymmetricEntries, Triple]:
     """Return two things in principal axes, as differentiable functions of the inertia tensor and
     the body rate: the six entries (11, 22, 33, 12, 13, 23) of the tensor; and the three components
     of the body momentum Π(0).
@@ -382,12 +386,14 @@ class MotionDerivatives(NamedTuple):
 
 
 # The motion, its derivatives, and the pair from which the derivatives are computed.
-MotionAndDerivatives = tuple[Motion, MotionDerivatives, tuple[VectorDerivatives, Six]]
+MotionAndDerivatives = tuple[Motion, MotionDerivatives, tuple[VectorDerivatives, SymmetricEntries]]
 
 
 @jax.custom_jvp
 @compiled_as_one_kernel
-def motion_and_derivatives(moments: Six, momentum: Triple, t: Scalar) -> MotionAndDerivatives:
+def motion_and_derivatives(
+    moments: SymmetricEntries, momentum: Triple, t: Scalar
+) -> MotionAndDerivatives:
     """Return three things: the motion of a free body, which is (Π(t), quaternion of the rotation
     from time 0 to t, body rate Ω(t)); the derivatives of the motion; and the pair (rows, G) from
     which the derivatives are computed.
@@ -414,7 +420,8 @@ def motion_and_derivatives(moments: Six, momentum: Triple, t: Scalar) -> MotionA
 # tensor: this function is smooth to any order.
 @motion_and_derivatives.defjvp
 def _motion_and_derivatives_jvp(
-    primals: tuple[Six, Triple, Scalar], tangents: tuple[Six, Triple, Scalar]
+    primals: tuple[SymmetricEntries, Triple, Scalar],
+    tangents: tuple[SymmetricEntries, Triple, Scalar],
 ) -> tuple[MotionAndDerivatives, MotionAndDerivatives]:
     """Return two things: the motion of a free body and its first derivatives, as
     `motion_and_derivatives` gives them; and the changes of all these numbers for a change of the
@@ -434,13 +441,13 @@ def _motion_and_derivatives_jvp(
 
 
 def _motion_derivatives(
-    inverse_inertia: Six,
+    inverse_inertia: SymmetricEntries,
     energy2: Scalar,
     momentum: Triple,
     t: Scalar,
     motion: Motion,
     momentum_rows: VectorDerivatives,
-    momentum_integral: Six,
+    momentum_integral: SymmetricEntries,
 ) -> MotionDerivatives:
     """Return the derivatives of a free motion (of its body momentum Π(t), rotation and body rate
     Ω(t)) with respect to ten variables, from the derivatives of its body momentum.
@@ -533,8 +540,8 @@ def derivative_variables(
 
 @compiled_as_one_kernel
 def _momentum_and_rotation_with_derivatives(
-    constants: ClosedFormConstants, moments: Six, momentum: Triple, t: Scalar
-) -> tuple[tuple[Triple, Four], VectorDerivatives, Six]:
+    constants: ClosedFormConstants, moments: SymmetricEntries, momentum: Triple, t: Scalar
+) -> tuple[tuple[Triple, QuaternionEntries], VectorDerivatives, SymmetricEntries]:
     """Return three things: the pair of the body momentum Π(t) of a free body and the quaternion of
     its rotation from time 0 to t; the derivatives of Π(t) − Π(0) with respect to ten variables, as
     three arrays (10,), one for each component; and the six entries (11, 22, 33, 12, 13, 23) of the
@@ -574,7 +581,7 @@ def _changes_of_momentum_derivatives(
     inverse_inertia: Differences,
     variables: Float[Array, "10"],
     change_of_variables: Float[Array, "10"],
-) -> tuple[VectorDerivatives, Six]:
+) -> tuple[VectorDerivatives, SymmetricEntries]:
     """Return two changes for a change of the ten variables of a free motion: the change of the
     derivatives of the body momentum Π(t) with respect to these variables, as three arrays (10,),
     one for each component of Π; and the change of the six entries (11, 22, 33, 12, 13, 23) of the
@@ -606,7 +613,9 @@ def _changes_of_momentum_derivatives(
     return d_rows, tuple(jnp.sum(g * change_of_variables) for g in by_inputs)
 
 
-def inverse_inertia_and_energy(moments: Six, momentum: Triple) -> InverseInertiaAndEnergy:
+def inverse_inertia_and_energy(
+    moments: SymmetricEntries, momentum: Triple
+) -> InverseInertiaAndEnergy:
     """Return three things: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
     inertia tensor, each with all its digits; the six entries of K; and E₂ = Π·KΠ, which is twice
     the energy.

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
-from rigidjax.exact.components3 import Six, Triple
+from rigidjax.exact.components3 import SymmetricEntries, Triple
 from rigidjax.exact.jacobi_duplication import (
     Elliptic,
     Modulus,
@@ -52,7 +52,7 @@ def momentum_jacobian_and_integral(
     halves: Scalar,
     duration_of_halves: Scalar,
     mean_of_s_squared: Scalar,
-) -> tuple[tuple[Float[Array, "10"], ...], Six]:
+) -> tuple[tuple[Float[Array, "10"], ...], SymmetricEntries]:
     """Return two things: the derivatives of Π(t) − Π(0) with respect to ten variables, as three
     arrays (10,), one for each component of the body momentum Π; and the six entries of the matrix G
     = ∫ Π Πᵀ dt from 0 to t.

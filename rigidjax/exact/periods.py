@@ -11,7 +11,7 @@ from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
 from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
 from rigidjax.exact import sigma_form
-from rigidjax.exact.components3 import HALF, Six, Triple, matvec
+from rigidjax.exact.components3 import HALF, SymmetricEntries, Triple, matvec
 from rigidjax.exact.derivatives import inverse_inertia_and_energy, motion_and_derivatives
 from rigidjax.exact.jacobi_duplication import Modulus, half_period, is_aperiodic
 from rigidjax.exact.principal_axes import components_along, principal_frame
@@ -119,7 +119,7 @@ def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Sca
 
 
 @jax.custom_jvp
-def _precession_angle(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
+def _precession_angle(moments: SymmetricEntries, momentum: Triple, period: Scalar) -> Scalar:
     """Return the angle, rad, by which a principal axis of a free body turns about the momentum in
     one period of the body rate. The axis is the one that the momentum circles in the body frame.
 
@@ -139,7 +139,8 @@ def _precession_angle(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
 
 @_precession_angle.defjvp
 def _precession_angle_jvp(
-    primals: tuple[Six, Triple, Scalar], tangents: tuple[Six, Triple, Scalar]
+    primals: tuple[SymmetricEntries, Triple, Scalar],
+    tangents: tuple[SymmetricEntries, Triple, Scalar],
 ) -> tuple[Scalar, Scalar]:
     """Return the angle, rad, by which a principal axis of a free body turns about the momentum in
     one period of the body rate, and the change of this angle for a change of the inputs. By this

@@ -11,15 +11,15 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from rigidjax._types import Mat3, Scalar, Vec3
-from rigidjax.exact.components3 import Six, Triple
-from rigidjax.rotation.barrier import compiled_as_one_kernel, match_batch_axes
+from rigidjax.exact.components3 import SymmetricEntries, Triple
+from rigidjax.rotation.barrier import batch_as, compiled_as_one_kernel
 
 # Jacobi's cyclic method converges quadratically; a 3×3 matrix needs four or five sweeps from
 # anywhere.
 _SWEEPS = 6
 
 
-def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
+def principal_frame(tensor: Mat3) -> tuple[SymmetricEntries, Mat3]:
     """Return two things: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in
     principal axes, with the moments ascending; and the rotation matrix A (3, 3) whose columns are
     these axes.
@@ -33,7 +33,7 @@ def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
 
 
 @jax.custom_jvp
-def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
+def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> SymmetricEntries:
     """Return the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes,
     `AᵀIA`.
 
@@ -50,7 +50,7 @@ def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
 @tensor_in_axes.defjvp
 def _tensor_in_axes_jvp(
     primals: tuple[Mat3, Mat3, Triple], tangents: tuple[Mat3, PyTree, PyTree]
-) -> tuple[Six, Six]:
+) -> tuple[SymmetricEntries, SymmetricEntries]:
     """Return two things: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor I in
     principal axes, AᵀIA; and their change for a change of the tensor, with the axes A held fixed.
     By this rule JAX differentiates `tensor_in_axes`.

@@ -39,7 +39,14 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from rigidjax._types import Scalar
-from rigidjax.exact.components3 import Six, Triple, adjugate, commuting_product, determinant, matvec
+from rigidjax.exact.components3 import (
+    SymmetricEntries,
+    Triple,
+    adjugate,
+    commuting_product,
+    determinant,
+    matvec,
+)
 from rigidjax.exact.jacobi_duplication import (
     Modulus,
     clip_time_on_separatrix,
@@ -105,10 +112,10 @@ class Sigma(NamedTuple):
     """
 
     s: Scalar
-    t: Six
-    adjugate: Six
+    t: SymmetricEntries
+    adjugate: SymmetricEntries
     det: Scalar
-    y: Six
+    y: SymmetricEntries
 
 
 def motion_invariants(inverse_inertia: Differences, momentum: Triple) -> Invariants:
@@ -277,7 +284,7 @@ def advance_momentum_and_integral_term(
     divisor_terms: DivisorTerms,
     sigma_of_step: Sigma,
     momentum: Triple,
-) -> tuple[Triple, Six]:
+) -> tuple[Triple, SymmetricEntries]:
     """Return two things: the body momentum after a step of time u; and the first term of the
     integral G = ∫ Π Πᵀ dt, as the six entries of a symmetric matrix.
 
@@ -319,7 +326,7 @@ def advance_momentum_and_integral_term(
 
 def momentum_and_integral_in_four_parts(
     inverse_inertia: Differences, momentum: Triple, constants: Invariants, duration: Scalar
-) -> tuple[Triple, Six]:
+) -> tuple[Triple, SymmetricEntries]:
     """Return two things: the body momentum Π after the time `duration`; and the integral ∫ Π Πᵀ dt
     over this time, as the six entries of a symmetric matrix.
 
@@ -416,7 +423,7 @@ def momentum_period(constants: Invariants) -> Scalar:
 
 def momentum_and_outer_product_integral(
     inverse_inertia: Differences, momentum: Triple, t: Scalar
-) -> tuple[Triple, Six]:
+) -> tuple[Triple, SymmetricEntries]:
     """Return two things: the body momentum Π(t) of a free body; and G = ∫₀ᵗ Π Πᵀ dt, as the six
     entries of a symmetric matrix. Both are smooth functions of the whole inertia tensor.
 
@@ -449,7 +456,9 @@ def momentum_and_outer_product_integral(
     return tuple(p[0] for p in out), g
 
 
-def _normalised_sigma(sigma: Scalar, t_matrix: Six, integral: Six) -> Sigma:
+def _normalised_sigma(
+    sigma: Scalar, t_matrix: SymmetricEntries, integral: SymmetricEntries
+) -> Sigma:
     """Return Weierstrass's sigma functions of a free motion with a common scale: the number σ and
     the symmetric matrix T are divided by the entry T₂₂, so that T₂₂ = 1 in value.
 
@@ -465,12 +474,12 @@ def _normalised_sigma(sigma: Scalar, t_matrix: Six, integral: Six) -> Sigma:
     return Sigma(sigma, t_matrix, *barrier((adjugate(t_matrix), determinant(t_matrix))), integral)
 
 
-def _scaled_matrix(matrix: Six, factor: Scalar | float) -> Six:
+def _scaled_matrix(matrix: SymmetricEntries, factor: Scalar | float) -> SymmetricEntries:
     """Return the six entries of a symmetric matrix, each multiplied by the scalar `factor`."""
     return tuple(c * factor for c in matrix)
 
 
-def _add_to_diagonal(matrix: Six, summand: Scalar | float) -> Six:
+def _add_to_diagonal(matrix: SymmetricEntries, summand: Scalar | float) -> SymmetricEntries:
     """Return the six entries (11, 22, 33, 12, 13, 23) of the matrix A + x 1, for a symmetric matrix
     A and a number x.
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from rigidjax._types import RealLike
-from rigidjax.exact.components3 import Four, Triple, add, cross
+from rigidjax.exact.components3 import QuaternionEntries, Triple, add, cross
 from rigidjax.exact.diffrax_solver import field_and_direction
 from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations, project_to_group
@@ -33,7 +33,7 @@ from rigidjax.solve.tableaus import KUTTA4
 def momentum_change_and_turn(
     slope: Callable[[Any, Triple], Triple], rate: Callable[[Triple], Triple],
     t: Any, end: Any, h: Array, p: Triple,
-) -> tuple[Triple, Four]:  # fmt: skip
+) -> tuple[Triple, QuaternionEntries]:  # fmt: skip
     """Return the change of the momentum (or body rate) `p` in a step, and the turn of the body.
 
     The turn is a quaternion, scalar first, from which the identity (1, 0, 0, 0) is subtracted.

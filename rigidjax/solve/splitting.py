@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from rigidjax._types import RealLike
 from rigidjax.exact.components3 import (
-    Six,
+    SymmetricEntries,
     Triple,
     add,
     adjugate,
@@ -102,8 +102,8 @@ class Frame(NamedTuple):
     In both matrices the off-diagonal entries are zero, but they have tangents that are not zero.
     """
 
-    moments: Six  # the inertia, kg m²
-    weights: Six  # the inverse of the inertia, 1/(kg m²)
+    moments: SymmetricEntries  # the inertia, kg m²
+    weights: SymmetricEntries  # the inverse of the inertia, 1/(kg m²)
     axes: Array  # (3, 3), the axes as columns
 
 
@@ -116,13 +116,13 @@ def frame_of_tensor(tensor: Array) -> Frame:
     # The tensor is divided by its trace before it is inverted, because the determinant of an
     # inertia of 1e37 kg m² would overflow.
     size = six[0] + six[1] + six[2]
-    unit: Six = tuple(i / size for i in six)
+    unit: SymmetricEntries = tuple(i / size for i in six)
     scale = determinant(unit)
     return Frame(six, tuple(c / scale / size for c in adjugate(unit)), axes)
 
 
 @jax.custom_jvp
-def rate_of(inverse: Six, momentum: Triple) -> Triple:
+def rate_of(inverse: SymmetricEntries, momentum: Triple) -> Triple:
     """Return the body rate Ω = I⁻¹Π along the principal axes, three numbers, rad/s.
 
     `momentum` is Π along these axes, three numbers, N m s. `inverse` has the six entries (11, 22,

@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia
-from rigidjax.exact.components3 import Six, Triple, add, cross, half_product, matvec
+from rigidjax.exact.components3 import SymmetricEntries, Triple, add, cross, half_product, matvec
 from rigidjax.exact.principal_axes import combine_columns
 from rigidjax.motion import Attitude, Spin
 from rigidjax.motion.coupled import motion_of
@@ -162,7 +162,7 @@ class _InertiaAndTorque(NamedTuple):
     """
 
     inertia: Inertia
-    weights: Six  # the six different entries of the inverse of the inertia, 1/(kg m²)
+    weights: SymmetricEntries  # the six different entries of the inverse of the inertia, 1/(kg m²)
     torque: Any  # the torque law, or `None` for a free body
 
 
@@ -217,7 +217,9 @@ def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
 
 
 @jax.custom_jvp
-def _free_momentum_derivative(inverse: Six, differences: Triple, momentum: Triple) -> Triple:
+def _free_momentum_derivative(
+    inverse: SymmetricEntries, differences: Triple, momentum: Triple
+) -> Triple:
     """Return the time derivative of the momentum of a free body, dΠ/dt = Π × Ω, N m.
 
     `momentum` is the angular momentum Π, three numbers along the principal axes, N m s; Ω is the
@@ -236,7 +238,7 @@ def _free_momentum_derivative_jvp(primals, tangents):
     return _free_momentum_derivative(weights, gaps, p), add(cross(dp, rate), cross(p, turning))
 
 
-def _entries_of_symmetric_matrix(a: Array) -> Six:
+def _entries_of_symmetric_matrix(a: Array) -> SymmetricEntries:
     """Return the six different entries of a symmetric matrix, in the order 11, 22, 33, 12, 13, 23.
 
     `a` (3, 3) is the matrix. Each of the last three is the mean of two equal entries.
