@@ -67,7 +67,7 @@ def number_and_complement(
 
 
 @jax.custom_jvp
-def value_by_complement(value: RealOrArray, complement: RealOrArray) -> RealOrArray:
+def value_differentiated_by_complement(value: RealOrArray, complement: RealOrArray) -> RealOrArray:
     """Return `value` as a function of its complement alone, where `complement` is 1 − `value`: the
     result is `value` itself, but its derivative with respect to `complement` is −1, and its
     derivative with respect to `value` is 0.
@@ -75,15 +75,15 @@ def value_by_complement(value: RealOrArray, complement: RealOrArray) -> RealOrAr
     return match_batch_axes(value, complement)
 
 
-@value_by_complement.defjvp
-def _value_by_complement_jvp(
+@value_differentiated_by_complement.defjvp
+def _value_differentiated_by_complement_jvp(
     primals: tuple[RealOrArray, RealOrArray], tangents: tuple[PyTree, PyTree]
 ) -> tuple[RealOrArray, PyTree]:
     """Return two things: a number x as a function of its complement 1 − x alone; and its tangent
     (the change in a derivative), which is −1 times the tangent of the complement. By this rule JAX
-    differentiates `value_by_complement`.
+    differentiates `value_differentiated_by_complement`.
 
     - `primals`: the pair of x and 1 − x, two numbers or arrays.
     - `tangents`: the pair of their tangents; the tangent of x is not used.
     """
-    return value_by_complement(*primals), -tangents[1]
+    return value_differentiated_by_complement(*primals), -tangents[1]

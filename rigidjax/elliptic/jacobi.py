@@ -28,7 +28,7 @@ from rigidjax.elliptic.arguments import (
     Tangent,
     number_and_complement,
     to_common_dtype,
-    value_by_complement,
+    value_differentiated_by_complement,
 )
 from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, sncndn_near_one
 from rigidjax.elliptic.legendre import agm_iterates, complete_integral, incomplete_integral
@@ -59,7 +59,7 @@ def sncndn(
     [0.803001824896, 0.595976567672, 0.823161001632]
     """
     u, m, m1 = to_common_dtype(u=u, **number_and_complement("m", m, m1))
-    s, c, d, _ = _sncndn_and_half_turns(u, value_by_complement(m, m1), m1)
+    s, c, d, _ = _sncndn_and_half_turns(u, value_differentiated_by_complement(m, m1), m1)
     return s, c, d
 
 
@@ -73,7 +73,7 @@ def am(u: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     0.932315079884
     """
     u, m, m1 = to_common_dtype(u=u, **number_and_complement("m", m, m1))
-    s, c, _, turns = _sncndn_and_half_turns(u, value_by_complement(m, m1), m1)
+    s, c, _, turns = _sncndn_and_half_turns(u, value_differentiated_by_complement(m, m1), m1)
     sign = power_of_minus_one(turns)
     return jnp.arctan2(sign * s, sign * c) + math.pi * turns
 
@@ -97,13 +97,13 @@ def _sncndn_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Array, Array,
     inner_m = jnp.where(above, 1, m) / divisor
     inner_m1 = jnp.where(above, -m1, m1) / divisor
 
-    s, c, d = _sncndn_up_to_one(v, inner_m, inner_m1)
+    s, c, d = _sncndn_for_m_up_to_one(v, inner_m, inner_m1)
     turns = _reduce_to_half_period(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
     return (s / root, jnp.where(above, d, c), jnp.where(above, c, d), jnp.where(above, 0, turns))
 
 
 @jax.custom_jvp
-def _sncndn_up_to_one(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
+def _sncndn_for_m_up_to_one(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
     """Return Jacobi's elliptic functions sn(u|m), cn(u|m) and dn(u|m) for a parameter m ≤ 1, three
     arrays.
 
@@ -143,8 +143,8 @@ def _sncndn_up_to_one(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Arra
     return s, c, d
 
 
-@partial(_sncndn_up_to_one.defjvp, symbolic_zeros=True)
-def _sncndn_up_to_one_jvp(
+@partial(_sncndn_for_m_up_to_one.defjvp, symbolic_zeros=True)
+def _sncndn_for_m_up_to_one_jvp(
     primals: tuple[Array, Array, Array], tangents: tuple[Tangent, Tangent, Tangent]
 ) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
     """Return two triples: Jacobi's elliptic functions sn, cn and dn; and their tangents (their
@@ -156,7 +156,7 @@ def _sncndn_up_to_one_jvp(
       by 1 − m. A change that is known to be zero is a `SymbolicZero`.
     """
     (u, m, m1), (du, _, dm1) = primals, tangents
-    s, c, d = _sncndn_up_to_one(u, m, m1)
+    s, c, d = _sncndn_for_m_up_to_one(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
         # The derivatives with respect to u are DLMF 22.13.1–3.
@@ -195,7 +195,7 @@ def _derivatives_by_m_jvp(
     sm, cm, dm = slopes = _derivatives_by_m(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
-        s, c, d = _sncndn_up_to_one(u, m, m1)
+        s, c, d = _sncndn_for_m_up_to_one(u, m, m1)
         ds, dc = (cm * d + c * dm) * du, -(sm * d + s * dm) * du
         dd = -(s * c + m * (sm * c + s * cm)) * du
     if not isinstance(dm1, SymbolicZero):
@@ -228,7 +228,7 @@ def _derivatives_by_m_from_integral(u: Array, m: Array, m1: Array) -> tuple[Arra
     where X = −½ ∫₀^u sd²(v) dv and sd = sn/dn. Carlson's integral R_D gives X, after whole half
     periods are taken off u.
     """
-    s, c, d = _sncndn_up_to_one(u, m, m1)
+    s, c, d = _sncndn_for_m_up_to_one(u, m, m1)
     turns = _reduce_to_half_period(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = power_of_minus_one(turns)
     # X grows as 1/dn² and must not overflow. If cn and dn are tiny, X depends, except for a factor,

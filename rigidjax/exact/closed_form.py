@@ -17,7 +17,7 @@ from rigidjax.exact.jacobi_duplication import (
     Modulus,
     clip_time_on_separatrix,
     elliptic_functions,
-    functions_at_double_time,
+    elliptic_functions_at_double_time,
     half_period,
 )
 from rigidjax.rotation.barrier import barrier, compiled_as_one_kernel
@@ -150,7 +150,7 @@ def restore_elliptic_identity(functions: Elliptic, modulus: Modulus) -> Elliptic
     )
 
 
-def momentum_from_functions(constants: ClosedFormConstants, functions: Elliptic) -> Triple:
+def momentum_from_elliptic_functions(constants: ClosedFormConstants, functions: Elliptic) -> Triple:
     """Return the three components of the body momentum of a free motion at the time of the elliptic
     functions.
 
@@ -183,7 +183,7 @@ def momentum_and_rotation(
     `constants` are the constants of the motion.
     """
     half_time = reduce_time(0.5 * t, constants.half.time, constants.modulus)
-    return momentum_and_rotation_from_functions(
+    return momentum_and_rotation_from_elliptic_functions(
         constants,
         elliptic_functions(half_time.near, constants.modulus, constants.mu, constants.phase_factor),
         half_time,
@@ -191,7 +191,7 @@ def momentum_and_rotation(
     )
 
 
-def momentum_and_rotation_from_functions(
+def momentum_and_rotation_from_elliptic_functions(
     constants: ClosedFormConstants, functions: Elliptic, half_time: ReducedTime, t: Scalar
 ) -> tuple[Triple, QuaternionEntries]:
     """Return two things: the body momentum at the time t; and the quaternion (w, x, y, z) of the
@@ -203,10 +203,12 @@ def momentum_and_rotation_from_functions(
     """
     functions, phase = barrier(restore_half_periods(constants, functions, half_time))
     full = barrier(
-        functions_at_double_time(functions, constants.modulus, constants.mu, constants.phase_factor)
+        elliptic_functions_at_double_time(
+            functions, constants.modulus, constants.mu, constants.phase_factor
+        )
     )
-    _, k2, k3 = barrier(momentum_from_functions(constants, functions))
-    m1, m2, m3 = barrier(momentum_from_functions(constants, full))
+    _, k2, k3 = barrier(momentum_from_elliptic_functions(constants, functions))
+    m1, m2, m3 = barrier(momentum_from_elliptic_functions(constants, full))
 
     # The turn is the product (c, s Π(0)) ⊗ b of two quaternions: the first turns about the initial
     # momentum, and b = (b0, 0, b2, b3) turns about an axis in the plane of axes 2 and 3.

@@ -35,7 +35,7 @@ from rigidjax.exact.closed_form import (
     ClosedFormConstants,
     closed_form_constants,
     momentum_and_rotation,
-    momentum_and_rotation_from_functions,
+    momentum_and_rotation_from_elliptic_functions,
     reduce_time,
 )
 from rigidjax.exact.components3 import (
@@ -56,7 +56,7 @@ from rigidjax.exact.jacobian import elliptic_functions_and_integrals, momentum_j
 from rigidjax.exact.principal_axes import (
     combine_columns,
     components_along,
-    principal_frame,
+    principal_tensor_and_axes,
     tensor_in_axes,
 )
 from rigidjax.exact.sigma_form import Differences
@@ -190,7 +190,7 @@ def free_motion_constants(tensor: Mat3, omega: Vec3) -> FreeMotionConstants:
     - `tensor`: (3, 3) the inertia tensor, body frame.
     - `omega`: (3,) the body rate at time 0, body frame.
     """
-    moments, axes = principal_frame(tensor)
+    moments, axes = principal_tensor_and_axes(tensor)
     momentum = matvec(moments, components_along(axes, omega))
     return FreeMotionConstants(
         axes, moments[:3], momentum, closed_form_constants(moments[:3], momentum)
@@ -292,7 +292,7 @@ def _rate_and_rotation_at(constants: FreeMotionConstants, t: Scalar) -> tuple[Ve
     )
 
 
-def _moments_and_momentum(
+def _tensor_and_momentum_in_axes(
     tensor: Mat3, omega: Vec3, constants: FreeMotionConstants
 ) -> tuple[SymmetricEntries, Triple]:
     """Return two things in principal axes, as differentiable functions of the inertia tensor and
@@ -324,7 +324,7 @@ def _variable_derivatives_by_body(
     - `constants`: the constants of the motion, from which the principal axes and moments are taken.
     """
     tensor, omega, axes = tensor_and_rate[:9].reshape(3, 3), tensor_and_rate[9:], constants.axes
-    moments, momentum = _moments_and_momentum(tensor, omega, constants)
+    moments, momentum = _tensor_and_momentum_in_axes(tensor, omega, constants)
     # In principal axes, δK = −K δI K is −BᵀδI B with B = A K, where the columns of A are the axes.
     # The products are written as sums of products of entries, for the reason given in
     # `_rate_and_rotation_jvp`.
@@ -359,7 +359,7 @@ def _rate_and_rotation_with_derivatives(
     of the body momentum Π(0), k33 and t, where kij are the entries of the inverse of the inertia
     tensor, in principal axes, and dij = kii − kjj.
     """
-    moments, momentum = _moments_and_momentum(tensor, omega, constants)
+    moments, momentum = _tensor_and_momentum_in_axes(tensor, omega, constants)
     (_, (w, *axis), rate), rows, _ = motion_and_derivatives(moments, momentum, t)
     rate = combine_columns(constants.axes, rate)
     turn = jnp.stack([w, *combine_columns(constants.axes, tuple(axis))])
@@ -392,13 +392,13 @@ MotionAndDerivatives = tuple[Motion, MotionDerivatives, tuple[VectorDerivatives,
 @jax.custom_jvp
 @compiled_as_one_kernel
 def motion_and_derivatives(
-    moments: SymmetricEntries, momentum: Triple, t: Scalar
+    inertia: SymmetricEntries, momentum: Triple, t: Scalar
 ) -> MotionAndDerivatives:
     """Return three things: the motion of a free body, which is (Π(t), quaternion of the rotation
     from time 0 to t, body rate Ω(t)); the derivatives of the motion; and the pair (rows, G) from
     which the derivatives are computed.
 
-    - `moments`: the six entries of the inertia tensor in principal axes, as for
+    - `inertia`: the six entries of the inertia tensor in principal axes, as for
       `free_momentum_and_rotation`.
     - `momentum`: the three components of the body momentum Π(0).
     - `t`: the time.
@@ -409,9 +409,9 @@ def motion_and_derivatives(
     of the inertia tensor and dij = kii − kjj (see `derivative_variables`).
     """
     (out, turn), rows, g = _momentum_and_rotation_with_derivatives(
-        closed_form_constants(moments[:3], momentum), moments, momentum, t
+        closed_form_constants(inertia[:3], momentum), inertia, momentum, t
     )
-    _, k, energy2 = inverse_inertia_and_energy(moments, momentum)
+    _, k, energy2 = inverse_inertia_and_energy(inertia, momentum)
     motion = out, turn, matvec(k, out)
     return motion, _motion_derivatives(k, energy2, momentum, t, motion, rows, g), (rows, g)
 
@@ -540,7 +540,7 @@ def derivative_variables(
 
 @compiled_as_one_kernel
 def _momentum_and_rotation_with_derivatives(
-    constants: ClosedFormConstants, moments: SymmetricEntries, momentum: Triple, t: Scalar
+    constants: ClosedFormConstants, inertia: SymmetricEntries, momentum: Triple, t: Scalar
 ) -> tuple[tuple[Triple, QuaternionEntries], VectorDerivatives, SymmetricEntries]:
     """Return three things: the pair of the body momentum Π(t) of a free body and the quaternion of
     its rotation from time 0 to t; the derivatives of Π(t) − Π(0) with respect to ten variables, as
@@ -548,7 +548,7 @@ def _momentum_and_rotation_with_derivatives(
     matrix G = ∫ Π Πᵀ dt from 0 to t. All are in principal axes.
 
     - `constants`: the numbers from which the closed form of the motion is evaluated.
-    - `moments`: the six entries of the inertia tensor.
+    - `inertia`: the six entries of the inertia tensor.
     - `momentum`: the three components of Π(0).
     - `t`: the time.
 
@@ -565,13 +565,15 @@ def _momentum_and_rotation_with_derivatives(
     )
     none = half_time.halves == 0
     whole = jnp.where(none, 0.0, 2.0 * half_time.halves) * jnp.where(none, 0.0, constants.half.time)
-    body, _, _ = inverse_inertia_and_energy(moments, momentum)
+    body, _, _ = inverse_inertia_and_energy(inertia, momentum)
     half = half_time_integrals._replace(f=f)
     rows, g = momentum_jacobian_and_integral(
         body, momentum, t, half, half_time.halves, whole, constants.half.mean
     )
     return (
-        momentum_and_rotation_from_functions(constants, half_time_integrals.f, half_time, t),
+        momentum_and_rotation_from_elliptic_functions(
+            constants, half_time_integrals.f, half_time, t
+        ),
         rows,
         g,
     )
@@ -614,18 +616,18 @@ def _changes_of_momentum_derivatives(
 
 
 def inverse_inertia_and_energy(
-    moments: SymmetricEntries, momentum: Triple
+    inertia: SymmetricEntries, momentum: Triple
 ) -> InverseInertiaAndEnergy:
     """Return three things: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
     inertia tensor, each with all its digits; the six entries of K; and E₂ = Π·KΠ, which is twice
     the energy.
 
-    - `moments`: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes.
+    - `inertia`: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes.
     - `momentum`: the three components of the body momentum Π.
     """
-    i1, i2, i3, i12, i13, i23 = moments
-    r = 1.0 / determinant(moments)
-    k = tuple(c * r for c in adjugate(moments))
+    i1, i2, i3, i12, i13, i23 = inertia
+    r = 1.0 / determinant(inertia)
+    k = tuple(c * r for c in adjugate(inertia))
     body = Differences(
         ((i2 - i1) * i3 + (i13 * i13 - i23 * i23)) * r,
         ((i3 - i1) * i2 + (i12 * i12 - i23 * i23)) * r,

@@ -100,7 +100,7 @@ def clip_time_on_separatrix(reduced_time: Scalar, modulus: Modulus) -> Scalar:
     )
 
 
-def functions_at_double_time(
+def elliptic_functions_at_double_time(
     functions: Elliptic, modulus: Modulus, mu: Scalar, phase_factor: Scalar
 ) -> Elliptic:
     """Return the elliptic functions S, C, D and the phase ξ at the time 2u, from their values at
@@ -203,7 +203,7 @@ def elliptic_functions(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Sc
     f = elliptic_taylor_series(u * 2.0**-n, modulus, mu, phase_factor)
     # A loop compiles eight times sooner than nine copies of its body.
     return jax.lax.fori_loop(
-        0, n, lambda _, g: functions_at_double_time(g, modulus, mu, phase_factor), f
+        0, n, lambda _, g: elliptic_functions_at_double_time(g, modulus, mu, phase_factor), f
     )
 
 

@@ -25,8 +25,8 @@ from rigidjax.exact.components3 import SymmetricEntries, Triple
 from rigidjax.exact.jacobi_duplication import (
     Elliptic,
     Modulus,
+    elliptic_functions_at_double_time,
     elliptic_taylor_series,
-    functions_at_double_time,
     iteration_limits,
     third_kind_integral_series,
 )
@@ -205,6 +205,6 @@ def functions_and_integrals_at_double_time(
     - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
     """
     f, three = start.f, modulus.gap > 0
-    after = functions_at_double_time(f, modulus, mu, phase_factor)
+    after = elliptic_functions_at_double_time(f, modulus, mu, phase_factor)
     a, b = f.S / jnp.where(three, f.D, f.C), after.S / jnp.where(three, after.D, after.C)
     return Integrals(after, 2.0 * start.y2 + f.S * f.S * after.S, 2.0 * start.y + a * a * b)

@@ -14,7 +14,7 @@ from rigidjax.exact import sigma_form
 from rigidjax.exact.components3 import HALF, SymmetricEntries, Triple, matvec
 from rigidjax.exact.derivatives import inverse_inertia_and_energy, motion_and_derivatives
 from rigidjax.exact.jacobi_duplication import Modulus, half_period, is_aperiodic
-from rigidjax.exact.principal_axes import components_along, principal_frame
+from rigidjax.exact.principal_axes import components_along, principal_tensor_and_axes
 
 
 def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
@@ -95,7 +95,7 @@ def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Sca
     - `omega`: (3,) the body rate at any moment, rad/s.
     """
     exponent = largest_binary_exponent(omega)
-    moments, axes = principal_frame(times_power_of_two(tensor, -largest_binary_exponent(tensor)))
+    moments, axes = principal_tensor_and_axes(times_power_of_two(tensor, -largest_binary_exponent(tensor)))
     momentum = matvec(moments, components_along(axes, times_power_of_two(omega, -exponent)))
     body, _, _ = inverse_inertia_and_energy(moments, momentum)
     v = sigma_form.motion_invariants(body, momentum)
@@ -119,15 +119,15 @@ def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Sca
 
 
 @jax.custom_jvp
-def _precession_angle(moments: SymmetricEntries, momentum: Triple, period: Scalar) -> Scalar:
+def _precession_angle(inertia: SymmetricEntries, momentum: Triple, period: Scalar) -> Scalar:
     """Return the angle, rad, by which a principal axis of a free body turns about the momentum in
     one period of the body rate. The axis is the one that the momentum circles in the body frame.
 
-    - `moments`: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes.
+    - `inertia`: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes.
     - `momentum`: the three components of the body momentum.
     - `period`: the period of the body rate, s.
     """
-    body, k, _ = inverse_inertia_and_energy(moments, momentum)
+    body, k, _ = inverse_inertia_and_energy(inertia, momentum)
     v = sigma_form.motion_invariants(body, momentum)
     about_three, h = v.a2 > 0, jnp.sqrt(v.h2)
     mu = jnp.where(about_three, body.d23 * v.a3, body.d12 * v.a1)

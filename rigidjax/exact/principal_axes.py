@@ -19,7 +19,7 @@ from rigidjax.rotation.barrier import batch_as, compiled_as_one_kernel
 _SWEEPS = 6
 
 
-def principal_frame(tensor: Mat3) -> tuple[SymmetricEntries, Mat3]:
+def principal_tensor_and_axes(tensor: Mat3) -> tuple[SymmetricEntries, Mat3]:
     """Return two things: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in
     principal axes, with the moments ascending; and the rotation matrix A (3, 3) whose columns are
     these axes.

@@ -279,7 +279,7 @@ def momentum_divisor_terms(
     )
 
 
-def advance_momentum_and_integral_term(
+def momentum_after_step_and_integral_term(
     inverse_inertia: Differences,
     divisor_terms: DivisorTerms,
     sigma_of_step: Sigma,
@@ -354,7 +354,7 @@ def momentum_and_integral_in_four_parts(
     def take_eighth(i, state):
         # The integral over each of the four parts is computed from Π at the middle of the part.
         point, total = state
-        point, part = advance_momentum_and_integral_term(inverse_inertia, terms, sigma, point)
+        point, part = momentum_after_step_and_integral_term(inverse_inertia, terms, sigma, point)
         odd = i % 2 == 1
         return point, tuple(a + jnp.where(odd, c, 0.0) for a, c in zip(total, part, strict=True))
 

@@ -133,9 +133,9 @@ def tumble(
     """
     seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
     body = validation.require_single_body(body, (Inertia, MassProperties), "body")
-    moments, q = evenly_spaced_attitudes(ts, states, pictures)
+    moments, q = evenly_spaced_times_and_attitudes(ts, states, pictures)
     size = _checks.integer(size, "size", 64)
-    corners, tip, reach = _corners_axis_end_and_half_diagonal(body)
+    corners, tip, reach = _box_corners_axis_end_and_half_diagonal(body)
     pyplot()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -209,8 +209,8 @@ def player(
     in a notebook. **Returns** a `Film`. **Raises** as `tumble`.
     """
     seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
-    _, q = evenly_spaced_attitudes(ts, states, pictures)
-    box = _corners_axis_end_and_half_diagonal(body)
+    _, q = evenly_spaced_times_and_attitudes(ts, states, pictures)
+    box = _box_corners_axis_end_and_half_diagonal(body)
     try:
         import viser
     except ModuleNotFoundError as error:
@@ -273,7 +273,7 @@ def _html_of_tumbling_box(
     return recording.as_html()
 
 
-def evenly_spaced_attitudes(
+def evenly_spaced_times_and_attitudes(
     ts: NumbersLike, states: PyTree, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return two arrays: `count` evenly spaced times; and the attitudes (count, 4) at these times.
@@ -293,7 +293,7 @@ def evenly_spaced_attitudes(
     return when, between / np.linalg.norm(between, axis=1, keepdims=True)
 
 
-def _corners_axis_end_and_half_diagonal(
+def _box_corners_axis_end_and_half_diagonal(
     body: Inertia | MassProperties,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return three things, for the uniform box that moves as the body does: its corners (8, 3); the

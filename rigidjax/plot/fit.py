@@ -15,7 +15,7 @@ from rigidjax.plot.style import (
     TIMES,
     escape_formulas,
     pyplot,
-    recording_residuals_and_deviations,
+    recording_residuals_and_standard_deviations,
     unit_factor,
 )
 from rigidjax.rotation import quaternion
@@ -47,7 +47,7 @@ def fit(
     plt = pyplot()
     seconds = unit_factor(time_unit, TIMES, "time_unit")
     rate = unit_factor(rate_unit, RATES, "rate_unit")
-    record, left, _ = recording_residuals_and_deviations(fit_result, index)
+    record, left, _ = recording_residuals_and_standard_deviations(fit_result, index)
     count = len(record.readings)
     size, how = (max(6.2 * count, 7.5), 6), dict(squeeze=False, layout="constrained")
     figure, axes = plt.subplots(2, count, figsize=size, sharex=True, height_ratios=(2, 1), **how)

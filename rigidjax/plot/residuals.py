@@ -9,7 +9,7 @@ from rigidjax.plot.style import (
     TIMES,
     axes_of_shape,
     escape_formulas,
-    recording_residuals_and_deviations,
+    recording_residuals_and_standard_deviations,
     unit_factor,
 )
 
@@ -41,7 +41,7 @@ def residuals(
     'lag, samples'
     """
     seconds = unit_factor(time_unit, TIMES, "time_unit")
-    record, left, noises = recording_residuals_and_deviations(fit_result, index)
+    record, left, noises = recording_residuals_and_standard_deviations(fit_result, index)
     count = len(record.readings)
     ax = axes_of_shape(ax, (count, 4), nrows=count, ncols=4, figsize=(10.5, 2.8 * count))
     t = np.asarray(record.t) / seconds

@@ -43,7 +43,7 @@ def unit_factor(unit: str, units: dict[str, float], name: str) -> float:
     return units[_checks.require_option(unit, tuple(units), name)]
 
 
-def recording_residuals_and_deviations(
+def recording_residuals_and_standard_deviations(
     fit_result: Any, index: object
 ) -> tuple[Any, list[np.ndarray], list[np.ndarray]]:
     """Return three things: a recording of a fit; its residuals, an array for each sensor; and the

@@ -28,7 +28,11 @@ from rigidjax.exact.components3 import (
 )
 from rigidjax.exact.derivatives import free_momentum_and_rotation
 from rigidjax.exact.diffrax_solver import field_and_direction
-from rigidjax.exact.principal_axes import combine_columns, components_along, principal_frame
+from rigidjax.exact.principal_axes import (
+    combine_columns,
+    components_along,
+    principal_tensor_and_axes,
+)
 from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import evaluate_torque, may_read_rate
@@ -112,7 +116,7 @@ def frame_of_tensor(tensor: Array) -> Frame:
 
     `tensor` (3, 3) is the inertia in body axes, kg m².
     """
-    six, axes = principal_frame(tensor)
+    six, axes = principal_tensor_and_axes(tensor)
     # The tensor is divided by its trace before it is inverted, because the determinant of an
     # inertia of 1e37 kg m² would overflow.
     size = six[0] + six[1] + six[2]

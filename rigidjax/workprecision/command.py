@@ -14,7 +14,7 @@ from rigidjax.workprecision.peers import methods
 from rigidjax.workprecision.record import (
     Measurement,
     read_csv,
-    records_to_store,
+    records_in_units_of_base_time,
     sentences_about_changes,
     write_csv,
 )
@@ -95,7 +95,7 @@ def run_subcommand(options: argparse.Namespace) -> int:
             write_csv(records, options.csv)
             print(f"records: {options.csv}")
         if options.keep is not None:
-            write_csv(records_to_store(records), options.keep)
+            write_csv(records_in_units_of_base_time(records), options.keep)
             print(f"kept: {options.keep}")
         print(summary(records))
         timed = [r for r in records if not r.scene.startswith(DRIFT)]

@@ -126,8 +126,8 @@ def _choose_for_scene(records: list[Measurement], scene: str, error: float) -> C
     - `error`: the wanted error, rad, or the wanted relative error of a gradient.
     """
     values, slopes = (
-        times_by_method(records, "value", error),
-        times_by_method(records, "gradient", error),
+        times_to_error_by_method(records, "value", error),
+        times_to_error_by_method(records, "gradient", error),
     )
     ours = {r.label for r in records if r.group == "ours"}
 
@@ -143,7 +143,9 @@ def _choose_for_scene(records: list[Measurement], scene: str, error: float) -> C
     return Choice(scene, error, *best, *quickest(slopes), *defaults, *elsewhere)
 
 
-def times_by_method(records: Iterable[Measurement], kind: str, error: float) -> dict[str, float]:
+def times_to_error_by_method(
+    records: Iterable[Measurement], kind: str, error: float
+) -> dict[str, float]:
     """Return, by label, the time, s, of each method that reaches `error`, the quickest method
     first.
     """

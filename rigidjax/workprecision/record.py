@@ -145,7 +145,7 @@ def sentences_about_changes(
     return wrong, paced
 
 
-def records_to_store(records: Iterable[Measurement]) -> list[Measurement]:
+def records_in_units_of_base_time(records: Iterable[Measurement]) -> list[Measurement]:
     """Return the records without peers, with times as multiples of the median time of `BASE`.
 
     The median is that of `BASE` on the same scene; compile times and memory become NaN.
