@@ -318,7 +318,10 @@ def box_half_lengths_and_axes(body: Inertia | MassProperties) -> tuple[np.ndarra
     second, q = principal(body.second_moment)
     size = np.sqrt(np.maximum(np.asarray(second, dtype=float), 0.0))
     if not size.max() > 0:
-        raise ValueError("body: wanted a body with an extension, got 𝔖 = 0; there is no box")
+        raise ValueError(
+            "body: wanted a body with an extension, got one whose second moment of mass is zero "
+            "(a point), which has no box"
+        )
     if isinstance(body, MassProperties):
         size = size * np.sqrt(3 / float(body.mass))
     else:

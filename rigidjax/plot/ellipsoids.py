@@ -42,7 +42,10 @@ def inertia_ellipsoid(
     solid = isinstance(best, MassProperties)
     size = 1.0 if solid else float(np.trace(np.asarray(best.second_moment)))
     if not size > 0:
-        raise ValueError("body: wanted a body with an extension, got 𝔖 = 0; there is no ellipsoid")
+        raise ValueError(
+            "body: wanted a body with an extension, got one whose second moment of mass is zero "
+            "(a point), which has no ellipsoid"
+        )
     shapes = {"body": np.asarray(_ellipsoid_matrix(best))[None] / size}
     if drawn is not None:
         shapes["cloud"] = np.asarray(jax.vmap(_ellipsoid_matrix)(drawn)) / size

@@ -72,7 +72,7 @@ def frames(
         colour = COLOURS[1 + number % (len(COLOURS) - 1)]
         here = np.asarray(place, dtype=float)
         if here.shape != (3,):
-            raise ValueError(f"marks[{name!r}]: wanted a place (3,), got shape {here.shape}")
+            raise ValueError(f"marks[{name!r}]: wanted a position (3,), got shape {here.shape}")
         still = jax.tree.map(lambda leaf: jnp.zeros_like(leaf), inside)
         still = Point(still.x + jnp.asarray(here, still.x.dtype)[None], still.v)
         moved = np.asarray(jax.vmap(moving.to_inertial)(still, t).x)

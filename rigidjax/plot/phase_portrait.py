@@ -113,7 +113,10 @@ def _symmetric_top_constants(
     lever, pull = np.linalg.norm(com), np.linalg.norm(gravity)
     weight = float(top.mass) * float(lever * pull)
     if not weight > 0:
-        raise ValueError("top: wanted a weight away from the pivot, got m g l = 0")
+        raise ValueError(
+            "top: wanted a weight away from the pivot, got zero for mass times gravity times the "
+            "distance of the centre of mass from the pivot"
+        )
     axis = com / lever
     along = float(axis @ tensor @ axis)
     across = 0.5 * (float(np.trace(tensor)) - along)

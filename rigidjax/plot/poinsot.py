@@ -82,7 +82,10 @@ def polhode(
     pi = omega @ turn * i
     size = float(np.linalg.norm(pi[0]))
     if not size > 0:
-        raise ValueError("polhode: the body is at rest, there is no momentum sphere")
+        raise ValueError(
+            "polhode: wanted a body that turns, got one at rest, which has no sphere of constant "
+            "angular momentum"
+        )
     pi = pi / size
     twice_energy = float(np.sum(pi[0] ** 2 / i))
 
@@ -167,7 +170,9 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     momenta = np.asarray(each(jax.tree.map(jnp.asarray, states)), dtype=float)
     size = np.linalg.norm(momenta, axis=1)
     if not size[0] > 0:
-        raise ValueError("herpolhode: the body is at rest, there is no invariable plane")
+        raise ValueError(
+            "herpolhode: wanted a body that turns, got one at rest; it has no invariable plane"
+        )
     up = momenta[0] / size[0]
     turned = np.linalg.norm(np.cross(momenta, up), axis=1) / size
     if turned.max() > 1e-3:

@@ -84,7 +84,7 @@ def run_subcommand(options: argparse.Namespace) -> int:
         known = [*scenes(), DRIFT]
         for name in options.scene:
             if name not in known:
-                raise ValueError(f"no scene {name!r}; there are {', '.join(known)}")
+                raise ValueError(f"scene: wanted one of {', '.join(known)}, got {name!r}")
         if options.thin < 1:
             raise ValueError(f"--thin: wanted 1 or more, got {options.thin}")
         before = None if options.check is None else read_csv(options.check)

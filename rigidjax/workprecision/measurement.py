@@ -355,7 +355,10 @@ def long_drift(
             spent = time.perf_counter() - begin
             away = {k: float(v) for k, v in drift(ts / part, ys, body, law).items()}
             if not np.isfinite(list(away.values())).all():
-                raise FloatingPointError(f"long_drift: {name} gave no numbers: {away}")
+                raise FloatingPointError(
+                    f"long_drift: the states of {name} became NaN or infinite, with the drifts "
+                    f"{away}; likely the step is too long"
+                )
             drifts_by_method.append(
                 Measurement(
                     scene, f"{name}, equal steps", "ours", "value", "", h, error=away["energy"],

@@ -21,8 +21,8 @@ def pareto_front(records: Iterable[Measurement]) -> list[Measurement]:
     records = [r for r in require_measurements(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
     if len(kinds) > 1:
-        words = f"front: wanted records of one scene and kind, got {sorted(kinds)}"
-        raise ValueError(f"{words}; pick them first")
+        words = "pareto_front: wanted records of one scene and one kind (value or gradient), got "
+        raise ValueError(f"{words}{sorted(kinds)}; select the records before the call")
     curves = [[r for r in records if r.label == n] for n in dict.fromkeys(r.label for r in records)]
     best: list[Measurement] = []
     for record in sorted(records, key=lambda r: (r.time, r.error)):

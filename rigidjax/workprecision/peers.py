@@ -198,7 +198,8 @@ def _prepare_mujoco(
         f'fullinertia="{words(about[at] for at in PAIRS)}"/></body></worldbody></mujoco>'
     )
     data: Any = mujoco.MjData(model)
-    # Without this MuJoCo writes a file into the working folder when a step is too long.
+    # Without this function for warnings MuJoCo writes a file into the working folder when a step
+    # is too long.
     mujoco.set_mju_user_warning(lambda message: None)
 
     def run(setting: float) -> tuple[Any, Any]:

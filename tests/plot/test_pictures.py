@@ -339,9 +339,9 @@ def test_words_on_mistakes(flip, monkeypatch):
         rj.plot.motion(flip.ts, flip.ys, attitude="euler")
     with pytest.raises(ValueError, match=r"ts: wanted \(101,\) as the states have, got \(100,\)"):
         rj.plot.motion(flip.ts[1:], flip.ys)
-    with pytest.raises(ValueError, match="at rest, there is no momentum sphere"):
+    with pytest.raises(ValueError, match="got one at rest, which has no sphere"):
         rj.plot.polhode(BODY, still)
-    with pytest.raises(ValueError, match="at rest, there is no invariable plane"):
+    with pytest.raises(ValueError, match="got one at rest; it has no invariable plane"):
         rj.plot.herpolhode(BODY, still)
     with pytest.raises(TypeError, match="wanted 3-D axes, got flat ones"):
         rj.plot.polhode(BODY, flip.ys, ax=plt.subplots()[1])

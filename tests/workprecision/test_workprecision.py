@@ -189,7 +189,7 @@ def test_the_front_and_the_table():
     assert (choice.method, choice.peer) == ("a", "b")
     assert (choice.time, choice.peer_time) == pytest.approx((math.sqrt(2), 1.2))
     assert "| s | 1e-04 | a |" in table([choice])
-    with pytest.raises(ValueError, match="front: wanted records of one scene and kind"):
+    with pytest.raises(ValueError, match="pareto_front: wanted records of one scene and one kind"):
         pareto_front([*ladder, line(scene="elsewhere")])
 
 
@@ -241,7 +241,8 @@ def test_mistakes_are_named(capsys, tmp_path):
     with pytest.raises(TypeError, match=r"wanted methods of workprecision.methods\(\), got str"):
         measure(scenes()["free-top"](), ["Tsit5"])
     assert main(["workprecision", "heavy top"]) == 2
-    assert "no scene 'heavy top'; there are free-top" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "scene: wanted one of free-top" in error and "got 'heavy top'" in error
     assert main(["workprecision", "--check", str(tmp_path / "none.csv")]) == 2
     assert "none.csv" in capsys.readouterr().err
     assert main(["workprecision", "--thin", "0"]) == 2
