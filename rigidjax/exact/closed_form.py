@@ -109,8 +109,8 @@ def restore_half_periods(
     """
     big = jnp.maximum(constants.modulus.p, constants.modulus.q)
     whole = jnp.where(half_time.halves == 0, 0.0, half_time.halves)
-    # After the time `u.near` on the separatrix the momentum rests on the middle axis, where S² =
-    # 1/max(p, q): the body spins steadily.
+    # After the time `half_time.near` on the separatrix the momentum rests on the middle axis, where
+    # S² = 1/max(p, q): the body spins steadily.
     spin = (
         (half_time.rest - half_time.near)
         * constants.phase_factor

@@ -251,8 +251,8 @@ def half_period(modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> HalfPerio
         0, iteration_limits(a.dtype).agm, _arithmetic_geometric_mean_step, start
     )
     time = math.pi / (a * jnp.sqrt(big))
-    # With turn = κ μ, the phase ξ of a quarter period is κ (π/2a) ½ μ/(λ² + μ) Σ, where Σ is
-    # `sum_parts`.
+    # The phase ξ of half a period T is ½ κ T Σ/(λ² + μ), where Σ is `sum_parts` (DLMF 19.8.7 with
+    # α² = −μ/λ²).
     phase = phase_factor * time * 0.5 / (big + mu) * sum_parts
     return HalfPeriod(jnp.where(endless, jnp.inf, time), phase, total / big)
 

@@ -84,8 +84,8 @@ def momentum_jacobian_and_integral(
         halves == 0, 1.0, jnp.abs(gap)
     )
 
-    # These are the divided differences of T = diag(D, 1, C): the entries 12, 13 and 23 of T change
-    # by these numbers times the changes of k12, k13 and k23.
+    # The numbers t12, t13 and t23 are the divided differences of T = diag(D, 1, C): the entries 12,
+    # 13 and 23 of T change by them times the changes of k12, k13 and k23.
     s = half_time_integrals.f.S * half_time_integrals.f.S
     cc, dd = (
         half_time_integrals.f.C * half_time_integrals.f.C,

@@ -14,8 +14,8 @@ from rigidjax._types import Mat3, Scalar, Vec3
 from rigidjax.exact.components3 import SymmetricEntries, Triple
 from rigidjax.rotation.barrier import batch_as, compiled_as_one_kernel
 
-# Jacobi's cyclic method converges quadratically; a 3×3 matrix needs four or five sweeps from
-# anywhere.
+# Jacobi's cyclic method converges quadratically: four or five sweeps are enough for any symmetric
+# 3×3 matrix.
 _SWEEPS = 6
 
 

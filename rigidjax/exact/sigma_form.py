@@ -300,7 +300,7 @@ def momentum_after_step_and_integral_term(
     """
     p1, p2, p3 = momentum
     d12, d13, d23, k12, k13, k23 = inverse_inertia
-    # This is K without its diagonal, times Π.
+    # The numbers r1, r2 and r3 are the components of KΠ, with K taken without its diagonal.
     r1, r2, r3 = barrier((k12 * p2 + k13 * p3, k12 * p1 + k23 * p3, k13 * p1 + k23 * p2))
     u1 = -d23 * p2 * p3 + p2 * r3 - p3 * r2
     u2 = d13 * p1 * p3 + p3 * r1 - p1 * r3
