@@ -33,7 +33,7 @@ class FreeInterpolation(dfx.AbstractLocalInterpolation):
         self, t0: RealLike, t1: RealLike | None = None, left: bool = True
     ) -> PyTree[Array]:
         """Return the state at the time `t0`; if `t1` is given, return the state at `t1` minus the
-        state at `t0`.
+        state at `t0`. The side `left` of a jump has no meaning here, because there is no jump.
         """
         motion = FreeBody(self.inertia, self.y0)
         state = motion(self.direction * (t0 - self.t0))
@@ -111,7 +111,9 @@ class FreeSolver(dfx.AbstractSolver):
         dense = dict(y0=y0, inertia=inertia, direction=direction)
         return y1, error, dense, None, dfx.RESULTS.successful
 
-    def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree) -> Any:
+    def func(
+        self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree
+    ) -> PyTree:
         """Return the rate of change of the state `y0` at the time `t0`, from the equations in
         `terms`.
         """

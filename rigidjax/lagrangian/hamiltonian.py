@@ -200,7 +200,8 @@ class HeavyTopHamiltonian(eqx.Module):
         return 0.5 * dot(pi, apply(self.inverse, pi)) - self.top.mass * dot(self.top.com, gamma)
 
     def start(self, state: HasAttitude) -> MomentumAndDirection:
-        """Return the state of the vector field: Π = IΩ and γ = Rᵀ g, in body axes.
+        """Return the state of the vector field: the angular momentum Π = IΩ and the gravity
+        γ = Rᵀ g, both in body axes, where g is the gravity of the top in world axes.
 
         `state` has the attitude R (a quaternion `q`, body → world) and the body rate Ω, rad/s.
         """

@@ -60,7 +60,7 @@ def compile_flow(scene: BenchmarkScene, flow: Flow) -> PreparedMethod:
 
 
 def flow_from_run(
-    scene: BenchmarkScene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]
+    scene: BenchmarkScene, run: Callable[[Any, PyTree, Array, Array], tuple[PyTree, Any]]
 ) -> Flow:
     """Return the flow of `run` on a scene: a function of the scene's numbers and the setting.
 
@@ -205,7 +205,7 @@ def _solve_with_diffrax(
     adjoint: dfx.AbstractAdjoint | None,
     setting: Array,
     end: float,
-) -> tuple[Any, Any]:
+) -> tuple[PyTree, Any]:
     """Solve an equation of motion by diffrax with adaptive steps. Return two things: the last
     state, with a leading axis of length 1; and the number of steps.
 

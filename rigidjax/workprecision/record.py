@@ -115,7 +115,9 @@ def sentences_about_changes(
 ) -> tuple[list[str], list[str]]:
     """Return two lists of sentences: about changed errors and steps; and about changed times.
 
-    Lines of two tables are compared, those of peers left out: `records` are new, `stored` are old.
+    Two tables of measurements are compared, a new one (`records`) and an old one (`stored`);
+    measurements of other packages are left out.
+
     A change is reported if an error is more than three times as large or as small; if the number of
     steps differs by more than 2 %; if a line of `stored` is missing; or if the ratio of a method's
     median time to that of `diffrax Dopri8`, on the same scene at common settings, has changed by
@@ -146,9 +148,10 @@ def sentences_about_changes(
 
 
 def records_in_units_of_base_time(records: Iterable[Measurement]) -> list[Measurement]:
-    """Return the records without peers, with times as multiples of the median time of `BASE`.
+    """Return the records without those of other packages, with times as multiples of the median
+    time in which the method `BASE` (Dopri8 of diffrax) computes the value on the same scene.
 
-    The median is that of `BASE` on the same scene; compile times and memory become NaN.
+    Compile times and memory become NaN.
     """
     records = [r for r in records if r.group != "peer"]
     middle = _median_time_by_method(records)

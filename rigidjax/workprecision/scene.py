@@ -125,7 +125,9 @@ class BenchmarkScene(eqx.Module):
             return {"by_attitude": slice(0, 3), "by_rate": slice(3, 6)}
         return {"by_inertia": slice(0, 6), "by_rate": slice(6, 9), "by_attitude": slice(9, 13)}
 
-    def assemble(self, numbers: Float[Array, " parameters"]) -> tuple[Any, Any]:
+    def assemble(
+        self, numbers: Float[Array, " parameters"]
+    ) -> tuple[Inertia | None, Attitude | Point]:
         """Return the body and the initial state with these `numbers`."""
         if self.body is None:
             return None, Point(numbers[:3], numbers[3:])

@@ -53,6 +53,9 @@ def test_motion_shows_rates_and_attitude_in_the_units_it_names(flip):
         np.testing.assert_allclose(one.get_ydata(), np.degrees(flip.ys.omega[:, axis]))
     assert (below.get_xlabel(), below.get_ylabel()) == ("time, min", "body rate Ω, deg/s")
     assert [one.get_label() for one in above.lines] == ["qw", "qx", "qy", "qz"]
+    # The lines can be told apart in grey.
+    assert [one.get_linestyle() for one in above.lines] == [":", "-", "--", "-."]
+    assert [one.get_linestyle() for one in below.lines] == ["-", "--", "-."]
     (only,) = rj.plot.motion(flip.ts, rj.Spin(flip.ys.omega))
     assert len(only.lines) == 3
 
@@ -257,6 +260,9 @@ def test_the_pictures_of_a_fit(found):
     assert inside.mean() > 0.85
     figure = rj.plot.fit(found, title="a log")
     assert figure.axes[0].get_ylabel() == "body rate, rad/s"
+    upper = figure.axes[0].lines
+    assert [one.get_linestyle() for one in upper if one.get_marker() == "None"] == ["-", "--", "-."]
+    assert [one.get_marker() for one in upper if one.get_linestyle() == "None"] == ["o", "s", "^"]
 
 
 @pytest.mark.parametrize(
