@@ -95,7 +95,9 @@ def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Sca
     - `omega`: (3,) the body rate at any moment, rad/s.
     """
     exponent = largest_binary_exponent(omega)
-    moments, axes = principal_tensor_and_axes(times_power_of_two(tensor, -largest_binary_exponent(tensor)))
+    moments, axes = principal_tensor_and_axes(
+        times_power_of_two(tensor, -largest_binary_exponent(tensor))
+    )
     momentum = matvec(moments, components_along(axes, times_power_of_two(omega, -exponent)))
     body, _, _ = inverse_inertia_and_energy(moments, momentum)
     v = sigma_form.motion_invariants(body, momentum)
@@ -162,20 +164,22 @@ def _precession_angle_jvp(
 
 
 @jax.custom_jvp
-def _momentum_integral_of_period(moments: Six, momentum: Triple, period: Scalar) -> Six:
+def _momentum_integral_of_period(
+    inertia: SymmetricEntries, momentum: Triple, period: Scalar
+) -> SymmetricEntries:
     """Return the six entries (11, 22, 33, 12, 13, 23) of the matrix G = ∫ Π Πᵀ dt over one period
     of the body rate of a free body, where Π is the body momentum in principal axes.
 
-    - `moments`: the six entries of the inertia tensor in principal axes.
+    - `inertia`: the six entries of the inertia tensor in principal axes.
     - `momentum`: the three components of the body momentum.
     - `period`: the period of the body rate, s.
 
     Over a whole period the products of two components cancel. The squares have the means
     `A₃(1 − p⟨S²⟩)/d₁₃`, `A₁A₃⟨S²⟩` and `A₁(1 − q⟨S²⟩)/d₁₃`, with the numbers A₁, A₃, p and q of
-    `sigma_form.invariants`, d₁₃ = 1/I₁ − 1/I₃, and the mean ⟨S²⟩ of `half_period`.
+    `sigma_form.motion_invariants`, d₁₃ = 1/I₁ − 1/I₃, and the mean ⟨S²⟩ of `half_period`.
     """
-    body, _, _ = inverse_inertia_and_energy(moments, momentum)
-    v = sigma_form.invariants(body, momentum)
+    body, _, _ = inverse_inertia_and_energy(inertia, momentum)
+    v = sigma_form.motion_invariants(body, momentum)
     mean = half_period(Modulus(v.p, v.q, v.gap), jnp.zeros_like(period), period).mean
     zero = jnp.zeros_like(period)
     return (
@@ -189,7 +193,10 @@ def _momentum_integral_of_period(moments: Six, momentum: Triple, period: Scalar)
 
 
 @_momentum_integral_of_period.defjvp
-def _momentum_integral_of_period_jvp(primals, tangents):
+def _momentum_integral_of_period_jvp(
+    primals: tuple[SymmetricEntries, Triple, Scalar],
+    tangents: tuple[SymmetricEntries, Triple, Scalar],
+) -> tuple[SymmetricEntries, SymmetricEntries]:
     """Return two things: the six entries of the matrix G of `_momentum_integral_of_period`, and
     their change for a change of the inputs. By this rule JAX takes second derivatives of a period.
 

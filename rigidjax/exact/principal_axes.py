@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 
 from rigidjax._types import Mat3, Scalar, Vec3
 from rigidjax.exact.components3 import SymmetricEntries, Triple
-from rigidjax.rotation.barrier import batch_as, compiled_as_one_kernel
+from rigidjax.rotation.barrier import compiled_as_one_kernel, match_batch_axes
 
 # Jacobi's cyclic method converges quadratically: four or five sweeps are enough for any symmetric
 # 3×3 matrix.
