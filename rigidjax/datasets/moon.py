@@ -24,7 +24,7 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.identify.model.charts import AbstractBodyChart
 from rigidjax.motion import Attitude
 from rigidjax.motion.torques import ChangingInertia, Chebyshev, GravityGradient, Sum, Tide
-from rigidjax.motion.torques.base import evaluate_torque
+from rigidjax.motion.torques.base import Torque, evaluate_torque
 from rigidjax.rotation import euler
 from rigidjax.rotation.linalg3 import cross
 
@@ -77,17 +77,18 @@ class Moon(eqx.Module):
         if not (days[0] < days[1] and 10 <= days[0] and high <= _BLOCKS):
             raise ValueError(f"Moon: wanted years in order in 1900 to 2199, got {first}, {last}")
 
-        def table(name: str, step: int) -> np.ndarray:
+        def read_chebyshev_table(name: str, days_per_interval: int) -> np.ndarray:
             """Return the Chebyshev coefficients (intervals, 3, coefficients) of one table of the
             ephemeris, for the years of this object and at least ten days before and after.
 
             - `name`: the name of the table in the file names of DE421, such as `moon`.
-            - `step`: the length of an interval of the result, days; longer intervals are divided.
+            - `days_per_interval`: the length of an interval of the result, days; longer intervals
+              are divided.
             """
             rows = np.load(Path(spec.origin or "").parent / f"jpl-{name}.npy", mmap_mode="r")
             a_block = len(rows) // _BLOCKS
-            return _subdivide_polynomials(
-                rows[low * a_block : high * a_block], _BLOCK // a_block // step
+            return _subdivide_chebyshev_intervals(
+                rows[low * a_block : high * a_block], _BLOCK // a_block // days_per_interval
             )
 
         numbers = np.load(Path(spec.origin).parent / "constants.npy")
@@ -95,12 +96,14 @@ class Moon(eqx.Module):
         # The ephemeris gives the Earth–Moon barycentre and the Sun, and the Moon relative to the
         # Earth.
         share = self.constants["EMRAT"] / (1 + self.constants["EMRAT"])
-        moon, middle, sun = (1e3 * table(name, 4) for name in ("moon", "earthmoon", "sun"))
+        moon, middle, sun = (
+            1e3 * read_chebyshev_table(name, 4) for name in ("moon", "earthmoon", "sun")
+        )
         sun = np.pad(sun, ((0, 0), (0, 0), (0, moon.shape[2] - sun.shape[2])))
         start = (_BLOCK * low - days[0]) * DAY
         self.earth = Chebyshev(start, 4 * DAY, -moon)
         self.sun = Chebyshev(start, 4 * DAY, sun - middle - share * moon)
-        self.angles = Chebyshev(start, 8 * DAY, table("librations", 8))
+        self.angles = Chebyshev(start, 8 * DAY, read_chebyshev_table("librations", 8))
         self.first = first
 
     def attitude(self, t: ScalarLike) -> Attitude:
@@ -128,12 +131,14 @@ class Moon(eqx.Module):
         return whole - self._core_inertia if core else whole
 
     def chart(self, *, core: bool = False) -> AbstractBodyChart:
-        """Return the chart of `body` for a fit, in which β and γ are the free parameters."""
+        """Return a chart for a fit: a map from two free numbers, for β and γ, to the inertia that
+        `body` returns.
+        """
         return _BetaGammaChart(self, core)
 
     def torque(
         self, degree: int = 4, *, tide: bool = False, core: bool = False, figure: bool = False
-    ) -> Any:
+    ) -> Torque:
         """Return the torque of Earth and Sun on the Moon.
 
         **Arguments:** `degree` the highest degree of the Moon's gravity field that the Earth acts
@@ -165,7 +170,9 @@ class Moon(eqx.Module):
             friction = c["KVC"] / DAY * self.body().tensor[2, 2]
             law = _LiquidCore(rate, self._core_inertia.tensor, friction, law)
             if self.first != EPOCH:
-                law = eqx.tree_at(lambda core: core.state0, law, _core_velocity_at(law, self.first))
+                law = eqx.tree_at(
+                    lambda core: core.state0, law, _core_angular_velocity_at(law, self.first)
+                )
         if tide:
             response, turn = c["K2M"] * self._radius**5 / _G, 2 * np.pi / (27.321661 * DAY)
             bulge = Tide(response, c["TAUM"] * DAY, self._mu_earth, self.earth, turn)
@@ -220,11 +227,11 @@ class _BetaGammaChart(AbstractBodyChart):
     core: bool = eqx.field(static=True)
 
     def body(self, vector: Array) -> Inertia:
-        beta, gamma = jnp.exp(1e-3 * vector + self._log_of_known)
+        beta, gamma = jnp.exp(1e-3 * vector + self._log_beta_gamma_of_de421)
         return self.moon.body(beta, gamma, core=self.core)
 
     def vector(self, body: Inertia) -> Array:
-        return 1e3 * (self.logs(body) - self._log_of_known)
+        return 1e3 * (self.logs(body) - self._log_beta_gamma_of_de421)
 
     def logs(self, body: Inertia) -> Array:
         tensor = body.tensor + self.moon._core_inertia.tensor if self.core else body.tensor
@@ -232,8 +239,8 @@ class _BetaGammaChart(AbstractBodyChart):
         return jnp.log(jnp.stack([(c - a) / b, (b - a) / c]))
 
     @property
-    def _log_of_known(self) -> Array:
-        """Return the logarithms (2,) of the values β* and γ* of DE421."""
+    def _log_beta_gamma_of_de421(self) -> Float[Array, "2"]:
+        """Return the logarithms (2,) of the values β* and γ* that DE421 gives for β and γ."""
         return jnp.log(jnp.array([self.moon.constants[name] for name in ("LBET", "LGAM")]))
 
 
@@ -286,7 +293,7 @@ class _CoreAcceleration(eqx.Module):
         return self.core.rate(t, own, self.moon.attitude(t), self.moon.body(core=True))
 
 
-def _core_velocity_at(core: _LiquidCore, year: float) -> Float[Array, "3"]:
+def _core_angular_velocity_at(core: _LiquidCore, year: float) -> Float[Array, "3"]:
     """Return the angular velocity (3,) of the Moon's liquid core at a given `year`, rad/s, mantle
     frame.
 
@@ -295,60 +302,62 @@ def _core_velocity_at(core: _LiquidCore, year: float) -> Float[Array, "3"]:
     """
     if core.state0.dtype != jnp.float64:
         raise ValueError(
-            f"torque: a core from EPOCH to {year} needs float64: set "
-            "jax.config.update('jax_enable_x64', True)"
+            f"torque: wanted float64 for a core that is integrated from EPOCH to {year}, got "
+            f"{core.state0.dtype}; set jax.config.update('jax_enable_x64', True)"
         )
     between = Moon(min(year, EPOCH), max(year, EPOCH))
     begin, end = (365.25 * DAY * (at - between.first) for at in (EPOCH, year))
-    return _integrate_core(_CoreAcceleration(core, between), core.state0, jnp.array([begin, end]))
+    return _integrate_core_velocity(
+        _CoreAcceleration(core, between), core.state0, jnp.array([begin, end])
+    )
 
 
 @eqx.filter_jit
-def _integrate_core(
-    field: _CoreAcceleration, own: Array, ends: Float[Array, "2"]
+def _integrate_core_velocity(
+    field: _CoreAcceleration, initial_velocity: Array, ends: Float[Array, "2"]
 ) -> Float[Array, "3"]:
     """Return the angular velocity (3,) of the Moon's liquid core at the last time, rad/s, mantle
     frame.
 
     - `field`: the time derivative of the angular velocity, with the mantle as in the ephemeris.
-    - `own`: (3,) the angular velocity at the first time.
+    - `initial_velocity`: (3,) the angular velocity at the first time.
     - `ends`: (2,) the first and the last time, s; the last may be earlier.
     """
-    steps = dfx.PIDController(rtol=1e-12, atol=1e-12 * jnp.max(jnp.abs(own)))
+    steps = dfx.PIDController(rtol=1e-12, atol=1e-12 * jnp.max(jnp.abs(initial_velocity)))
     first = jnp.sign(ends[1] - ends[0]) * jnp.minimum(DAY, jnp.abs(ends[1] - ends[0]))
     solution = dfx.diffeqsolve(
-        dfx.ODETerm(field), dfx.Dopri8(), ends[0], ends[1], first, own,
+        dfx.ODETerm(field), dfx.Dopri8(), ends[0], ends[1], first, initial_velocity,
         stepsize_controller=steps, max_steps=1_000_000,
     )  # fmt: skip
     return solution.ys[0]  # pyright: ignore[reportOptionalSubscript]
 
 
-def _shift_along_z(table: Chebyshev, z: float) -> Chebyshev:
-    """Return a Chebyshev `table` of positions (3,), m, as functions of time, with the length `z`,
+def _shift_along_z(positions: Chebyshev, z: float) -> Chebyshev:
+    """Return a Chebyshev table of `positions` (3,), m, as functions of time, with the length `z`,
     m, added to the third component of each position.
     """
-    moved = table.coefficients.at[:, 2, 0].add(z)
-    return eqx.tree_at(lambda t: t.coefficients, table, moved)
+    moved = positions.coefficients.at[:, 2, 0].add(z)
+    return eqx.tree_at(lambda t: t.coefficients, positions, moved)
 
 
-def _subdivide_polynomials(rows: np.ndarray, parts: int) -> np.ndarray:
+def _subdivide_chebyshev_intervals(coefficients: np.ndarray, parts: int) -> np.ndarray:
     """Return the Chebyshev coefficients of the same functions on shorter intervals: each interval
     is divided into equal parts.
 
-    - `rows`: (intervals, k, terms) the coefficients of k functions on each interval, where `terms`
-      is the number of coefficients of a function.
+    - `coefficients`: (intervals, k, terms) the coefficients of k functions on each interval, where
+      `terms` is the number of coefficients of a function.
     - `parts`: the number of parts of each interval; the result has the shape (intervals · parts, k,
       terms).
     """
-    count, k, terms = rows.shape
+    count, k, terms = coefficients.shape
     if parts == 1:
-        return rows
+        return coefficients
     nodes = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
     back = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, terms - 1))
     out = np.empty((count, parts, k, terms))
     for part in range(parts):
         at = np.polynomial.chebyshev.chebvander((2 * part + 1 + nodes) / parts - 1, terms - 1)
-        out[:, part] = rows @ (back @ at).T
+        out[:, part] = coefficients @ (back @ at).T
     return out.reshape(count * parts, k, terms)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from rigidjax import exact
 from rigidjax._names import define_dir_and_getattr
@@ -92,7 +92,7 @@ def model() -> Model:
 
 
 @jax.jit
-def _log_periods(body: Inertia, state: Attitude) -> Array:
+def _log_periods(body: Inertia, state: Attitude) -> Float[Array, "2"]:
     """Return the logarithms (2,) of the rotation period and the precession period, days, of a free
     `body` with the initial `state`.
     """
@@ -102,7 +102,7 @@ def _log_periods(body: Inertia, state: Attitude) -> Array:
 
 
 @jax.jit
-def _momentum_direction(body: Inertia, state: Attitude) -> Array:
+def _momentum_direction(body: Inertia, state: Attitude) -> Float[Array, "2"]:
     """Return the longitude and latitude (2,), rad, of the angular momentum of a `body` with the
     given `state`, in world axes.
     """

@@ -19,7 +19,7 @@ from rigidjax.tumblers.scattering import (
     Geometric as Geometric,
     Lambert as Lambert,
     LommelSeeliger as LommelSeeliger,
-    law_of,
+    scattering_or_default,
     unit_direction,
 )
 
@@ -46,7 +46,7 @@ def ellipsoid(
     >>> round(float(ellipsoid([3.0, 2.0, 1.0], [0, 0, 1.0], [0, 0, 1.0])) / jnp.pi, 12)
     6.0
     """
-    law = law_of(scattering)
+    law = scattering_or_default(scattering)
     a = _checks.array_of_shape(semi_axes, (3,), "semi_axes", unit="m")
     a = _checks.require_positive(a, "semi_axes", "three positive lengths, m")
     s, o = (
@@ -86,7 +86,7 @@ def mesh(
     >>> float(mesh(corners, sides, [0, 0, -1.0], [0, 0, -1.0]))
     0.5
     """
-    law = law_of(scattering)
+    law = scattering_or_default(scattering)
     corners = _checks.array_of_rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
     if _checks.is_known(corners):
         _checks.require_finite(corners, "vertices")

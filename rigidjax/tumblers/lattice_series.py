@@ -43,9 +43,9 @@ class Sums(NamedTuple):
     total: Float[Array, ""]
 
 
-def sum_table(light: tuple[Array, ...], highest: float) -> Sums:
-    """Return the table of sums over the readings, from which `lattice_misfits` computes χ², up to
-    the frequency `highest`.
+def fourier_sum_table(light: tuple[Array, ...], highest: float) -> Sums:
+    """Return the table of sums over the readings, from which `fourier_chi2_of_padded_pairs`
+    computes χ², up to the frequency `highest`.
 
     - `light`: the light curve as three arrays (T,): the times of the readings divided by the span
       (the time from the first to the last reading); the values divided by their noise; and one over
@@ -55,16 +55,18 @@ def sum_table(light: tuple[Array, ...], highest: float) -> Sums:
     size = math.ceil(highest * DENSE) + 2 * NEAR
     grid = (np.arange(-(-size // ROWS) * ROWS) - NEAR // 2) / DENSE
     x, z, w = light
-    window, data = _sums_at_frequencies(jnp.asarray(grid, x.dtype), x, z, w)
+    window, data = _fourier_sums_at_frequencies(jnp.asarray(grid, x.dtype), x, z, w)
     return Sums(window, data, jnp.sum(z * z))
 
 
 @jax.jit
-def _sums_at_frequencies(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
+def _fourier_sums_at_frequencies(
+    frequencies: Array, x: Array, z: Array, w: Array
+) -> tuple[Complex[Array, " f"], Complex[Array, " f"]]:
     """Return two arrays (F,) of complex sums over the T readings of a light curve, one entry for
-    each of the F frequencies f of `grid`: `Σ w² exp 2πi f (x − ½)`; and `Σ w z exp 2πi f (x − ½)`.
+    each of the F `frequencies` f: `Σ w² exp 2πi f (x − ½)`; and `Σ w z exp 2πi f (x − ½)`.
 
-    - `grid`: (F,) the frequencies, 1/span, where the span is the time from the first to the last
+    - `frequencies`: (F,) in 1/span, where the span is the time from the first to the last
       reading.
     - `x`: (T,) the times of the readings divided by the span.
     - `z`: (T,) the values divided by their noise.
@@ -80,12 +82,14 @@ def _sums_at_frequencies(grid: Array, x: Array, z: Array, w: Array) -> tuple[Arr
             jax.lax.complex(jnp.sum(values * cos), jnp.sum(values * sin)),
         )
 
-    return jax.lax.map(sums_at, grid, batch_size=BATCH)
+    return jax.lax.map(sums_at, frequencies, batch_size=BATCH)
 
 
-def _interpolate_sums(table: Array, f: Array) -> Array:
-    """Return complex sums over the readings of a light curve at the frequencies `f`, interpolated
-    in a `table` of such sums.
+def _interpolate_sums(
+    table: Complex[Array, " entries"], frequencies: Float[Array, "*shape"]
+) -> Complex[Array, "*shape"]:
+    """Return complex sums over the readings of a light curve at the wanted `frequencies`,
+    interpolated in a `table` of such sums.
 
     The interpolation is the polynomial (Lagrange) through the nearest entries, whose number is
     `NEAR`.
@@ -93,15 +97,14 @@ def _interpolate_sums(table: Array, f: Array) -> Array:
     - `table`: (F,) complex, the sums at F frequencies, (k − NEAR/2)/DENSE for k = 0, 1, …, F − 1,
       in 1/span with `DENSE` frequencies for each 1/span, where the span is the time from the first
       to the last reading.
-    - `f`: the wanted frequencies, 1/span, an array of any shape, which is also the shape of the
-      result. The sum at a negative frequency is the complex conjugate of the sum at the opposite
-      frequency.
+    - `frequencies`: in 1/span, an array of any shape, which is also the shape of the result. The
+      sum at a negative frequency is the complex conjugate of the sum at the opposite frequency.
     """
-    place = jnp.abs(f) * DENSE
+    place = jnp.abs(frequencies) * DENSE
     first = jnp.floor(place)
     part = place - first
     index = first.astype(jnp.int32) + 1
-    real = imaginary = jnp.zeros(f.shape, part.dtype)
+    real = imaginary = jnp.zeros(frequencies.shape, part.dtype)
     nodes = np.arange(NEAR) - NEAR // 2 + 1
     for k in range(NEAR):
         others = np.delete(nodes, k)
@@ -110,11 +113,11 @@ def _interpolate_sums(table: Array, f: Array) -> Array:
             weight = weight * (part - float(other))
         entry = table[index + k]
         real, imaginary = real + weight * entry.real, imaginary + weight * entry.imag
-    return jax.lax.complex(real, jnp.where(f < 0, -imaginary, imaginary))
+    return jax.lax.complex(real, jnp.where(frequencies < 0, -imaginary, imaginary))
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pairs"]:
+def fourier_chi2_of_padded_pairs(pairs: Array, table: Sums, order: int) -> Float[Array, " pairs"]:
     """Return χ² of the best Fourier series `Σ c_jk exp 2πi (j f₁ + k f₂) t` for each pair of
     frequencies (f₁, f₂).
 
@@ -123,14 +126,19 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
 
     - `pairs`: (P, 2) the frequencies f₁ and f₂, 1/span, where the span is the time from the first
       to the last reading.
-    - `table`: the sums over the readings, as `sum_table` returns them.
+    - `table`: the sums over the readings, as `fourier_sum_table` returns them.
     - `order`: the largest multiple of f₂.
     """
     js, ks = np.meshgrid(np.arange(-FIRST, FIRST + 1), np.arange(-order, order + 1), indexing="ij")
     js, ks = js.ravel(), ks.ravel()
     dj, dk = js[None, :] - js[:, None] + 2 * FIRST, ks[None, :] - ks[:, None] + 2 * order
 
-    def sums_at_multiples(sums: Array, pair: Array, first_order: int, second_order: int) -> Array:
+    def sums_at_multiples(
+        sums: Complex[Array, " entries"],
+        pair: Float[Array, "2"],
+        first_order: int,
+        second_order: int,
+    ) -> Complex[Array, "rows columns"]:
         """Return the sums (2 m + 1, 2 n + 1) over the readings at the frequencies j f₁ + k f₂, for
         whole numbers |j| ≤ m and |k| ≤ n.
 
@@ -185,25 +193,26 @@ def pad_rows(rows: np.ndarray) -> np.ndarray:
     return np.concatenate([rows, np.repeat(rows[:1], size - len(rows), axis=0)])
 
 
-def lattice_chi2(table: Sums, pairs: np.ndarray, order: int) -> np.ndarray:
+def fourier_chi2_of_pairs(table: Sums, pairs: np.ndarray, order: int) -> np.ndarray:
     """Return χ² (P,) of the best Fourier series in two frequencies for any number P of pairs, as a
     NumPy array.
 
-    The pairs are given to `lattice_misfits` in chunks, so that few programs are compiled.
+    The pairs are given to `fourier_chi2_of_padded_pairs` in chunks, so that few programs are
+    compiled.
 
-    - `table`: the sums over the readings, as `sum_table` returns them.
+    - `table`: the sums over the readings, as `fourier_sum_table` returns them.
     - `pairs`: (P, 2) the two frequencies of each series, 1/span.
     - `order`: the largest multiple of the second frequency.
     """
     out = [np.zeros(0)]
     for first in range(0, len(pairs), MANY):
         chunk = pairs[first : first + MANY]
-        misfits = lattice_misfits(jnp.asarray(pad_rows(chunk)), table, order)
+        misfits = fourier_chi2_of_padded_pairs(jnp.asarray(pad_rows(chunk)), table, order)
         out.append(np.asarray(misfits)[: len(chunk)])
     return np.concatenate(out)
 
 
-def side_peaks(table: Sums, highest: float) -> np.ndarray:
+def side_peaks_of_window(table: Sums, highest: float) -> np.ndarray:
     """Return the positions (n,), n ≤ 2, of the highest side peaks of the spectral window, in
     1/span, the highest first.
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, exact
+from rigidjax._types import Scalar
 from rigidjax.body.inertia import Inertia, tensor_of
 from rigidjax.identify.answer import answers
 from rigidjax.identify.answer.answers import FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
@@ -31,8 +32,14 @@ from rigidjax.identify.uncertainty.quantities import (
 )
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot
-from rigidjax.tumblers.search import MAGNITUDE, noise_of, relative_flux, search_from, starts_of
-from rigidjax.tumblers.sensor import Brightness, bisector
+from rigidjax.tumblers.search import (
+    MAGNITUDE,
+    noise_of,
+    search_all_then_best_starts,
+    starts_from_frequency_pairs,
+    times_fluxes_and_noise,
+)
+from rigidjax.tumblers.sensor import Brightness, sun_observer_bisector
 from rigidjax.tumblers.two_frequencies import TwoFrequencies, two_frequencies
 
 # Two motions count as the same if their rotation periods, precession periods and two ratios of
@@ -108,7 +115,9 @@ class LightCurve(eqx.Module):
 
     @property
     def status(self) -> str:
-        """Return both answers in one line, which is `ok` if both are good and have no reasons."""
+        """Return one line of text with the answers `search` and `explanation`; it is `ok` if both
+        answers are good and give no reasons.
+        """
         return answers.joined_status(self.search, self.explanation)
 
     @property
@@ -170,16 +179,20 @@ def fit_light_curve(
     say = lambda line: None  # noqa: E731
     if progress is not None:
         say = _checks.require_function(progress, "progress", "of a line of text, such as print")
-    t, flux, noise = relative_flux(model, reading)
+    t, flux, noise = times_fluxes_and_noise(model, reading)
     squares, sigma = flux**2, None if noise is None else 2.0 * flux * noise
     pairs = two_frequencies(t, squares, sigma, shortest=shortest, count=count)
     above = ABOVE * max(1.0, float(pairs.misfits[0]) / pairs.dof)
     used = max(LEAST, int((pairs.misfits <= pairs.misfits[0] + above).sum()))
-    starts = starts_of(model, reading, t, squares, sigma, pairs.frequencies[:used])
+    starts = starts_from_frequency_pairs(
+        model, reading, t, squares, sigma, pairs.frequencies[:used]
+    )
     say(f"{used} pairs of frequencies, χ² {pairs.misfits[0]:.6g} of {pairs.dof}")
     say(f"{len(starts)} starts")
     whole = stacking.pad_to_few_lengths(model)
-    ends = search_from(whole, starts, noise_of(reading, flux, pairs.scatter), tolerance)
+    ends = search_all_then_best_starts(
+        whole, starts, noise_of(reading, flux, pairs.scatter), tolerance
+    )
     aliases = _distinct_motions(whole, ends)
     say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
     best = fit(whole, starts=1, initial=aliases[0].x, tolerance=tolerance)
@@ -213,12 +226,14 @@ def _require_one_brightness(model: Model) -> Reading:
     if isinstance(model.chart, Bodies):
         raise ValueError("fit_light_curve: wanted one body, got several by name")
     if model.torque is not None:
-        raise ValueError("fit_light_curve: wanted a free body, got a torque")
+        raise ValueError("fit_light_curve: wanted a free body, got a model with a torque")
     return stacking.pick_records(readings[0], 0)
 
 
 @eqx.filter_jit
-def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Array]:
+def _log_periods_moment_ratios_and_mode_number(
+    x: Float[Array, " n"], model: Model
+) -> tuple[Float[Array, "4"], Scalar]:
     """Return two things: the logarithms (4,) of the rotation period, s, of the precession period,
     s, and of the two smaller moments divided by the largest; and the number h²/2T divided by the
     middle moment.
@@ -240,7 +255,9 @@ def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Arr
 
 
 @eqx.filter_jit
-def _period_derivatives(x: Float[Array, " n"], model: Model) -> Float[Array, "4 n"]:
+def _derivatives_of_log_periods_and_ratios(
+    x: Float[Array, " n"], model: Model
+) -> Float[Array, "4 n"]:
     """Return the derivatives (4, n) of the logarithms of the rotation period, the precession period
     and the two ratios of moments (the two smaller moments divided by the largest), with respect to
     the n free numbers.
@@ -248,7 +265,7 @@ def _period_derivatives(x: Float[Array, " n"], model: Model) -> Float[Array, "4 
     - `x`: (n,) the free numbers of the model, at which the derivatives are taken.
     - `model`: a model of one recording of a free body.
     """
-    return jax.jacfwd(lambda x: _periods_and_ratios(x, model)[0])(x)
+    return jax.jacfwd(lambda x: _log_periods_moment_ratios_and_mode_number(x, model)[0])(x)
 
 
 def _motion_of_free_numbers(model: Model, x: Array, cost: float) -> Alias:
@@ -261,7 +278,7 @@ def _motion_of_free_numbers(model: Model, x: Array, cost: float) -> Alias:
     - `cost`: half of χ² of the motion, where χ² is the sum over the readings of (error divided by
       noise)².
     """
-    numbers, middle = (np.asarray(v) for v in _periods_and_ratios(x, model))
+    numbers, middle = (np.asarray(v) for v in _log_periods_moment_ratios_and_mode_number(x, model))
     rotation, precession, *ratios = np.exp(numbers)
     mode = "long" if middle < 1 else "short"
     motion = float(rotation), float(precession), mode, np.array(ratios)
@@ -306,7 +323,7 @@ def _is_same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
 
 
 @eqx.filter_jit
-def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
+def _bisectors_in_body_frame(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
     """Return the unit vectors (T, 3) half way between the directions to sun and observer, at the T
     times of the readings, in the axes of the moving body.
 
@@ -320,12 +337,12 @@ def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
 
     def bisector_at(now: Array) -> Array:
         state: Any = motion(now - t[0])
-        return quaternion.rotate_inverse(state.q, bisector(sensor, now))
+        return quaternion.rotate_inverse(state.q, sun_observer_bisector(sensor, now))
 
     return jax.vmap(bisector_at)(t)
 
 
-def _allow_for_shape(best: Fit) -> Fit:
+def _widen_covariance_for_shape_errors(best: Fit) -> Fit:
     """Return the fit `best` of a light curve with a larger covariance, which allows for a body that
     is not an ellipsoid.
 
@@ -338,7 +355,7 @@ def _allow_for_shape(best: Fit) -> Fit:
     reading, weight = stacking.pick_records(best.model.records.readings[0], 0), linear.weights[0][0]
     flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
     size = np.full(weight.shape, 1.0 / MAGNITUDE) if reading.sensor.unit == "mag" else flux
-    n = np.asarray(_bisectors(best.x, best.model))
+    n = np.asarray(_bisectors_in_body_frame(best.x, best.model))
     change = SHAPE / float(best.noises[0][0, 0]) * size[:, None, None] * n[:, :, None] * n[:, None]
     slopes = linear.slopes[0][0, :, 0] * weight[:, None]
     kept = weight > 0
@@ -373,8 +390,8 @@ def _light_curve_of_fit(
       further pairs may fit.
     """
     slopes, wider = (
-        np.asarray(_period_derivatives(best.derivative_point, best.model)),
-        _allow_for_shape(best),
+        np.asarray(_derivatives_of_log_periods_and_ratios(best.derivative_point, best.model)),
+        _widen_covariance_for_shape_errors(best),
     )
     own, deviations = (
         standard_deviations(

@@ -22,13 +22,13 @@ from rigidjax._types import Mat3, Numbers, Scalar, Vec3, Vec3Like
 from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
 from rigidjax.rotation.linalg3 import apply, cofactors, cross, determinant, dot
 
-# For arguments below _SMALL the function `_artanh_excess` of the law of Lommel and Seeliger is
-# computed by a series of _TERMS terms.
+# For arguments below _SMALL the function `_artanh_sqrt_ratio_minus_one_over_w` is computed by a
+# series of _TERMS terms.
 _SMALL, _TERMS = 0.1, 16
 # Each of the two integrals of Lambert's law has this number of Gauss–Legendre points.
 _POINTS = 32
 
-Faces = Float[Array, "*faces"]
+ValuePerFace = Float[Array, "*faces"]
 
 
 class AbstractScattering(eqx.Module):
@@ -44,7 +44,7 @@ class AbstractScattering(eqx.Module):
     """
 
     @abc.abstractmethod
-    def per_area(self, incidence: Faces, emission: Faces) -> Faces:
+    def per_area(self, incidence: ValuePerFace, emission: ValuePerFace) -> ValuePerFace:
         """Return the brightness of a piece of surface divided by its area, from the cosines of its
         angles of `incidence` and `emission`.
 
@@ -71,11 +71,11 @@ class Geometric(AbstractScattering):
     0.25
     """
 
-    def per_area(self, incidence: Faces, emission: Faces) -> Faces:
+    def per_area(self, incidence: ValuePerFace, emission: ValuePerFace) -> ValuePerFace:
         return emission
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-        p, _, more, _, _ = _numbers_of_lit_lune(shape, sun, observer)
+        p, _, more, _, _ = _scalars_of_ellipsoid_brightness(shape, sun, observer)
         return 0.5 * math.pi * _ratio_or_zero(more, p)
 
 
@@ -93,12 +93,16 @@ class LommelSeeliger(AbstractScattering):
     0.5
     """
 
-    def per_area(self, incidence: Faces, emission: Faces) -> Faces:
+    def per_area(self, incidence: ValuePerFace, emission: ValuePerFace) -> ValuePerFace:
         return 2.0 * incidence * emission / (incidence + emission)
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-        p, q, more, w, rest = _numbers_of_lit_lune(shape, sun, observer)
-        return math.pi * _ratio_or_zero(more, p + q) * (1.0 - rest * _artanh_excess(w, rest))
+        p, q, more, w, rest = _scalars_of_ellipsoid_brightness(shape, sun, observer)
+        return (
+            math.pi
+            * _ratio_or_zero(more, p + q)
+            * (1.0 - rest * _artanh_sqrt_ratio_minus_one_over_w(w, rest))
+        )
 
 
 class Lambert(AbstractScattering):
@@ -112,14 +116,14 @@ class Lambert(AbstractScattering):
     0.75
     """
 
-    def per_area(self, incidence: Faces, emission: Faces) -> Faces:
+    def per_area(self, incidence: ValuePerFace, emission: ValuePerFace) -> ValuePerFace:
         return 1.5 * incidence * emission
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
         return 1.5 * _lambert_integral(shape, sun, observer)
 
 
-def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
+def scattering_or_default(scattering: AbstractScattering | None) -> AbstractScattering:
     """Return the law `scattering`, or the law of Lommel and Seeliger for `None`; raise `TypeError`
     for other objects.
     """
@@ -145,7 +149,9 @@ def unit_direction(value: Vec3Like | Numbers, name: str) -> Vec3:
     return v / jnp.sqrt(dot(v, v))
 
 
-def _numbers_of_lit_lune(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
+def _scalars_of_ellipsoid_brightness(
+    shape: Mat3, sun: Vec3, observer: Vec3
+) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar]:
     """Return the five scalars that determine the brightness of an ellipsoid: |p|, |q|, |p||q| +
     p·q, z² and 1 − z².
 
@@ -159,7 +165,7 @@ def _numbers_of_lit_lune(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar
     minors = cofactors(shape)
     of_sun, turned = apply(minors, sun), cross(sun, observer)
     pq = dot(observer, of_sun)
-    p, q = _root_or_zero(dot(sun, of_sun)), _root_or_zero(dot(observer, apply(minors, observer)))
+    p, q = _sqrt_or_zero(dot(sun, of_sun)), _sqrt_or_zero(dot(observer, apply(minors, observer)))
     # The smaller of the two numbers |p||q| ± p·q is |p × q|² divided by the larger number. Since |p
     # × q|² is computed without a subtraction, the smaller number keeps its digits at zero phase and
     # at a phase of 180°.
@@ -172,11 +178,11 @@ def _numbers_of_lit_lune(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar
     return p, q, more, 1.0 - rest, rest
 
 
-def _artanh_excess(w: Array, complement: Array) -> Array:
+def _artanh_sqrt_ratio_minus_one_over_w(w: Array, one_minus_w: Array) -> Array:
     """Return `(artanh(√w)/√w − 1)/w` of an array of numbers `w`, also at w = 0, where the value is
     1/3.
 
-    `complement` is 1 − w, given separately since a subtraction would lose its digits near w = 1.
+    `one_minus_w` is 1 − w, given separately since a subtraction would lose its digits near w = 1.
     The two arrays may be complex.
     """
     near = jnp.abs(w) < _SMALL
@@ -186,11 +192,11 @@ def _artanh_excess(w: Array, complement: Array) -> Array:
         series = series * few + 1.0 / (2 * k + 3)
     far = jnp.where(near, 0.5, w)
     z = jnp.sqrt(far)
-    lone = jnp.abs(complement) > 0
-    # At zero phase `complement` is 0, and the result is multiplied by `complement`. The logarithm
+    is_nonzero = jnp.abs(one_minus_w) > 0
+    # At zero phase 1 − w is 0, and the caller multiplies the result by 1 − w. The logarithm
     # is set to 0 here, since x ln x tends to 0. The derivative is right as well, since `complement`
     # has a minimum at zero phase.
-    logarithm = jnp.where(lone, jnp.log(jnp.where(lone, complement, 1.0)), 0.0)
+    logarithm = jnp.where(is_nonzero, jnp.log(jnp.where(is_nonzero, one_minus_w, 1.0)), 0.0)
     return jnp.where(near, series, ((jnp.log1p(z) - 0.5 * logarithm) / z - 1.0) / far)
 
 
@@ -225,11 +231,13 @@ def _lambert_integral(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
     below = size + square * (second + square * (total + square))
     whole = math.pi * size * jnp.sqrt(middle) * jnp.sum(w * top / (below * jnp.sqrt(below)))
     is_large = whole > 0
-    lune = _lune_integral(shape, minors, sun, jnp.where(is_large, -observer, observer))
+    lune = _integral_over_lune_of_normals(
+        shape, minors, sun, jnp.where(is_large, -observer, observer)
+    )
     return jnp.where(is_large, whole, 0.0) + size * lune
 
 
-def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
+def _integral_over_lune_of_normals(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
     """Return `∫ (n·sun)(n·observer)/(n·En)² dn` over the unit vectors n for which both n·sun and
     n·observer are positive, which is a lune of the unit sphere.
 
@@ -238,7 +246,7 @@ def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scal
     - `sun`, `observer`: (3,) unit vectors, body axes.
     """
     pole = cross(sun, observer)
-    sine, apart = _root_or_zero(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
+    sine, apart = _sqrt_or_zero(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
     # If the directions to sun and observer are nearly parallel or opposite, any pole orthogonal to
     # them can be used.
     least = jnp.eye(3, dtype=pole.dtype)[jnp.argmin(jnp.abs(sun))]
@@ -278,13 +286,13 @@ def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scal
     root = jnp.sqrt(d)
     e = jax.lax.complex(root / along, -tilt / along)
     square = e * e
-    excess = _artanh_excess(1.0 - square, square)
+    excess = _artanh_sqrt_ratio_minus_one_over_w(1.0 - square, square)
     inner = (e + e * (1.0 - square) * excess).real * dot(pole, e_pole) / root
     inner = inner + (square * excess).real
     return jnp.sum(weight * s * jnp.sin(width - angle) * inner / d)
 
 
-def _root_or_zero(x: Scalar) -> Scalar:
+def _sqrt_or_zero(x: Scalar) -> Scalar:
     """Return √x of a number x ≥ 0, with the derivative 0 at x = 0, where that of the root would be
     infinite.
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rigidjax._types import Vec3
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.free import leaf_at
@@ -20,8 +21,8 @@ from rigidjax.identify.search.least_squares import CAREFUL, Settings, minimise
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.rotation import quaternion
 from rigidjax.tumblers import starts
-from rigidjax.tumblers.sensor import bisector
-from rigidjax.tumblers.two_frequencies import pad_light
+from rigidjax.tumblers.sensor import sun_observer_bisector
+from rigidjax.tumblers.two_frequencies import pad_light_curve
 
 # The search takes STEPS steps from each start, where one run of a program computes FIRST starts.
 # Then it takes MORE steps from each of the SECOND best results.
@@ -32,7 +33,7 @@ DIFFERENCE = 1e-6
 MAGNITUDE = 0.4 * np.log(10.0)
 
 
-def relative_flux(
+def times_fluxes_and_noise(
     model: Model, reading: Reading
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return the light curve as three arrays (T,), without gaps: the times since the first time, s;
@@ -57,23 +58,23 @@ def relative_flux(
     return t[mask] - t[0], flux, sigma
 
 
-def starts_of(
+def starts_from_frequency_pairs(
     model: Model,
     reading: Reading,
     t: np.ndarray,
-    squares: np.ndarray,
+    squared_flux: np.ndarray,
     noise: np.ndarray | None,
     pairs: np.ndarray,
-) -> list[Array]:
+) -> list[Float[Array, " n"]]:
     """Return the best starting points over all pairs of frequencies, each as free numbers (n,).
 
-    **Arguments:** `model` and its only `reading`; `t` (T,) s; `squares` (T,) the squared fluxes;
-    `noise` their standard deviations or `None`; `pairs` (P, 2), 1/s.
+    **Arguments:** `model` and its only `reading`; `t` (T,) s; `squared_flux` (T,);
+    `noise` (T,) its standard deviations or `None`; `pairs` (P, 2), 1/s.
     """
     sensor: Any = reading.sensor
     sigma = np.ones(t.shape) if noise is None else noise
-    light = pad_light(t, squares, 1.0 / sigma)
-    middle = np.asarray(bisector(sensor, model.records.t[0][0] + 0.5 * t[-1]))
+    light = pad_light_curve(t, squared_flux, 1.0 / sigma)
+    middle = np.asarray(sun_observer_bisector(sensor, model.records.t[0][0] + 0.5 * t[-1]))
     order, areas = np.arange(3), None
     if sensor.semi_axes is not None:
         axes = np.asarray(sensor.semi_axes)
@@ -82,7 +83,7 @@ def starts_of(
     best_of, others = [], []
     for pair in pairs:
         for mode in starts.MODES:
-            candidates = starts.candidates(pair, mode, light, middle, areas, 3)
+            candidates = starts.candidate_motions(pair, mode, light, middle, areas, 3)
             # The best body of each mode of each pair comes first, since the misfits on a grid
             # cannot decide between modes and pairs.
             best_of += candidates[: len(starts.ABOUT)]
@@ -91,40 +92,42 @@ def starts_of(
     in_order = [one for group in (best_of, others) for one in sorted(group, key=lambda c: c.misfit)]
     chosen = in_order[: chunks * FIRST]
     # The columns of this rotation are the axes of the body in the order of ascending moments.
-    turn = np.eye(3)[:, order]
-    turn = turn * np.array([1.0, 1.0, np.linalg.det(turn)])
-    return [_free_numbers_of_candidate(model, one, turn) for one in chosen]
+    principal_to_body = np.eye(3)[:, order]
+    principal_to_body = principal_to_body * np.array([1.0, 1.0, np.linalg.det(principal_to_body)])
+    return [_free_numbers_of_candidate(model, one, principal_to_body) for one in chosen]
 
 
 def _free_numbers_of_candidate(
-    model: Model, candidate: starts.Candidate, turn: np.ndarray
-) -> Array:
+    model: Model, candidate: starts.Candidate, principal_to_body: np.ndarray
+) -> Float[Array, " n"]:
     """Return the n free numbers (n,) of the `model` for a `candidate` motion; a search starts from
     them.
 
     - `candidate`: principal moments, initial attitude and initial rate, all in principal axes.
-    - `turn`: (3, 3) the rotation matrix from principal axes to body axes.
+    - `principal_to_body`: (3, 3) the rotation matrix from principal axes to body axes.
     """
-    moments = turn @ np.diag(candidate.moments) @ turn.T
+    moments = principal_to_body @ np.diag(candidate.moments) @ principal_to_body.T
     start = model.start(Inertia(jnp.asarray(moments)))
     reference = model.reference
-    step = _rotation_vector(jnp.asarray(candidate.q), jnp.asarray(turn), reference.state.q[0])
-    spin = jnp.asarray(turn @ candidate.omega) / reference.rate[0]
+    step = _rotation_vector_from_reference(
+        jnp.asarray(candidate.q), jnp.asarray(principal_to_body), reference.state.q[0]
+    )
+    spin = jnp.asarray(principal_to_body @ candidate.omega) / reference.rate[0]
     # The free numbers of an initial `Attitude` are the rotation vector from the reference attitude,
     # and the rate in units of the typical rate.
     return start.at[model.index.start[0]].set(jnp.concatenate([step, spin]))
 
 
 @jax.jit
-def _rotation_vector(q: Array, turn: Array, reference: Array) -> Array:
+def _rotation_vector_from_reference(q: Array, principal_to_body: Array, reference: Array) -> Vec3:
     """Return the rotation vector (3,), rad, from a reference attitude to the attitude of a body,
     whose principal axes have the attitude `q`.
 
     - `q`: (4,) the quaternion that maps principal axes to world axes.
-    - `turn`: (3, 3) the rotation matrix from principal axes to body axes.
+    - `principal_to_body`: (3, 3) the rotation matrix from principal axes to body axes.
     - `reference`: (4,) the quaternion of the reference attitude, body → world.
     """
-    back = quaternion.conjugate(quaternion.from_matrix(turn))
+    back = quaternion.conjugate(quaternion.from_matrix(principal_to_body))
     q = quaternion.multiply(q, back)
     return quaternion.log(quaternion.multiply(quaternion.conjugate(reference), q))
 
@@ -146,7 +149,9 @@ def noise_of(reading: Reading, flux: np.ndarray, scatter: float) -> tuple[Float[
     return (jnp.full((1, 1), max(left * unit, 1e-12)),)
 
 
-def search_from(model: Model, starts: list[Array], noise: Noise, tolerance: float) -> list[Attempt]:
+def search_all_then_best_starts(
+    model: Model, starts: list[Array], noise: Noise, tolerance: float
+) -> list[Attempt]:
     """Return the results of least-squares searches: a few steps from all starts, then more steps
     from the best of the points that were reached.
 
@@ -159,7 +164,7 @@ def search_from(model: Model, starts: list[Array], noise: Noise, tolerance: floa
     for first in range(0, len(starts), FIRST):
         # Starts are repeated to fill the last chunk, so that all chunks use one program.
         chunk = [starts[first + k % len(starts[first:])] for k in range(FIRST)]
-        stacked = _with_best_level(jnp.stack(chunk), model)
+        stacked = _fit_brightness_level_of_starts(jnp.stack(chunk), model)
         settings = Settings(tolerance, CAREFUL, STEPS)
         ends = _search_from_starts(stacked, model, noise, settings, np.int32(FIRST))
         points.append(ends.x)
@@ -204,13 +209,13 @@ def _search_from_starts(
     def search_from_start(numbered_start: tuple[Array, Array]) -> Attempt:
         start, number = numbered_start
 
-        def errors(point: Array) -> Array:
+        def scaled_errors(point: Array) -> Array:
             return model.errors(point)[0][:, 0] / noise[0][0, 0]
 
         def evaluate(point: Array) -> tuple[tuple[()], Array, NormalMatrix, Array]:
             steps = jnp.concatenate([jnp.zeros((1, start.size)), jnp.eye(start.size)])
             moved = point[None] + DIFFERENCE * steps
-            e = jax.lax.map(errors, moved)
+            e = jax.lax.map(scaled_errors, moved)
             rows = (e[1:] - e[:1]) / DIFFERENCE
             return (), 0.5 * jnp.sum(e[0] ** 2), NormalMatrix(rows @ rows.T), rows @ e[0]
 
@@ -223,7 +228,9 @@ def _search_from_starts(
 
 
 @eqx.filter_jit
-def _with_best_level(starts: Float[Array, "starts n"], model: Model) -> Float[Array, "starts n"]:
+def _fit_brightness_level_of_starts(
+    starts: Float[Array, "starts n"], model: Model
+) -> Float[Array, "starts n"]:
     """Return the `starts` of searches, each with the level of brightness that fits the readings
     best.
 

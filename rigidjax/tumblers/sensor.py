@@ -18,7 +18,7 @@ from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import determinant, dot
 from rigidjax.tumblers.brightness import AbstractScattering
-from rigidjax.tumblers.scattering import law_of, unit_direction
+from rigidjax.tumblers.scattering import scattering_or_default, unit_direction
 
 UNITS = ("flux", "mag")
 
@@ -94,12 +94,15 @@ class Brightness(AbstractSensor):
             _checked_direction(sun, "sun"),
             _checked_direction(observer, "observer"),
         )
-        self.scattering, self.noise = law_of(scattering), base.deviations_field(1)(noise)
+        self.scattering, self.noise = (
+            scattering_or_default(scattering),
+            base.deviations_field(1)(noise),
+        )
         self.unit = _checks.require_option(unit, UNITS, "unit")
         usual = 1.0 if unit == "flux" else 0.0
         checked_level = base.array_field("level", ())(usual if level is None else level)
         if unit == "flux":
-            words = "level: wanted a positive flux"
+            words = "level: wanted a positive flux, since the unit is 'flux'"
             checked_level = _checks.error_if(checked_level, ~(checked_level > 0), words)
         self.level = checked_level
         if semi_axes is not None:
@@ -119,7 +122,8 @@ class Brightness(AbstractSensor):
         shape = shape / jnp.trace(shape)
         q = motion.state.q
         sun, observer = (
-            quaternion.rotate_inverse(q, v) for v in directions(self, motion.t, q.dtype)
+            quaternion.rotate_inverse(q, v)
+            for v in sun_and_observer_directions(self, motion.t, q.dtype)
         )
         area = self.scattering.of_ellipsoid(shape, sun, observer)
         relative = area / (math.pi * jnp.cbrt(determinant(shape)))
@@ -147,8 +151,8 @@ class Brightness(AbstractSensor):
         return 0.5 * float(turns[np.argmax(power)])
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return two things: a mask (T,) of the `values` that are fluxes far below zero; and a
-        message with the reason.
+        """Return two things: a mask (T,), true for each of the `values` that must be refused, a
+        flux far below zero; and a message with the reason.
         """
         noise = np.std(values) if self.noise is None else np.asarray(self.noise)[0]
         wrong = values < 0 if self.unit == "flux" else np.zeros(values.shape, bool)
@@ -157,7 +161,9 @@ class Brightness(AbstractSensor):
         return wrong, words
 
 
-def directions(sensor: Brightness, t: ScalarLike, dtype: DTypeLike | None = None) -> list[Vec3]:
+def sun_and_observer_directions(
+    sensor: Brightness, t: ScalarLike, dtype: DTypeLike | None = None
+) -> list[Vec3]:
     """Return two unit vectors (3,), the directions from the body to the sun and to the observer at
     the time `t`, s, in the world frame.
 
@@ -167,11 +173,11 @@ def directions(sensor: Brightness, t: ScalarLike, dtype: DTypeLike | None = None
     return [_normalise_vector(v if dtype is None else v.astype(dtype)) for v in vectors]
 
 
-def bisector(sensor: Brightness, t: ScalarLike) -> Vec3:
+def sun_observer_bisector(sensor: Brightness, t: ScalarLike) -> Vec3:
     """Return the unit vector half way between sun and observer at the time `t`, in the world
     frame.
     """
-    sun, observer = directions(sensor, t)
+    sun, observer = sun_and_observer_directions(sensor, t)
     return _normalise_vector(sun + observer)
 
 
@@ -180,7 +186,9 @@ def _normalise_vector(v: Vec3) -> Vec3:
     return v / jnp.sqrt(dot(v, v))
 
 
-def _checked_direction(source: NumbersLike | Callable[..., Any], name: str) -> Any:
+def _checked_direction(
+    source: NumbersLike | Callable[..., Any], name: str
+) -> Vec3 | Callable[..., Any]:
     """Return the direction of a sensor after a check: a vector (3,) as its unit vector, or a
     function of time unchanged.
 

@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rigidjax import exact
+from rigidjax._types import Scalar
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion import Attitude
 from rigidjax.rotation import quaternion
@@ -48,7 +49,7 @@ class Candidate(NamedTuple):
     misfit: float
 
 
-def candidates(
+def candidate_motions(
     pair: np.ndarray,
     mode: str,
     light: tuple[Array, Array, Array],
@@ -79,7 +80,7 @@ def candidates(
         forms = np.broadcast_to(areas, forms.shape)
     forms = forms / forms.mean(axis=1, keepdims=True)
     arrays = jnp.asarray(moments), jnp.asarray(forms), jnp.asarray(pair), *light
-    motions = _motions_on_grid_of_phases(jnp.asarray(mode == "long"), *arrays)
+    motions = _fit_motions_on_grid_of_phases(jnp.asarray(mode == "long"), *arrays)
     misfits, sides, q, omega = (np.asarray(v) for v in motions)
     # The best phase is taken for each body.
     phase, least = misfits.argmin(axis=1), misfits.min(axis=1)
@@ -90,25 +91,27 @@ def candidates(
         at = k, phase[k]
         in_world = (
             np.array(quaternion_product(q0, q[at]))
-            for q0 in _momentum_frame_to_world(sides[at], bisector)
+            for q0 in _rotations_from_momentum_frame_to_world(sides[at], bisector)
         )
         out += [Candidate(moments[k], one, omega[at], float(least[k])) for one in in_world]
     return out
 
 
-def _momentum_frame_to_world(side: np.ndarray, bisector: np.ndarray) -> list[tuple[Any, ...]]:
+def _rotations_from_momentum_frame_to_world(
+    fitted_entries: np.ndarray, bisector: np.ndarray
+) -> list[tuple[Any, ...]]:
     """Return the quaternions (4,), one for each angle of `ABOUT`, that rotate the frame of the
     angular momentum (its z axis is along the momentum) to the world frame.
 
     Each of these rotations takes the direction n, half way between sun and observer, from the first
     frame to the second. They differ in the angle of a further rotation about n in the world, which
-    `side` does not determine: `ABOUT` has three such angles, rad.
+    `fitted_entries` does not determine: `ABOUT` has three such angles, rad.
 
-    - `side`: (6,) the entries xx, yy, zz, xy, xz, yz of the fitted matrix n nᵀ in the frame of the
-      momentum, whose eigenvector of the largest eigenvalue is taken as n.
+    - `fitted_entries`: (6,) the entries xx, yy, zz, xy, xz, yz of the fitted matrix n nᵀ in the
+      frame of the momentum, whose eigenvector of the largest eigenvalue is taken as n.
     - `bisector`: (3,) the unit vector n in the world frame.
     """
-    xx, yy, zz, xy, xz, yz = side
+    xx, yy, zz, xy, xz, yz = fitted_entries
     _, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     n = axes[:, -1]
     first = _shortest_rotation(n, bisector if n @ bisector >= 0 else -bisector, np)
@@ -127,41 +130,42 @@ def _shortest_rotation(u: Any, v: Any, xp: ModuleType) -> Any:
     return q / xp.sqrt((q * q).sum())
 
 
-def _rate_of_energy(moments: Array, d: Array) -> Float[Array, "3"]:
+def _rate_at_unit_momentum(moments: Array, momentum2_over_2energy: Array) -> Float[Array, "3"]:
     """Return the body rate (3,), in principal axes, of a motion with the angular momentum h = 1 and
-    `h²/2T = d`, where T is the kinetic energy, at the time at which the component of the rate along
-    the axis of the middle moment is zero.
+    the given h²/2T, where T is the kinetic energy, at the time at which the component of the rate
+    along the axis of the middle moment is zero.
 
     - `moments`: (3,) the principal moments, ascending.
-    - `d`: a number between the smallest and the largest moment.
+    - `momentum2_over_2energy`: h²/2T, a number between the smallest and the largest moment.
     """
     a, _, c = (1.0 / moments[k] for k in range(3))
-    x = jnp.clip((1.0 / d - c) / (a - c), 0.0, 1.0)
+    x = jnp.clip((1.0 / momentum2_over_2energy - c) / (a - c), 0.0, 1.0)
     return jnp.stack([jnp.sqrt(x), jnp.zeros_like(x), jnp.sqrt(1.0 - x)]) / moments
 
 
 def _rate_with_period_ratio(
-    moments: Array, ratio: Array, long_axis: Array
-) -> tuple[Array, Array, Array]:
+    moments: Array, period_ratio: Array, is_long_axis_mode: Array
+) -> tuple[Float[Array, "3"], Scalar, Bool[Array, ""]]:
     """Return three things: the body rate (3,) of a free motion whose precession period divided by
-    its rotation period is `ratio`; its precession period; and whether there is such a motion.
+    its rotation period is `period_ratio`; its precession period; and whether there is such a
+    motion.
 
     The angular momentum is 1, and the energy is found by bisection. The first two results have no
     meaning if the third is false.
 
     - `moments`: (3,) the principal moments, ascending.
-    - `ratio`: the wanted quotient of the two periods.
-    - `long_axis`: true for a motion in the long-axis mode (the momentum circulates in the body
-      about the axis of the smallest moment), false for the short-axis mode.
+    - `period_ratio`: the wanted quotient of the two periods.
+    - `is_long_axis_mode`: true for a motion in the long-axis mode (the momentum circulates in the
+      body about the axis of the smallest moment), false for the short-axis mode.
     """
-    body, pure = Inertia(jnp.diag(moments)), jnp.where(long_axis, moments[0], moments[2])
+    body, pure = Inertia(jnp.diag(moments)), jnp.where(is_long_axis_mode, moments[0], moments[2])
 
     def bisect(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high = state[:2]
         part = 0.5 * (low + high)
-        omega = _rate_of_energy(moments, pure + part * (moments[1] - pure))
+        omega = _rate_at_unit_momentum(moments, pure + part * (moments[1] - pure))
         precession = exact.precession_period(body, omega)
-        quotient = precession / exact.body_period(body, omega) / ratio
+        quotient = precession / exact.body_period(body, omega) / period_ratio
         low, high = jnp.where(quotient > 1, part, low), jnp.where(quotient > 1, high, part)
         return low, high, omega, precession, quotient
 
@@ -176,15 +180,20 @@ def _rate_with_period_ratio(
 
 
 @jax.jit
-def _motions_on_grid_of_phases(
-    long_axis: Array,
+def _fit_motions_on_grid_of_phases(
+    is_long_axis_mode: Array,
     moments: Array,
     forms: Array,
     pair: Array,
     t: Array,
-    squares: Array,
+    squared_flux: Array,
     weights: Array,
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[
+    Float[Array, "bodies phases"],
+    Float[Array, "bodies phases 6"],
+    Float[Array, "bodies phases 4"],
+    Float[Array, "bodies phases 3"],
+]:
     """Return four arrays for the motions of S bodies that start at P = `PHASES` phases of half a
     rotation: the misfits χ² (S, P); the six fitted entries xx, yy, zz, xy, xz, yz of n nᵀ times the
     level (S, P, 6); the initial attitudes (S, P, 4), principal axes → frame of the angular
@@ -195,20 +204,20 @@ def _motions_on_grid_of_phases(
     to give the squared fluxes, where r_k are the principal axes in that frame. All motions have the
     same `pair` of frequencies. A body that has no such motion has the misfit infinity.
 
-    - `long_axis`: true for motions in the long-axis mode, false for the short-axis mode.
+    - `is_long_axis_mode`: true for motions in the long-axis mode, false for the short-axis mode.
     - `moments`: (S, 3) the principal moments of each body, ascending.
     - `forms`: (S, 3) the numbers M = (bc)², (ca)², (ab)² of each body with the semi-axes a, b, c,
       divided by a common factor.
     - `pair`: (2,) the frequencies of the mean precession and of twice the rotation, 1/s.
     - `t`: (T,) the times of the readings since the first, s.
-    - `squares`: (T,) the squared fluxes.
+    - `squared_flux`: (T,) the squared fluxes.
     - `weights`: (T,) one over the noise of the squared fluxes.
     """
     ratio = 0.5 * pair[1] / pair[0]
 
     def shape(one: tuple[Array, Array]) -> tuple[Array, ...]:
         body, form = one
-        omega, precession, exists = _rate_with_period_ratio(body, ratio, long_axis)
+        omega, precession, exists = _rate_with_period_ratio(body, ratio, is_long_axis_mode)
         omega = omega * (precession * pair[0])
         h = body * omega
         # The attitude q turns the angular momentum to the z axis of the world. The momentum is not
@@ -219,7 +228,7 @@ def _motions_on_grid_of_phases(
         def phase(part: Array) -> tuple[Array, ...]:
             since = part / pair[1]
 
-            def row(q: Array) -> Array:
+            def row_of_quadratic_form(q: Array) -> Array:
                 m = quaternion.to_matrix(q)
 
                 def entry(i: int, j: int) -> Any:
@@ -232,8 +241,8 @@ def _motions_on_grid_of_phases(
             # The first state is computed together with all other states. Computed alone, it would
             # need a second compilation.
             states: Any = jax.vmap(motion)(since + jnp.concatenate([jnp.zeros(1, t.dtype), t]))
-            rows = jax.vmap(row)(states.q[1:]).T * weights[None, :]
-            misfit, n = least_squares_remainder(rows, squares * weights)
+            rows = jax.vmap(row_of_quadratic_form)(states.q[1:]).T * weights[None, :]
+            misfit, n = least_squares_remainder(rows, squared_flux * weights)
             return jnp.where(exists, misfit, jnp.inf), n, states.q[0], states.omega[0]
 
         parts = jnp.arange(PHASES, dtype=t.dtype) / PHASES

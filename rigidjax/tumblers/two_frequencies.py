@@ -9,15 +9,16 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
+from rigidjax._types import Scalar
 from rigidjax.tumblers.lattice_series import (
     BATCH,
     FIRST,
     Sums,
-    lattice_chi2,
+    fourier_chi2_of_pairs,
+    fourier_sum_table,
     least_squares_remainder,
     pad_rows,
-    side_peaks,
-    sum_table,
+    side_peaks_of_window,
 )
 
 # A line is a peak of the spectrum. One of the LINES strongest lines must be a combination of the
@@ -117,14 +118,20 @@ def two_frequencies(
     if not (np.isfinite(t).all() and np.isfinite(y).all()):
         raise ValueError("two_frequencies: t or values contain NaN or infinity; leave gaps out")
     if not (np.diff(t) > 0).all():
-        raise ValueError("t: wanted increasing times")
+        raise ValueError(
+            "t: wanted increasing times, got some that are equal or decrease; sort the readings by "
+            "their times, and keep one for each time"
+        )
     sigma = np.ones(t.shape)
     if noise is not None:
         sigma = _checks.host_array(noise, "noise")
         if sigma.shape not in ((), t.shape):
             raise ValueError(f"noise: wanted one number or (T,) as t has, got shape {sigma.shape}")
         if not (np.isfinite(sigma) & (sigma > 0)).all():
-            raise ValueError("noise: wanted positive standard deviations")
+            raise ValueError(
+                "noise: wanted positive standard deviations, got one that is zero, negative or not "
+                "finite"
+            )
         sigma = np.broadcast_to(sigma, t.shape)
     with np.errstate(over="ignore"):
         worst = max(np.abs(y).max() / sigma.min(), 1 / sigma.min(), sigma.max())
@@ -136,14 +143,16 @@ def two_frequencies(
     span, typical = float(t[-1] - t[0]), float(np.median(np.diff(t)))
     least = 4.0 * typical if shortest is None else _checks.positive_float(shortest, "shortest")
     if span / least > MOST:
-        words = f"{least:.3g} s, and a light curve of {span:.3g} s"
-        raise ValueError(f"shortest: {words}: wanted at most {MOST:.0e} periods in it")
-    light = pad_light((t - t[0]) / span, y / sigma, 1.0 / sigma)
-    lines = strongest_lines(light, span / least, 2 * LINES)
+        raise ValueError(
+            f"shortest: a light curve of {span:.3g} s has {span / least:.3g} periods of "
+            f"{least:.3g} s, wanted at most {MOST:.0e} periods in it; give a longer period"
+        )
+    light = pad_light_curve((t - t[0]) / span, y / sigma, 1.0 / sigma)
+    lines = strongest_spectral_lines(light, span / least, 2 * LINES)
     highest = SECOND * float(lines[:LINES].max())
     # The table covers all combinations of multiples of the two frequencies of a pair, also after
     # the refinement has moved a pair beyond the highest frequency.
-    table = sum_table(light, 2 * (FIRST + order) * (highest + 1.0))
+    table = fourier_sum_table(light, 2 * (FIRST + order) * (highest + 1.0))
     pairs, misfits = _pairs_and_chi2_with_strong_line(table, lines, order)
     pairs, misfits = refine_pairs(
         table, pairs[distinct_pairs(pairs, misfits, count * TRIED)], order
@@ -157,7 +166,9 @@ def two_frequencies(
     return TwoFrequencies(pairs[keep] / span, misfits[keep] * scale, dof, scatter, lines / span)
 
 
-def pad_light(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array, Array]:
+def pad_light_curve(
+    x: np.ndarray, z: np.ndarray, w: np.ndarray
+) -> tuple[Float[Array, " padded"], Float[Array, " padded"], Float[Array, " padded"]]:
     """Return the three arrays (T,) of a light curve, padded with zeros to a multiple of `BLOCK`, so
     that few programs are compiled.
 
@@ -170,7 +181,9 @@ def pad_light(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array
     return tuple(jnp.asarray(np.pad(v, (0, more))) for v in (x, z, w))  # pyright: ignore
 
 
-def strongest_lines(light: tuple[Array, Array, Array], highest: float, count: int) -> np.ndarray:
+def strongest_spectral_lines(
+    light: tuple[Array, Array, Array], highest: float, count: int
+) -> np.ndarray:
     """Return the frequencies (`count`,), in 1/span, of the strongest lines of the spectrum of a
     light curve, the strongest first.
 
@@ -192,7 +205,9 @@ def strongest_lines(light: tuple[Array, Array, Array], highest: float, count: in
 
 
 @jax.jit
-def _best_sinusoid(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Array, Array]:
+def _best_sinusoid(
+    grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike
+) -> tuple[Scalar, Float[Array, " times"]]:
     """Return two things: the frequency of `grid` whose sinusoid plus a constant fits the readings
     of a light curve best; and the fitted sinusoid plus constant (T,) at the times of the readings.
 
@@ -204,15 +219,15 @@ def _best_sinusoid(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tup
     """
     x, z, w = jnp.asarray(x), jnp.asarray(z), jnp.asarray(w)
 
-    def rows(f: Array) -> Array:
+    def sinusoid_rows(f: Array) -> Array:
         angle = 2.0 * math.pi * f * x
         return jnp.stack([jnp.ones_like(x), jnp.cos(angle), jnp.sin(angle)])
 
     left, c = jax.lax.map(
-        lambda f: least_squares_remainder(rows(f) * w[None], z), grid, batch_size=BATCH
+        lambda f: least_squares_remainder(sinusoid_rows(f) * w[None], z), grid, batch_size=BATCH
     )
     best = jnp.argmin(left)
-    return grid[best], c[best] @ rows(grid[best])
+    return grid[best], c[best] @ sinusoid_rows(grid[best])
 
 
 def _pairs_and_chi2_with_strong_line(
@@ -239,7 +254,7 @@ def _pairs_and_chi2_with_strong_line(
                 rows.append(np.stack([grid, second], axis=1))
     pairs = np.concatenate(rows)
     pairs = pairs[(pairs[:, 1] > 0.5) & (pairs[:, 1] < SECOND * highest)]
-    return pairs, lattice_chi2(table, pairs, order)
+    return pairs, fourier_chi2_of_pairs(table, pairs, order)
 
 
 def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
@@ -272,20 +287,20 @@ def with_aliases(
     An alias is a pair that may fit the same readings (`aliases_of`). Aliases are sought in rounds
     until no alias is better than the best pair.
 
-    - `table`: the sums over the readings, as `sum_table` returns them.
+    - `table`: the sums over the readings, as `fourier_sum_table` returns them.
     - `pairs`: (P, 2) in 1/span.
     - `misfits`: (P,) χ² of the pairs.
     - `highest`: the highest frequency of an alias, 1/span.
     - `order`: the largest multiple of the second frequency.
     """
-    peaks = side_peaks(table, highest)
+    peaks = side_peaks_of_window(table, highest)
     for _ in range(ROUNDS):
         seeds = pairs[distinct_pairs(pairs, misfits, SEEDS)]
         more = (aliases_of(seeds, peaks)[:, None] + 0.2 * AROUND).reshape(-1, 2)
         more = more[((more > 0.5) & (more < highest)).all(axis=1)]
         if not len(more):
             break
-        best = distinct_pairs(more, lattice_chi2(table, more, order), 2 * SEEDS)
+        best = distinct_pairs(more, fourier_chi2_of_pairs(table, more, order), 2 * SEEDS)
         more, new = refine_pairs(table, more[best], order)
         before = misfits.min()
         pairs, misfits = np.concatenate([pairs, more]), np.concatenate([misfits, new])
@@ -317,7 +332,7 @@ def refine_pairs(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray
     Each pair moves to the best of its neighbours on a square grid. The grid becomes finer whenever
     no neighbour has a lower misfit.
 
-    - `table`: the sums over the readings, as `sum_table` returns them.
+    - `table`: the sums over the readings, as `fourier_sum_table` returns them.
     - `pairs`: (P, 2) the starts, 1/span.
     - `order`: the largest multiple of the second frequency.
     """
@@ -325,7 +340,9 @@ def refine_pairs(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray
     least = np.full(len(pairs), np.inf)
     for _ in range(9):
         neighbours = pairs[:, None] + size[:, None, None] * AROUND
-        misfits = lattice_chi2(table, neighbours.reshape(-1, 2), order).reshape(len(pairs), -1)
+        misfits = fourier_chi2_of_pairs(table, neighbours.reshape(-1, 2), order).reshape(
+            len(pairs), -1
+        )
         best, least = misfits.argmin(axis=1), misfits.min(axis=1)
         pairs = pairs + size[:, None] * AROUND[best]
         size = np.where(best == 4, 0.4 * size, size)

@@ -20,9 +20,9 @@ from rigidjax.identify.search.stages import (
     Task,
     fit_in_stages,
     least_squares_from,
-    polish,
+    search_whole_records,
     weights_of_beginning,
-    whole_record,
+    weights_of_whole_record,
 )
 
 TS = np.linspace(0.0, 1.0, 8)
@@ -58,7 +58,9 @@ def test_a_stride_that_is_lost_leaves_where_it_began_and_its_misfit(problem, mon
     monkeypatch.setattr(stages, "least_squares_from", lost)
     monkeypatch.setattr(stages, "cost_of", lambda *_: 7.0)
     seen = []
-    out = polish(Attempt(at(problem, 2.0)), Task(problem, (), 1e-4, 100), watch=seen.append)
+    out = search_whole_records(
+        Attempt(at(problem, 2.0)), Task(problem, (), 1e-4, 100), watch=seen.append
+    )
     assert place(out.x) == 2.0 and float(out.cost) == 7.0
     # No other stride follows.
     assert not bool(out.converged) and len(seen) == 1 and seen[0] is out
@@ -128,7 +130,7 @@ def searched(problem, weights, settings):
 
 def test_a_part_of_the_record_is_followed_no_further_than_that(pushed):
     of = pushed(9.0)
-    part, all_of_it = weights_of_beginning(of, 0.25), whole_record(of)
+    part, all_of_it = weights_of_beginning(of, 0.25), weights_of_whole_record(of)
     once = Settings(1e-4, 1.0, 0)
     # Beyond the part nothing is computed: what is not finite there does no harm.
     lost = pushed(1.5)
@@ -152,7 +154,7 @@ def test_a_part_of_the_record_is_followed_no_further_than_that(pushed):
 
 def test_a_search_may_end_near(pushed):
     of = pushed(9.0)
-    seen = whole_record(of)
+    seen = weights_of_whole_record(of)
     end = searched(of, seen, Settings(1e-4, 1.0, 60))
     least = float(end.cost)
     early = searched(of, seen, Settings(1e-4, 1.0, 60, near=1.5 * least))

@@ -25,12 +25,12 @@ from rigidjax.identify.answer.result import Fit, Start
 from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.model import Model, describe_delays_outside_windows
 from rigidjax.identify.model.terms import Noise
-from rigidjax.identify.search.noise import median_of_chi2
+from rigidjax.identify.search.noise import median_and_density_of_chi2
 from rigidjax.identify.search.stages import (
     Attempt,
+    count_of_errors_if_unit_noise,
     errors_and_slopes,
     has_unit_noise,
-    nominal_count,
 )
 from rigidjax.identify.uncertainty import considered, covariance as uncertainty, flat_limit
 from rigidjax.identify.uncertainty.covariance import CorrelationTimes, Linearisation, scatter
@@ -225,7 +225,7 @@ def _excess_by_median(squares: np.ndarray, size: int) -> float:
     if not squares.size:
         return 1.0
     middle = float(np.median(squares))
-    half, density = median_of_chi2(size)
+    half, density = median_and_density_of_chi2(size)
     # The standard deviation of the median of n samples is 1 / (2 f √n), with f the density at the
     # median.
     wide = 0.5 / (density * np.sqrt(squares.size))
@@ -396,7 +396,7 @@ def assess(
     # any more. The search has then ended if the minimum of the linearised problem is near.
     held = [limit.slope for limit in limits if limit.free < 0]
     near_end = AT_THE_END
-    if count := nominal_count(model):
+    if count := count_of_errors_if_unit_noise(model):
         near_end *= float(np.sqrt(2.0 * best_cost / count))
     done = bool(best.converged) or uncertainty.distance_to_minimum(linear, white, held) < near_end
     chi2, dof, explanation, left = goodness(model, noise, linear, times, white.determined)

@@ -21,9 +21,9 @@ from rigidjax.identify.model.charts import bodies_as_list, tensor_of
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, standardised_error_changes
 from rigidjax.identify.search.starts import (
-    balance_of_momentum,
     depends_on_rate_only,
-    tensor_and_margin,
+    inertia_components_and_feasibility_margin,
+    integrated_euler_equations,
 )
 from rigidjax.identify.sensors import AbstractSensor, Gyro
 from rigidjax.identify.uncertainty.considered import slope_in_time
@@ -124,9 +124,9 @@ def _euler_residual(
       a mirror of the axes, or another unit.
     - `sign`: the factor by which the torque is multiplied.
     """
-    balances = [balance_of_momentum(recording, torque, turn) for recording in recordings]
+    balances = [integrated_euler_equations(recording, torque, turn) for recording in recordings]
     matrix, side, momentum = (np.concatenate(part) for part in zip(*balances, strict=True))
-    components, margin = tensor_and_margin(matrix, sign * side)
+    components, margin = inertia_components_and_feasibility_margin(matrix, sign * side)
     left = np.linalg.norm(matrix @ components - sign * side)
     return float(left / np.linalg.norm(momentum @ components)), margin
 

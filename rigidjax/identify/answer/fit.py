@@ -35,7 +35,7 @@ from rigidjax.identify.search.stages import (
     cost_of,
     errors_and_slopes,
     fit_in_stages,
-    polish,
+    search_whole_records,
     sufficient_misfit,
 )
 from rigidjax.identify.search.starts import starting_points
@@ -173,7 +173,7 @@ def fit(
     rough.clear()
     while (finer := _converged_integrator(best, task, rough)) is not None:
         task = task._replace(model=_with_integrator(task.model, finer))
-        best, task = _estimate_noise_in_turn(polish(Attempt(best.x), task), task)
+        best, task = _estimate_noise_in_turn(search_whole_records(Attempt(best.x), task), task)
         best = _with_blocks(best, task.model)
     shown = model if task.model is padded else _with_original_readings(model, task.model)
     return assess(task.model, best, task.noise, attempts, lowest, shown, interrupts, rough)
@@ -251,7 +251,7 @@ def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
         pairs = zip(before, task.noise, strict=True)
         if turn > 1 and all(np.allclose(b, a, rtol=_SETTLED, atol=0.0) for a, b in pairs):
             break
-        best = polish(Attempt(best.x), task)
+        best = search_whole_records(Attempt(best.x), task)
     return best, task
 
 
@@ -441,7 +441,7 @@ def _estimate_widths_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
         widths = [jnp.asarray(width) for width in new]
         model = eqx.tree_at(lambda m: [m.slots[i].spread for i in indices], task.model, widths)
         task = task._replace(model=model)
-        best = polish(Attempt(best.x), task)
+        best = search_whole_records(Attempt(best.x), task)
         if (np.abs(new - before) < _SETTLED * before).all() or (new <= least).all():
             break
         before = new

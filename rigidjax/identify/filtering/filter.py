@@ -22,8 +22,8 @@ from rigidjax.identify.filtering.steps import (
     ExtendedState,
     ReadNumbers,
     Stops,
-    coloured_parts,
     dynamics_of,
+    time_correlated_torques,
 )
 from rigidjax.identify.model.model import Model, require_numbers, require_single_model
 from rigidjax.identify.model.scene import Process, Scene
@@ -56,18 +56,18 @@ class Belief(eqx.Module):
     root: Float[Array, "*times n n"]
 
     @property
-    def state(self) -> Any:
+    def state(self) -> Spin | Attitude | Rigid:
         """Return the estimated `Spin`, `Attitude` or `Rigid`."""
         return self.x.motion
 
     @property
     def torques(self) -> tuple[Float[Array, "*times 3"], ...]:
-        """Return the value of each `CorrelatedTorque`, N m, body frame."""
+        """Return the estimate (3,) of each `CorrelatedTorque`, N m, body frame."""
         return self.x.torques
 
     @property
     def walks(self) -> tuple[Array, ...]:
-        """Return the value of each `Walk`."""
+        """Return the estimate of each `Walk`, a number that drifts as a random walk."""
         return self.x.walks
 
     @property
@@ -119,7 +119,7 @@ def first_belief(
     >>> first_belief(model, rate=0.1).deviation.tolist()
     [0.1, 0.1, 0.1]
     """
-    scene, record = scene_at(model, x)
+    scene, record = scene_and_recording(model, x)
     start: Any = scene.start if state is None else state
     if state is None and x is None:
         _require_shown_attitude(record, start)
@@ -132,10 +132,10 @@ def first_belief(
     kind, wanted = type(start).__name__, [words[part] for part in leaf_names(start)]
     for name, value in deviations.items():
         if name not in wanted and value is not None:
-            raise ValueError(f"{name}: a {kind} has none; leave it out")
+            raise ValueError(f"{name}: a {kind} has no {name}; leave the argument out")
         if name in wanted and value is None:
             raise ValueError(
-                f"{name}: wanted the standard deviation of the initial one, got None; a {kind} "
+                f"{name}: wanted the standard deviation of the initial {name}, got None; a {kind} "
                 "needs " + ", ".join(wanted)
             )
     parts = [broadcast_to_shape(deviations[name], (3,), name) for name in wanted]
@@ -165,7 +165,7 @@ def belief_at(
       gyro. They begin at their values in the scene.
     """
     dtype = state.omega.dtype
-    coloured = coloured_parts(scene.process)
+    coloured = time_correlated_torques(scene.process)
     walks = tuple(value.astype(dtype) for value in drifting_values(scene, drifts))
     parts = [deviations, *(law.deviation for law in coloured)]
     parts += [drift.deviation.reshape(-1) for drift in drifts]
@@ -186,7 +186,10 @@ def _require_shown_attitude(recording: Recording, state: HasSpin | None) -> None
     reading shows it.
     """
     if not _checks.is_known(recording):
-        raise TypeError("state: wanted a state; a traced recording shows none")
+        raise TypeError(
+            "state: wanted the initial state, got None; the readings cannot show it, since they "
+            "are traced by JAX"
+        )
     if isinstance(state, HasAttitude) and not len(attitudes(recording)[1]):
         raise ValueError(
             "state: the readings alone show no initial attitude (an attitude sensor, two "
@@ -194,7 +197,7 @@ def _require_shown_attitude(recording: Recording, state: HasSpin | None) -> None
         )
 
 
-def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recording]:
+def scene_and_recording(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recording]:
     """Return the scene of the only recording of a `model`, and the recording (its times and
     readings).
 
@@ -219,13 +222,13 @@ def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recordi
                 "fit(model).x or model.start(body) makes them"
             )
         x = model.start()
-    scene = _scene_at(model, require_numbers(model, x))
+    scene = _scene_of_first_recording(model, require_numbers(model, x))
     steps.require_sensors(scene.sensors)
     return scene, stacking.pick_records(model.records, 0)
 
 
 @eqx.filter_jit
-def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
+def _scene_of_first_recording(model: Model, x: Float[Array, " n"]) -> Scene:
     """Return the scene of the first recording of a `model`, computed in one compiled program.
 
     A scene holds all on which readings depend: the body, the torques, the sensors and the initial
@@ -259,7 +262,7 @@ class Grid(NamedTuple):
     real: Bool[Array, " n"]
     rows: Int[Array, " t"]
 
-    def at_rows(self, values: PyTree[Array]) -> PyTree[Array]:
+    def at_recording_times(self, values: PyTree[Array]) -> PyTree[Array]:
         """Return the entries of `values` at the times of the recording.
 
         The arrays in `values` have a leading axis over all times of the grid.
@@ -269,7 +272,7 @@ class Grid(NamedTuple):
         return values if same else jax.tree.map(lambda leaf: leaf[self.rows], values)
 
 
-def grid_of(
+def grid_of_step_times(
     process: Process | None, recording: Recording, belief: Belief, substeps: int | None
 ) -> Grid:
     """Return the times at which the steps of a filter end, from the time of a `belief` to the last
@@ -296,7 +299,7 @@ def grid_of(
         )
         _checks.error_if(t, t[0] < t0, words)
     ends = xp.concatenate([t0[None], t])
-    counts = steps.steps_of(process, ends, belief.x.motion, substeps, recording)
+    counts = steps.step_counts_between(process, ends, belief.x.motion, substeps, recording)
     index = np.repeat(np.arange(counts.size), counts)
     rows = np.cumsum(counts) - 1
     part = (np.arange(index.size) - np.repeat(rows - counts, counts)) / counts[index]
@@ -360,13 +363,13 @@ class Filtered(eqx.Module):
         return self.belief.t
 
     @property
-    def states(self) -> Any:
+    def states(self) -> Spin | Attitude | Rigid:
         """Return the estimated states, with a leading time axis."""
         return self.belief.state
 
     @property
     def words(self) -> str:
-        """Return the status in words."""
+        """Return text that says whether the filter followed the readings, was lost, or stopped."""
         return WORDS[int(self.status)]
 
     @property
@@ -425,10 +428,10 @@ def filter(
     ((2, 3), (2, 3), 'followed')
     """
     run = _filter(checked_input(model, belief, x, substeps))
-    return raise_if_lost(run) if throw else run
+    return raise_if_filter_lost(run) if throw else run
 
 
-def raise_if_lost(run: Any) -> Any:
+def raise_if_filter_lost(run: Any) -> Any:
     """Return the result `run` of a filter, or raise an error if the filter was lost or stopped."""
     status = run.status
     at = f" (at {float(run.lost_at):g} s)" if _checks.is_known(run.lost_at) else ""
@@ -499,11 +502,12 @@ def step(
     >>> rj.identify.step(model, belief, 0.1, jnp.array([1.0, 0.0, 0.0])).t
     Array(0.1, dtype=float64)
     """
-    scene, _ = scene_at(model, x)
+    scene, _ = scene_and_recording(model, x)
     _checks.require_instance(belief, Belief, "belief", hint="identify.first_belief makes it")
     if belief.t.shape != ():
         raise ValueError(
-            f"belief: wanted one, got times of shape {belief.t.shape}; for many use jax.vmap"
+            f"belief: wanted one belief, got several, with times of shape {belief.t.shape}; use "
+            "jax.vmap for several"
         )
     when = _checks.checked_time(t).astype(belief.t.dtype)
     if _checks.is_known((when, belief.t)):
@@ -513,7 +517,9 @@ def step(
     for name, items in (("readings", readings), ("mask", flags)):
         if len(items) != len(scene.sensors):
             kinds = ", ".join(type(sensor).__name__ for sensor in scene.sensors)
-            raise ValueError(f"{name}: wanted one for each sensor ({kinds}), got {len(items)}")
+            raise ValueError(
+                f"{name}: wanted one entry for each sensor ({kinds}), got {len(items)}"
+            )
     values, masks = [], []
     for sensor, reading, flag in zip(scene.sensors, readings, flags, strict=True):
         name = type(sensor).__name__
@@ -552,8 +558,8 @@ def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) 
 def _predict_and_update(
     dynamics: Dynamics, belief: Belief, stop: Stops
 ) -> tuple[Belief, ReadNumbers]:
-    """Return two things: the estimate after one step of a filter; and its readings beside their
-    predictions.
+    """Return two things: the estimate after one step of a filter; and the readings of this step,
+    compared with their predictions.
 
     The step first predicts the state at the new time by the equations of motion. Then it corrects
     the state by the readings at this time.
@@ -574,14 +580,14 @@ def _predict_and_update(
     # Subtract times before they are rounded to the dtype of the state: after a thousand seconds the
     # seven digits of float32 are too few.
     since = (stop.t - belief.t).astype(dtype)
-    x, grown, noise = dynamics.predict(belief.t.astype(dtype), since, belief.x)
-    root = roots.predicted_root(grown, belief.root, noise)
+    x, grown, noise = dynamics.predict_and_linearise(belief.t.astype(dtype), since, belief.x)
+    root = roots.predicted_covariance_root(grown, belief.root, noise)
     matrix, error, deviation, mask = steps.linearise_readings(dynamics, stop, x)
     e = jnp.zeros_like(root[0])
-    e, root, innovation, variance = roots.update(e, root, matrix, error, deviation**2, mask)
-    return Belief(stop.t, plus(x, e), steps.moved_root(x, e, root)), ReadNumbers(
-        innovation, variance, mask
-    )
+    e, root, innovation, variance = roots.kalman_update(e, root, matrix, error, deviation**2, mask)
+    return Belief(
+        stop.t, plus(x, e), steps.covariance_root_about_neighbour(x, e, root)
+    ), ReadNumbers(innovation, variance, mask)
 
 
 def scan_filter(
@@ -605,13 +611,13 @@ def scan_filter(
     masks = tuple(r.mask[grid.source] & grid.real for r in recording.readings)
     stops = Stops(grid.t, values, masks)
 
-    def body(belief: Belief, stop: Stops) -> tuple[Belief, Any]:
+    def filter_step(belief: Belief, stop: Stops) -> tuple[Belief, Any]:
         belief, read = _predict_and_update(dynamics, belief, stop)
         return belief, keep(belief, read)
 
     # Let a reverse pass compute each step again: storing one step would take some thousand numbers.
-    body = jax.checkpoint(body)  # pyright: ignore[reportPrivateImportUsage]
-    return dynamics, stops, lax.scan(body, first, stops)[1]
+    filter_step = jax.checkpoint(filter_step)  # pyright: ignore[reportPrivateImportUsage]
+    return dynamics, stops, lax.scan(filter_step, first, stops)[1]
 
 
 @eqx.filter_jit
@@ -623,10 +629,10 @@ def _filter(run: FilterInput) -> Filtered:
     the estimate before the first reading; and the times at which the steps end.
     """
     both = scan_filter(run, lambda belief, read: (belief, read))[2]
-    beliefs, read = run.grid.at_rows(both)
+    beliefs, read = run.grid.at_recording_times(both)
     reads = steps.split_by_sensor(run.scene.sensors, read)
-    total = roots.innovation_terms(*read).log_density
-    return Filtered(beliefs, reads, total, *status_of(beliefs, reads, run.first.t))
+    total = roots.log_density_terms(*read).total_log_density
+    return Filtered(beliefs, reads, total, *status_and_loss_time(beliefs, reads, run.first.t))
 
 
 @eqx.filter_jit
@@ -638,10 +644,12 @@ def _log_likelihood(run: FilterInput) -> Scalar:
     and initial state; the numbers that drift as random walks, such as the bias of a gyro; the
     readings; the estimate before the first reading; and the times at which the steps end.
     """
-    return roots.innovation_terms(*scan_filter(run, lambda _, read: read)[2]).log_density
+    return roots.log_density_terms(*scan_filter(run, lambda _, read: read)[2]).total_log_density
 
 
-def status_of(beliefs: Belief, reads: tuple[ReadNumbers, ...], t0: Array) -> tuple[Array, Array]:
+def status_and_loss_time(
+    beliefs: Belief, reads: tuple[ReadNumbers, ...], t0: Array
+) -> tuple[Int[Array, ""], Scalar]:
     """Return two things: whether a filter followed the readings; and the time, s, at which it was
     lost.
 
@@ -682,13 +690,13 @@ def checked_input(
 
     **Arguments:** `model`, `belief`, `x` and `substeps` are as for `filter`. **Raises:**
     `TypeError` for a `belief` without the parts of the state that a sensor reads, such as an
-    attitude; and the errors of `scene_at` and `grid_of`.
+    attitude; and the errors of `scene_and_recording` and `grid_of_step_times`.
     """
-    scene, recording = scene_at(model, x)
-    _checks.require_instance(belief, Belief, "first", hint="identify.first_belief makes it")
+    scene, recording = scene_and_recording(model, x)
+    _checks.require_instance(belief, Belief, "belief", hint="identify.first_belief makes it")
     for sensor in scene.sensors:
         if not isinstance(belief.x.motion, sensor.feels):
             kind, got = sensor.feels.__name__, type(belief.x.motion).__name__
-            raise TypeError(f"first: a sensor needs a state with {kind}, got a {got}")
-    grid = grid_of(scene.process, recording, belief, substeps)
+            raise TypeError(f"belief: a sensor needs a state with {kind}, got a {got}")
+    grid = grid_of_step_times(scene.process, recording, belief, substeps)
     return FilterInput(scene, model.walks, recording, belief, grid)

@@ -138,7 +138,7 @@ class LinearEstimate(eqx.Module):
 # time to time. The arrays in _STEPS belong to the steps, all other arrays to the times.
 _STEPS = {"transition": 2, "noise": 2, "push": 1}
 _AXES = _STEPS | {"matrix": 2, "deviation": 1, "offset": 1}
-Parts = dict[str, Any]
+ArraysByField = dict[str, Any]
 
 
 Readings = Float[ArrayLike, "times k"] | Numbers
@@ -196,7 +196,7 @@ def linear_smooth(
 
 def _checked_arguments(
     model: LinearModel, readings: Readings, mean: Mean, root: Root, mask: Mask
-) -> tuple[Parts, Array, Array, Array, Array]:
+) -> tuple[ArraysByField, Array, Array, Array, Array]:
     """Return the arguments of `linear_filter` (a Kalman filter) or `linear_smooth` as checked
     arrays.
 
@@ -226,19 +226,21 @@ def _checked_arguments(
         mask = jnp.ones(readings.shape, bool)
     mask = jnp.asarray(mask)
     if mask.dtype != bool or mask.shape != readings.shape:
-        raise ValueError(f"mask: wanted truth values {readings.shape}, got {mask.shape}")
+        raise ValueError(
+            f"mask: wanted truth values of shape {readings.shape}, got {mask.dtype} of {mask.shape}"
+        )
     bad = mask & ~jnp.isfinite(readings)
     words = "readings: contains NaN or infinity; mask it if it is a gap"
     readings = jnp.where(mask, _checks.error_if(readings, bad.any(), words), 0)
     parts = {name: getattr(model, name) for name in _AXES}
-    for name, part in _time_varying_arrays(parts).items():
+    for name, part in _drop_constant_arrays(parts).items():
         wanted = times - 1 if name in _STEPS else times
         if part.shape[0] != wanted:
             raise ValueError(f"{name}: wanted {wanted} rows for {times} times, got {part.shape[0]}")
     return parts, readings, mean, root, mask
 
 
-def _time_varying_arrays(parts: Parts) -> Parts:
+def _drop_constant_arrays(parts: ArraysByField) -> ArraysByField:
     """Return the arrays of a linear model that change from step to step or from time to time.
 
     Such an array has one more axis, its first, than a constant one. The argument `parts` and the
@@ -250,7 +252,7 @@ def _time_varying_arrays(parts: Parts) -> Parts:
 
 @partial(jax.jit, static_argnames="smooth")
 def linear_estimate(
-    parts: Parts, readings: Array, mean: Array, root: Array, mask: Array, *, smooth: bool
+    parts: ArraysByField, readings: Array, mean: Array, root: Array, mask: Array, *, smooth: bool
 ) -> LinearEstimate:
     """Return the states of a linear model at T times, estimated by the Kalman filter or the
     smoother.
@@ -265,46 +267,61 @@ def linear_estimate(
     - `smooth`: whether each state is estimated from all readings (the smoother of Rauch, Tung and
       Striebel), and not only from the readings up to its time.
     """
-    steps = {name: part for name, part in _time_varying_arrays(parts).items() if name in _STEPS}
-    times = {name: part for name, part in _time_varying_arrays(parts).items() if name not in _STEPS}
+    steps = {name: part for name, part in _drop_constant_arrays(parts).items() if name in _STEPS}
+    times = {
+        name: part for name, part in _drop_constant_arrays(parts).items() if name not in _STEPS
+    }
 
-    def read(row: tuple, mean: Array, root: Array) -> roots.Update:
+    def update_by_readings(row: tuple, mean: Array, root: Array) -> roots.Update:
         times, y, mask = row
         at_time: dict[str, Any] = parts | times
         error = y if at_time["offset"] is None else y - at_time["offset"]
-        return roots.update(mean, root, at_time["matrix"], error, at_time["deviation"] ** 2, mask)
+        return roots.kalman_update(
+            mean, root, at_time["matrix"], error, at_time["deviation"] ** 2, mask
+        )
 
-    def advance(carry: tuple[Array, Array], row_of_step: tuple[Parts, tuple]) -> tuple[Any, Any]:
+    def advance_to_next_time(
+        carry: tuple[Array, Array], row_of_step: tuple[ArraysByField, tuple]
+    ) -> tuple[Any, Any]:
         (mean, root), (steps, row) = carry, row_of_step
         of_step: dict[str, Any] = parts | steps
         transition, noise, push = (of_step[name] for name in ("transition", "noise", "push"))
         predicted = jnp.sum(transition * mean[None], 1)
         if push is not None:
             predicted = predicted + push
-        joint = joint_roots(transition, noise, root) if smooth else None
-        before = roots.predicted_root(transition, root, noise) if joint is None else joint.predicted
-        update = read(row, predicted, before)
+        joint = smoother_gain_and_roots(transition, noise, root) if smooth else None
+        before = (
+            roots.predicted_covariance_root(transition, root, noise)
+            if joint is None
+            else joint.predicted
+        )
+        update = update_by_readings(row, predicted, before)
         return (update.step, update.root), (update, predicted, joint)
 
     rows = times, readings, mask
     first_row, later_rows = (
         jax.tree.map(lambda leaf, at=at: leaf[at], rows) for at in (0, slice(1, None))
     )
-    first = read(first_row, mean, root)
-    _, (rest, predicted, joint) = lax.scan(advance, (first.step, first.root), (steps, later_rows))
+    first = update_by_readings(first_row, mean, root)
+    _, (rest, predicted, joint) = lax.scan(
+        advance_to_next_time, (first.step, first.root), (steps, later_rows)
+    )
     updates = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
     means, all_roots, innovation, variance = updates
-    total, kicks = roots.innovation_terms(innovation, variance, mask).log_density, (None, None)
+    total, kicks = (
+        roots.log_density_terms(innovation, variance, mask).total_log_density,
+        (None, None),
+    )
     if smooth:
         end, noise = (means[-1], all_roots[-1]), parts["noise"]
-        means, all_roots, *kicks = backward_pass(joint, means[:-1], predicted, noise, end)
+        means, all_roots, *kicks = smoother_backward_pass(joint, means[:-1], predicted, noise, end)
     return LinearEstimate(means, all_roots, innovation, variance, total, *kicks)
 
 
-class Joint(NamedTuple):
+class SmootherMatrices(NamedTuple):
     """Hold the matrices of one forward step that the backward pass of a smoother needs.
 
-    `joint_roots` makes a `Joint`.
+    `smoother_gain_and_roots` computes them.
 
     **Fields:**
 
@@ -320,11 +337,14 @@ class Joint(NamedTuple):
     rest: Float[Array, "n n"]
 
 
-def joint_roots(transition: Array, noise: Array, root: Array) -> Joint:
-    """Return the `Joint` of a step from the triangular root of `[[F S, G], [S, 0]]`.
+def smoother_gain_and_roots(transition: Array, noise: Array, root: Array) -> SmootherMatrices:
+    """Return the gain of a smoother and two roots of covariances for one step.
 
-    F (n, n) is the `transition`, G (n, m) the `noise`, and S (n, n) the `root` of the covariance
-    before the step (Park and Kailath 1995, doi:10.1080/00207179508921582).
+    The three matrices come from the triangular root of the matrix `[[F S, G], [S, 0]]` (Park and
+    Kailath 1995, doi:10.1080/00207179508921582).
+
+    **Arguments:** `transition` F (n, n); `noise` G (n, m); `root` S (n, n), a root of the
+    covariance of the state before the step. **Returns** the `SmootherMatrices`.
     """
     n, m = noise.shape
     upper = jnp.concatenate([roots.matrix_product(transition, root), noise], 1)
@@ -332,12 +352,19 @@ def joint_roots(transition: Array, noise: Array, root: Array) -> Joint:
     # A triangular root of 2n rows needs as many columns.
     whole = roots.triangular_root(jnp.pad(whole, ((0, 0), (0, max(0, n - m)))))
     predicted, cross = whole[:n, :n], whole[n:, :n]
-    return Joint(predicted, roots.divide_right(cross, predicted), whole[n:, n:])
+    return SmootherMatrices(
+        predicted, roots.right_divide_by_triangular(cross, predicted), whole[n:, n:]
+    )
 
 
-def backward_pass(
-    joint: Joint, mean: Array, predicted: Array, noise: Array, last: tuple[Array, Array]
-) -> tuple[Array, Array, Array, Array]:
+def smoother_backward_pass(
+    joint: SmootherMatrices, mean: Array, predicted: Array, noise: Array, last: tuple[Array, Array]
+) -> tuple[
+    Float[Array, "times n"],
+    Float[Array, "times n n"],
+    Float[Array, "steps m"],
+    Float[Array, "steps m m"],
+]:
     """Return the smoothed states and the noise of each step, by a pass back over all steps.
 
     Four things are returned: the smoothed means (T, n); roots (T, n, n) of the smoothed
@@ -350,7 +377,7 @@ def backward_pass(
 
     **Arguments:**
 
-    - `joint`: the results of `joint_roots` for all steps, stacked.
+    - `joint`: the results of `smoother_gain_and_roots` for all steps, stacked.
     - `mean`: (T − 1, n) the filtered mean before each step.
     - `predicted`: (T − 1, n) the predicted mean after each step.
     - `noise`: G (n, m) for all steps, or (T − 1, n, m) with one G for each step.
@@ -361,7 +388,9 @@ def backward_pass(
         noise: Array, predicted_root: Array, error: Array, root: Array
     ) -> tuple[Array, Array]:
         m = noise.shape[1]
-        both = roots.divide(predicted_root, jnp.concatenate([noise, error[:, None], root], 1))
+        both = roots.left_divide_by_triangular(
+            predicted_root, jnp.concatenate([noise, error[:, None], root], 1)
+        )
         whitened, mean, scaled_root = both[:, :m], both[:, m], both[:, m + 1 :]
         mean = jnp.sum(whitened * mean[:, None], 0)
         left = jnp.eye(m, dtype=noise.dtype) - roots.matrix_product(whitened.T, whitened)
@@ -375,7 +404,7 @@ def backward_pass(
             noise if own_noise is None else own_noise, joint.predicted, off, root
         )
         mean = mean + jnp.sum(joint.gain * off[None], 1)
-        out = mean, roots.predicted_root(joint.gain, root, joint.rest)
+        out = mean, roots.predicted_covariance_root(joint.gain, root, joint.rest)
         return out, (*out, *kicks)
 
     own_noise = noise if noise.ndim > 2 else None

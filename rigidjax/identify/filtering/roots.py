@@ -28,14 +28,14 @@ def triangular_root(rows: Float[Array, "n m"]) -> Float[Array, "n n"]:
 
     def gram_schmidt_step(rows: Array, k: Array) -> tuple[Array, Array]:
         row = lax.dynamic_index_in_dim(rows, k, keepdims=False)
-        unit = row * inverse_root(jnp.sum(row * row), least[k])
+        unit = row * inverse_sqrt_or_zero(jnp.sum(row * row), least[k])
         column = jnp.where(below >= k, jnp.sum(rows * unit[None], 1), 0)
         return rows - column[:, None] * unit[None], column
 
     return lax.scan(gram_schmidt_step, rows, below)[1].T
 
 
-def predicted_root(
+def predicted_covariance_root(
     transition: Float[Array, "k n"], root: Float[Array, "n n"], noise: Float[Array, "k m"]
 ) -> Float[Array, "k k"]:
     """Return a triangular root (k, k) of the predicted covariance, `F P Fᵀ + G Gᵀ`.
@@ -47,7 +47,7 @@ def predicted_root(
     return triangular_root(jnp.concatenate([matrix_product(transition, root), noise], 1))
 
 
-def inverse_root(x: Array, threshold: ScalarLike = 0.0) -> Array:
+def inverse_sqrt_or_zero(x: Array, threshold: ScalarLike = 0.0) -> Array:
     """Return 1/√x where x is above `threshold`, and zero with zero derivatives elsewhere."""
     there = x > threshold
     return jnp.where(there, 1 / jnp.sqrt(jnp.where(there, x, 1)), 0)
@@ -78,7 +78,7 @@ class Update(NamedTuple):
     variance: Float[Array, "*k"]
 
 
-def update(
+def kalman_update(
     step: Float[Array, " n"],
     root: Float[Array, "n n"],
     matrix: Float[Array, "k n"],
@@ -119,7 +119,7 @@ def update(
     return Update(step, root, innovation, total)
 
 
-class Terms(NamedTuple):
+class LogDensityTerms(NamedTuple):
     """Hold the terms of a log-density in which each number read is normal, given the numbers read
     before it.
 
@@ -131,25 +131,27 @@ class Terms(NamedTuple):
     log_variance: Float[Array, "*n"]
 
     @property
-    def log_density(self) -> Scalar:
-        """Return the sum of the logarithms of the normal densities."""
+    def total_log_density(self) -> Scalar:
+        """Return the sum of the logarithms of the normal densities of all numbers read."""
         return -0.5 * jnp.sum(self.error**2 + self.log_variance)
 
 
-def innovation_terms(innovation: Array, variance: Array, mask: Array) -> Terms:
+def log_density_terms(innovation: Array, variance: Array, mask: Array) -> LogDensityTerms:
     """Return the terms of the log-density of readings, from their innovations (reading minus
     prediction).
 
     **Arguments:** `innovation` the innovations, `variance` their variances, and `mask` true for the
-    numbers read, three arrays of one shape. **Returns** the `Terms`, arrays of this shape too: each
-    innovation over its standard deviation, and the logarithm of 2π times its variance. Both are
-    zero where `mask` is false.
+    numbers read, three arrays of one shape. **Returns** the `LogDensityTerms`, arrays of this shape
+    too: each innovation over its standard deviation, and the logarithm of 2π times its variance.
+    Both are zero where `mask` is false.
     """
     error = jnp.where(mask, innovation * lax.rsqrt(variance), 0)
-    return Terms(error, jnp.where(mask, jnp.log(2 * math.pi * variance), 0))
+    return LogDensityTerms(error, jnp.where(mask, jnp.log(2 * math.pi * variance), 0))
 
 
-def divide(lower: Float[Array, "n n"], rhs: Float[Array, "n m"]) -> Float[Array, "n m"]:
+def left_divide_by_triangular(
+    lower: Float[Array, "n n"], rhs: Float[Array, "n m"]
+) -> Float[Array, "n m"]:
     """Return `lower⁻¹ rhs` by forward substitution, where `lower` is a lower triangular matrix.
 
     Where a diagonal entry of `lower` is zero, the row of the result is zero.
@@ -164,10 +166,12 @@ def divide(lower: Float[Array, "n n"], rhs: Float[Array, "n m"]) -> Float[Array,
     return lax.scan(forward_substitution_step, rhs, jnp.arange(lower.shape[0]))[1]
 
 
-def divide_right(numerator: Float[Array, "m n"], lower: Float[Array, "n n"]) -> Float[Array, "m n"]:
+def right_divide_by_triangular(
+    numerator: Float[Array, "m n"], lower: Float[Array, "n n"]
+) -> Float[Array, "m n"]:
     """Return `numerator lower⁻¹`, where `lower` is a lower triangular matrix.
 
     Where a diagonal entry of `lower` is zero, the column of the result is zero.
     """
-    turned = divide(lower[::-1, ::-1].T, numerator[:, ::-1].T)
+    turned = left_divide_by_triangular(lower[::-1, ::-1].T, numerator[:, ::-1].T)
     return turned.T[:, ::-1]

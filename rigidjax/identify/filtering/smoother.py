@@ -1,6 +1,6 @@
 """Find the most probable motion, given all readings, by an iterated smoother."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,13 +16,14 @@ from rigidjax.identify.filtering.filter import (
     Belief,
     FilterInput,
     checked_input,
-    raise_if_lost,
+    raise_if_filter_lost,
     scan_filter,
-    status_of,
+    status_and_loss_time,
 )
 from rigidjax.identify.filtering.linear import LinearEstimate, linear_estimate
 from rigidjax.identify.filtering.steps import Dynamics, ExtendedState, ReadNumbers, Stops
 from rigidjax.identify.model.model import Model
+from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import minus, plus
 
 
@@ -69,7 +70,7 @@ class Smoothed(eqx.Module):
 
     @property
     def words(self) -> str:
-        """Return the status in words."""
+        """Return text that says whether the filter followed the readings, was lost, or stopped."""
         return WORDS[int(self.status)]
 
     @property
@@ -78,7 +79,7 @@ class Smoothed(eqx.Module):
         return self.belief.t
 
     @property
-    def states(self) -> Any:
+    def states(self) -> Spin | Attitude | Rigid:
         """Return the most probable states at the recorded times, with a leading time axis."""
         return jax.tree.map(lambda leaf: leaf[self.rows], self.belief.state)
 
@@ -129,7 +130,7 @@ def smooth(
         "more iterations, a better initial state, or a model that the readings fit; throw=False "
         "returns it"
     )
-    return _checks.error_if(raise_if_lost(run), run.change > 1, words)
+    return _checks.error_if(raise_if_filter_lost(run), run.change > 1, words)
 
 
 @eqx.filter_jit
@@ -148,8 +149,8 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
     """
     sensors, first, grid = run.scene.sensors, run.first, run.grid
     dynamics, stops, kept = scan_filter(run, lambda belief, read: (belief, read))
-    beliefs, read = grid.at_rows(kept)
-    status, lost_at = status_of(beliefs, steps.split_by_sensor(sensors, read), first.t)
+    beliefs, read = grid.at_recording_times(kept)
+    status, lost_at = status_and_loss_time(beliefs, steps.split_by_sensor(sensors, read), first.t)
     path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, kept[0].x)
 
     def is_running(state: tuple) -> Array:
@@ -157,15 +158,17 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
 
     def iterate(state: tuple) -> tuple:
         path, estimate, _, count = state
-        out = _iterate(dynamics, first, stops, path, estimate.kicks[:, : dynamics.kicks])
+        out = _gauss_newton_iteration(
+            dynamics, first, stops, path, estimate.kicks[:, : dynamics.noise_dimension]
+        )
         return *out, count + 1
 
-    still = jnp.zeros((stops.t.shape[0], dynamics.kicks), first.root.dtype)
+    still = jnp.zeros((stops.t.shape[0], dynamics.noise_dimension), first.root.dtype)
     # Start the loop from an estimate of zeros: a first iteration before the loop would compile the
     # iteration a second time.
     blank = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-        jax.eval_shape(lambda: _iterate(dynamics, first, stops, path, still)[1]),
+        jax.eval_shape(lambda: _gauss_newton_iteration(dynamics, first, stops, path, still)[1]),
     )
     far = jnp.asarray(jnp.inf, first.root.dtype)
     path, estimate, change, count = lax.while_loop(
@@ -175,7 +178,7 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
     pushes = []
     for index, root in enumerate(dynamics.white):
         mine = slice(6 * index, 6 * index + 3)
-        size = roots.inverse_root(h)[:, None] * root[None]
+        size = roots.inverse_sqrt_or_zero(h)[:, None] * root[None]
         variance = jnp.diagonal(estimate.kick_covariance, axis1=1, axis2=2)[:, mine]
         pushes.append(Push(size * estimate.kicks[:, mine], size * jnp.sqrt(variance)))
     belief = Belief(stops.t, jax.tree.map(lambda leaf: leaf[1:], path), estimate.root[1:])
@@ -186,7 +189,7 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
     return Smoothed(belief, grid.rows, tuple(pushes), reads, total, change, count, status, lost_at)
 
 
-def _iterate(
+def _gauss_newton_iteration(
     dynamics: Dynamics, belief: Belief, stops: Stops, path: ExtendedState, kicks: Array
 ) -> tuple[ExtendedState, LinearEstimate, Scalar]:
     """Return the most probable motion of the problem linearised about a `path`: one Gauss–Newton
@@ -210,7 +213,9 @@ def _iterate(
     """
     dtype = belief.root.dtype
 
-    def linearise(row: tuple) -> tuple:
+    def linearise_step_and_readings(
+        row: tuple[Array, Stops, ExtendedState, ExtendedState, Array],
+    ) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array, Array]]:
         """Return two things: one step of the motion, linearised; and the readings at its end,
         linearised.
 
@@ -225,26 +230,34 @@ def _iterate(
         true for a component that was read and is below full scale.
         """
         t0, stop, x, y, kick = row
-        after, grown, noise = dynamics.predict(
+        after, grown, noise = dynamics.predict_and_linearise(
             t0.astype(dtype), (stop.t - t0).astype(dtype), x, kick
         )
         off = minus(after, y)
-        grown, noise = (steps.moved_root(y, off, part, inverse=True) for part in (grown, noise))
-        push = off - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
+        grown, noise = (
+            steps.covariance_root_about_neighbour(y, off, part, inverse=True)
+            for part in (grown, noise)
+        )
+        push = off - jnp.sum(noise[:, : dynamics.noise_dimension] * kick[None], 1)
         return (grown, noise, push), steps.linearise_readings(dynamics, stop, y)
 
     before = jnp.concatenate([belief.t[None], stops.t[:-1]])
     x0, earlier, later = (
         jax.tree.map(lambda leaf, at=at: leaf[at], path) for at in (0, slice(-1), slice(1, None))
     )
-    moves, rows = lax.map(linearise, (before, stops, earlier, later, kicks))
+    moves, rows = lax.map(linearise_step_and_readings, (before, stops, earlier, later, kicks))
     # The first time is that of the first belief, at which nothing is read.
     matrix, error, deviation, mask = (jnp.pad(a, [(1, 0)] + [(0, 0)] * (a.ndim - 1)) for a in rows)
     parts = dict(zip(("transition", "noise", "push"), moves, strict=True))
     parts |= {"matrix": matrix, "deviation": deviation, "offset": None}
     off = minus(x0, belief.x)
     out = linear_estimate(
-        parts, error, -off, steps.moved_root(x0, off, belief.root), mask, smooth=True
+        parts,
+        error,
+        -off,
+        steps.covariance_root_about_neighbour(x0, off, belief.root),
+        mask,
+        smooth=True,
     )
-    change = jnp.max(jnp.abs(out.mean) * roots.inverse_root(jnp.sum(out.root**2, -1)))
+    change = jnp.max(jnp.abs(out.mean) * roots.inverse_sqrt_or_zero(jnp.sum(out.root**2, -1)))
     return jax.vmap(plus)(path, out.mean), out, change

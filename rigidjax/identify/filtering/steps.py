@@ -73,18 +73,18 @@ def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
         name = type(sensor).__name__
         if sensor.noise is None:
             raise ValueError(
-                f"{name}: wanted its noise, a filter weighs each reading by it; give "
-                f"{name}(noise=…), such as identify.fit estimates it"
+                f"{name}: wanted its noise, by which a filter weighs each reading, got None; give "
+                f"{name}(noise=…), such as the noise that identify.fit estimates"
             )
         if getattr(sensor, "lowpass", None) is not None:
             raise ValueError(
                 f"{name}: a lowpass has states of its own, which the filter does not estimate; "
-                "leave it out, and give its lag as offset"
+                "leave the lowpass out, and give its lag as offset"
             )
         if getattr(sensor, "jitter", None) is not None:
             raise ValueError(
-                f"{name}: jitter makes errors that depend on each other, which the filter takes as "
-                "independent; leave it out, and give more noise"
+                f"{name}: jitter makes the errors of a reading depend on each other, but the "
+                "filter takes them as independent; leave the jitter out, and give more noise"
             )
 
 
@@ -113,28 +113,30 @@ class Dynamics(eqx.Module):
     drifts: tuple[Array, ...]
     paths: tuple[tuple[Any, ...], ...] = eqx.field(static=True)
 
-    def sensors_at(self, walks: Sequence[Array]) -> tuple[AbstractSensor, ...]:
+    def sensors_with_walks(self, walks: Sequence[Array]) -> tuple[AbstractSensor, ...]:
         """Return the sensors of the scene with `walks` as the values of their drifting numbers."""
         return with_leaves(self.scene, self.paths, walks).sensors
 
     @property
-    def kicks(self) -> int:
+    def noise_dimension(self) -> int:
         """Return the number of unit normal numbers that make the noise of one step of motion and
         torques.
         """
         return 6 * (len(self.white) + len(self.coloured))
 
-    def with_torques(self, change: PyTree, torques: Sequence[Array]) -> PyTree:
+    def rate_with_torques(self, rate_of_change: PyTree, torques: Sequence[Array]) -> PyTree:
         """Return the rate of change of a motion under additional `torques` (3,), body frame.
 
-        `change` is the rate of change without the additional torques.
+        `rate_of_change` is that of the motion without the additional torques.
         """
         if not torques:
-            return change
-        spin = change.omega + jnp.sum(self.inverse * sum(torques[1:], torques[0])[None], 1)
-        return eqx.tree_at(lambda s: s.omega, change, spin)
+            return rate_of_change
+        spin = rate_of_change.omega + jnp.sum(self.inverse * sum(torques[1:], torques[0])[None], 1)
+        return eqx.tree_at(lambda s: s.omega, rate_of_change, spin)
 
-    def advance(self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array) -> ExtendedState:
+    def advance_under_noise(
+        self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array
+    ) -> ExtendedState:
         """Return the state at the time t + h, s, for the state x at the time t, with a random
         torque between.
 
@@ -146,12 +148,12 @@ class Dynamics(eqx.Module):
         doi:10.1137/19M1261912).
         """
         safe = jnp.where(h > 0, h, 1)
-        pairs = kicks.reshape(-1, 2, 3) * roots.inverse_root(h)
+        pairs = kicks.reshape(-1, 2, 3) * roots.inverse_sqrt_or_zero(h)
 
         def noise_at(pair: Array, share: Scalar) -> Array:
             return pair[0] + 3.0**0.5 * share * pair[1]
 
-        def rate(elapsed: Scalar, state: tuple[Any, tuple]) -> tuple[Any, tuple]:
+        def rate_of_state(elapsed: Scalar, state: tuple[Any, tuple]) -> tuple[Any, tuple]:
             motion, torques = state
             share = 1.0 - 2.0 * elapsed / safe
             white = [r * noise_at(pair, share) for r, pair in zip(self.white, pairs, strict=False)]
@@ -160,16 +162,16 @@ class Dynamics(eqx.Module):
                 (r * noise_at(pair, share) - tau) / time for (r, time), pair, tau in later
             )
             change = self.field(t + elapsed, motion, None)
-            return self.with_torques(change, [*white, *torques]), slopes
+            return self.rate_with_torques(change, [*white, *torques]), slopes
 
         motion, torques = state_after_step(
-            KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques)
+            KUTTA4, rate_of_state, jnp.zeros_like(h), h, (x.motion, x.torques)
         )
         if isinstance(motion, HasAttitude):
             motion = eqx.tree_at(lambda s: s.q, motion, to_unit_length(motion.q))
         return ExtendedState(motion, torques, x.walks)
 
-    def predict(
+    def predict_and_linearise(
         self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array | None = None
     ) -> tuple[ExtendedState, Float[Array, "n n"], Float[Array, "n m"]]:
         """Return the state at the time t + h, s, for the state x at the time t, and two matrices of
@@ -180,18 +182,20 @@ class Dynamics(eqx.Module):
         walks, which are numbers that drift randomly. F and G are the derivatives at the noise
         `kicks` (unit normal numbers, six for each random torque), which is zero for `None`.
         """
-        kicks = jnp.zeros(self.kicks, x.motion.omega.dtype) if kicks is None else kicks
-        after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
+        kicks = jnp.zeros(self.noise_dimension, x.motion.omega.dtype) if kicks is None else kicks
+        after, push = jax.linearize(lambda y, k: self.advance_under_noise(t, h, y, k), x, kicks)
         moving = ExtendedState(x.motion, x.torques, ())
         size, drifting = dimension(moving), dimension(x) - dimension(moving)
         still = tuple(jnp.zeros_like(w) for w in x.walks)
 
-        def column(unit: Array) -> Array:
+        def jacobian_column(unit: Array) -> Array:
             along = vector_to_tangent(moving, unit[:size])
             moved = push(ExtendedState(along.motion, along.torques, still), unit[size:])
             return tangent_to_vector(after, moved)[:size]
 
-        both = jax.vmap(column, out_axes=1)(jnp.eye(size + self.kicks, dtype=kicks.dtype))
+        both = jax.vmap(jacobian_column, out_axes=1)(
+            jnp.eye(size + self.noise_dimension, dtype=kicks.dtype)
+        )
         grown, noise = both[:, :size], both[:, size:]
         if not drifting:
             return after, grown, noise
@@ -218,22 +222,22 @@ def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: ExtendedState) -> Dyna
         eqx.tree_at(lambda s: s.body, scene, body),
         equations_of_motion(body, x.motion, in_precision(scene.torque, dtype)),
         inverse(tensor_of(body)),
-        tuple(jnp.sqrt(law.density.astype(dtype)) for law in white_parts(scene.process)),
+        tuple(jnp.sqrt(law.density.astype(dtype)) for law in white_noise_torques(scene.process)),
         tuple(
             (jnp.sqrt(law.density.astype(dtype)), law.time.astype(dtype))
-            for law in coloured_parts(scene.process)
+            for law in time_correlated_torques(scene.process)
         ),
         tuple(jnp.sqrt(drift.density.astype(dtype)) for drift in drifts),
         tuple(drift.path for drift in drifts),
     )
 
 
-def white_parts(process: Process | None) -> tuple[RandomTorque, ...]:
+def white_noise_torques(process: Process | None) -> tuple[RandomTorque, ...]:
     """Return the torques of a `process` (the unknown torque of a model) that are white noise."""
     return tuple(part for part in parts_of(process) if isinstance(part, RandomTorque))
 
 
-def coloured_parts(process: Process | None) -> tuple[CorrelatedTorque, ...]:
+def time_correlated_torques(process: Process | None) -> tuple[CorrelatedTorque, ...]:
     """Return the torques of a `process` (the unknown torque of a model) that are correlated in
     time.
 
@@ -242,16 +246,20 @@ def coloured_parts(process: Process | None) -> tuple[CorrelatedTorque, ...]:
     return tuple(part for part in parts_of(process) if isinstance(part, CorrelatedTorque))
 
 
-def moved_root(
-    x: ExtendedState, e: Float[Array, " n"], root: Float[Array, "n m"], *, inverse: bool = False
+def covariance_root_about_neighbour(
+    x: ExtendedState,
+    change: Float[Array, " n"],
+    root: Float[Array, "n m"],
+    *,
+    inverse: bool = False,
 ) -> Float[Array, "n m"]:
     """Return the root of a covariance of errors about the state x, for errors about a neighbouring
     state.
 
-    The neighbouring state is x changed by the vector e (n,); `root` (n, m) belongs to errors about
-    x. Only errors of a turn differ: an error e + δ about x is the error `log(exp(−e) exp(e + δ)) ≈
-    J_r(e) δ` about the new state, where J_r is the right Jacobian, here to second order in e
-    (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848).
+    The neighbouring state is x changed by the vector `change` (n,), here called e; `root` (n, m)
+    belongs to errors about x. Only errors of a turn differ: an error e + δ about x is the error
+    `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ` about the new state, where J_r is the right Jacobian, here
+    to second order in e (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848).
 
     With `inverse` the root is multiplied by `J_r(e)⁻¹`, to third order, which is the derivative of
     `log(exp(e) exp(δ))` with respect to δ.
@@ -259,7 +267,7 @@ def moved_root(
     first, second = (0.5, 1 / 12) if inverse else (-0.5, 1 / 6)
     across = jax.vmap(cross, (None, 1), 1)
     for rows in rotation_slices(x):
-        turn, mine = e[rows], root[rows]
+        turn, mine = change[rows], root[rows]
         once = across(turn, mine)
         mine = mine + first * once + second * across(turn, once)
         root = jnp.concatenate([root[: rows.start], mine, root[rows.stop :]])
@@ -301,19 +309,21 @@ def linearise_readings(
     for index, (value, mask) in enumerate(zip(stop.values, stop.masks, strict=True)):
         sensor = in_precision(dynamics.scene.sensors[index], dtype)
 
-        def error(y: ExtendedState, index: int = index, value: Array = value) -> Array:
-            drifted = in_precision(dynamics.sensors_at(y.walks)[index], dtype)
+        def reading_error(y: ExtendedState, index: int = index, value: Array = value) -> Array:
+            drifted = in_precision(dynamics.sensors_with_walks(y.walks)[index], dtype)
 
-            def field(t: Array, state: PyTree, args: object = None) -> PyTree:
-                return dynamics.with_torques(dynamics.field(t, state, args), y.torques)
+            def field_with_torques(t: Array, state: PyTree, args: object = None) -> PyTree:
+                return dynamics.rate_with_torques(dynamics.field(t, state, args), y.torques)
 
             motion, when = y.motion, t
             offset = getattr(drifted, "offset", None)
             if offset is not None:
-                motion, when = shift_in_time(field, t, motion, offset), t + offset
-            return drifted.error(SensorInput(when, motion, dynamics.scene.body, field), value)
+                motion, when = shift_in_time(field_with_torques, t, motion, offset), t + offset
+            return drifted.error(
+                SensorInput(when, motion, dynamics.scene.body, field_with_torques), value
+            )
 
-        value_of_error, push = jax.linearize(error, x)
+        value_of_error, push = jax.linearize(reading_error, x)
         matrix = -jax.vmap(push, out_axes=1)(basis)
         mask = jnp.broadcast_to(mask, value_of_error.shape)
         limit = getattr(sensor, "limit", None)
@@ -340,7 +350,8 @@ class ReadNumbers(NamedTuple):
 def split_by_sensor(
     sensors: Sequence[AbstractSensor], numbers: ReadNumbers
 ) -> tuple[ReadNumbers, ...]:
-    """Return, for each sensor, the numbers that a filter read from it, beside their predictions.
+    """Return, for each sensor, the numbers that a filter read from it, compared with their
+    predictions.
 
     The argument `numbers` holds the innovations, their variances and the mask of all `sensors`, one
     after another along the last axis.
@@ -355,7 +366,7 @@ def split_by_sensor(
 MEMORY_A_STEP = 0.25
 
 
-def steps_of(
+def step_counts_between(
     process: Process | None,
     ts: Array | np.ndarray,
     state: HasSpin,
@@ -378,7 +389,7 @@ def steps_of(
     """
     if substeps is not None:
         return np.full(ts.shape[0] - 1, _checks.integer(substeps, "substeps", 1))
-    coloured = coloured_parts(process)
+    coloured = time_correlated_torques(process)
     if not _checks.is_known((ts, state.omega, coloured)):
         return np.ones(ts.shape[0] - 1, int)
     rate = float(np.linalg.norm(np.asarray(state.omega, float)))
@@ -455,9 +466,9 @@ def sample(
     if times.shape[0] < 2:
         raise ValueError(f"ts: wanted at least two times, got {times.shape[0]}")
     if _checks.is_known(times):
-        words = "ts: wanted increasing times"
+        words = "ts: wanted increasing times, got some that are equal or decrease"
         _checks.error_if(times, not (np.diff(np.asarray(times)) > 0).all(), words)
-    pieces = int(steps_of(process, times, state0, substeps).max())
+    pieces = int(step_counts_between(process, times, state0, substeps).max())
     scene = Scene(body, torque, process, (), project_to_group(state0))
     return _sample(key, scene, times, pieces)
 
@@ -479,7 +490,7 @@ def _sample(
     correlated in time.
     """
     state0: Any = scene.start
-    dtype, coloured = state0.omega.dtype, coloured_parts(scene.process)
+    dtype, coloured = state0.omega.dtype, time_correlated_torques(scene.process)
     first, later = jax.random.split(key)
     keys = jax.random.split(first, len(coloured))
     torques = tuple(
@@ -496,12 +507,14 @@ def _sample(
         # Subtract times before they are rounded to the dtype of the state.
         h = ((right - left) / pieces).astype(dtype)
         left = left.astype(dtype)
-        kicks = jax.random.normal(one, (pieces, dynamics.kicks), dtype)
+        kicks = jax.random.normal(one, (pieces, dynamics.noise_dimension), dtype)
 
-        def move(x: ExtendedState, piece: tuple[Array, Array]) -> tuple[ExtendedState, None]:
-            return dynamics.advance(left + piece[0] * h, h, x, piece[1]), None
+        def take_substep(
+            x: ExtendedState, piece: tuple[Array, Array]
+        ) -> tuple[ExtendedState, None]:
+            return dynamics.advance_under_noise(left + piece[0] * h, h, x, piece[1]), None
 
-        x, _ = lax.scan(move, x, (jnp.arange(pieces, dtype=dtype), kicks))
+        x, _ = lax.scan(take_substep, x, (jnp.arange(pieces, dtype=dtype), kicks))
         return x, x
 
     keys = jax.random.split(later, ts.shape[0] - 1)

@@ -14,8 +14,13 @@ from rigidjax._types import Scalar
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.filtering import roots
-from rigidjax.identify.filtering.filter import FilterInput, belief_at, grid_of, scan_filter
-from rigidjax.identify.filtering.roots import Terms
+from rigidjax.identify.filtering.filter import (
+    FilterInput,
+    belief_at,
+    grid_of_step_times,
+    scan_filter,
+)
+from rigidjax.identify.filtering.roots import LogDensityTerms
 from rigidjax.identify.filtering.steps import require_sensors
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.normal import normal_matrix_of_jacobians
@@ -34,9 +39,13 @@ from rigidjax.identify.model.terms import (
 from rigidjax.motion.manifold import dimension
 
 
-def terms_of_recording(
-    model: Model, row: Array, record: Recording, reference: ReferenceStates, body_index: BodyIndex
-) -> Terms:
+def log_density_terms_of_recording(
+    model: Model,
+    free_numbers: Array,
+    record: Recording,
+    reference: ReferenceStates,
+    body_index: BodyIndex,
+) -> LogDensityTerms:
     """Return the terms of the log-density of the readings of one recording.
 
     The readings are normal about the motion. If the model has an unknown torque, or numbers that
@@ -46,30 +55,30 @@ def terms_of_recording(
     **Arguments:**
 
     - `model`: the model.
-    - `row`: (m,) the free numbers on which this recording depends.
+    - `free_numbers`: (m,) the free numbers on which this recording depends.
     - `record`: the times and readings of the recording.
     - `reference`: the state about which the initial state of the recording is parametrised.
     - `body_index`: the index of the body of the recording among several bodies, or `None` for one
       body.
 
-    **Returns** the `Terms`, two arrays with an entry for each component of each reading: its error
-    over its standard deviation; and the logarithm of 2π times its variance.
+    **Returns** the `LogDensityTerms`, two arrays with an entry for each component of each reading:
+    its error over its standard deviation; and the logarithm of 2π times its variance.
     """
-    scene = scene_from_row(model, row, record, reference, body_index)
+    scene = scene_from_row(model, free_numbers, record, reference, body_index)
     if scene.process is None and not model.walks:
-        return _terms_of_motion(model, scene, record)
+        return _log_density_terms_of_motion(model, scene, record)
     require_sensors(scene.sensors)
     scene = dataclasses.replace(scene, torque=torque_with_inputs(scene, record))
     start: Any = scene.start
     known = jnp.zeros(dimension(start), start.omega.dtype)
     first = belief_at(record.t[0], start, known, scene, model.walks)
-    grid = grid_of(scene.process, record, first, model.filter_steps)
+    grid = grid_of_step_times(scene.process, record, first, model.filter_steps)
     run = FilterInput(scene, model.walks, record, first, grid)
     _, _, read = scan_filter(run, lambda _, read: read)
-    return jax.tree.map(jnp.ravel, roots.innovation_terms(*read))
+    return jax.tree.map(jnp.ravel, roots.log_density_terms(*read))
 
 
-def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
+def _log_density_terms_of_motion(model: Model, scene: Scene, record: Recording) -> LogDensityTerms:
     """Return the terms of the log-density of one recording if no torque is random and no
     parameter drifts.
 
@@ -82,10 +91,10 @@ def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
     - `scene`: the body, torque, sensors and initial state of the recording.
     - `record`: the times and readings of the recording.
 
-    **Returns** the `Terms`, two arrays with an entry for each component of each reading: z, its
-    error divided by its standard deviation σ; and l = log(2πσ²). The log-density is −½ Σ (z² + l).
-    For a masked reading both entries are zero. For a component at full scale, of which only a bound
-    is known, z is √(−2 log P), with the probability P of exceeding the bound, and l is zero.
+    **Returns** the `LogDensityTerms`, two arrays with an entry for each component of each reading:
+    z, its error divided by its standard deviation σ; and l = log(2πσ²). The log-density is −½ Σ (z²
+    + l). For a masked reading both entries are zero. For a component at full scale, of which only a
+    bound is known, z is √(−2 log P), with the probability P of exceeding the bound, and l is zero.
     """
     errors = errors_of_scene(model, scene, record)
     scaled, log_variance = [], []
@@ -100,12 +109,12 @@ def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
         mask = reading.mask[:, None] & ~full
         logs = jnp.log(2 * math.pi * noise**2)[None]
         log_variance.append(jnp.where(mask, logs if wider is None else logs + wider, 0))
-    return Terms(
+    return LogDensityTerms(
         *(jnp.concatenate([a.reshape(-1) for a in part]) for part in (scaled, log_variance))
     )
 
 
-def reading_terms(model: Model, x: Float[Array, " n"]) -> Terms:
+def log_density_terms_of_all_readings(model: Model, x: Float[Array, " n"]) -> LogDensityTerms:
     """Return the terms (R, N) of the log-density of all readings of a `model`.
 
     R is the number of recordings, N the number of terms of each recording, and x (n,) holds the
@@ -113,17 +122,19 @@ def reading_terms(model: Model, x: Float[Array, " n"]) -> Terms:
     forward mode.
     """
     return differentiable_map_over_recordings(
-        model.index.rows_of_recordings(x), model, terms_of_recording
+        model.index.rows_of_recordings(x), model, log_density_terms_of_recording
     )
 
 
-def log_density(model: Model, x: Float[Array, " n"]) -> Scalar:
+def log_posterior_density(model: Model, x: Float[Array, " n"]) -> Scalar:
     """Return the logarithm of the posterior density of a `model` at its free numbers x, up to a
     constant.
 
     It is the logarithm of the density of all readings plus the logarithms of the priors.
     """
-    return reading_terms(model, x).log_density - 0.5 * jnp.sum(prior_residuals(model, x) ** 2)
+    return log_density_terms_of_all_readings(model, x).total_log_density - 0.5 * jnp.sum(
+        prior_residuals(model, x) ** 2
+    )
 
 
 class Curvature(NamedTuple):
@@ -138,7 +149,7 @@ class Curvature(NamedTuple):
     slope: Float[Array, " n"]
 
 
-def curvature(model: Model, x: Float[Array, " n"]) -> Curvature:
+def cost_gradient_and_information(model: Model, x: Float[Array, " n"]) -> Curvature:
     """Return the cost, gradient and Fisher's information of a posterior density at x (n,).
 
     The free numbers x change the variances of the readings, too. The information is that of the
@@ -146,7 +157,7 @@ def curvature(model: Model, x: Float[Array, " n"]) -> Curvature:
     variance s, and ∂ is the gradient with respect to x (Gupta and Mehra 1974,
     doi:10.1109/TAC.1974.1100714, for the filter).
     """
-    value, slopes = errors_and_jacobians(model, x, terms_of_recording)
+    value, slopes = errors_and_jacobians(model, x, log_density_terms_of_recording)
     # Compute dν/√s from the derivative of ν/√s, by d(ν/√s) = dν/√s − ½ ν/√s d(log s).
     moved = slopes.error + 0.5 * value.error[..., None] * slopes.log_variance
     both = jnp.concatenate([moved, 0.5**0.5 * slopes.log_variance], axis=1)
@@ -156,5 +167,5 @@ def curvature(model: Model, x: Float[Array, " n"]) -> Curvature:
     each = each + 0.5 * jnp.sum(slopes.log_variance, 1)
     slope = jnp.zeros(size + 1, x.dtype).at[places].add(each)[:-1]
     rows, rest = jacobian_and_value(lambda x: prior_residuals(model, x), x)
-    cost = 0.5 * jnp.sum(rest**2) - value.log_density
+    cost = 0.5 * jnp.sum(rest**2) - value.total_log_density
     return Curvature(cost, gram + rows.T @ rows, slope + rest @ rows)

@@ -66,7 +66,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     for name, one in fits.items():
         _checks.require_instance(one, Fit, f"fits[{name!r}]")
     if not fits:
-        raise ValueError("compare: wanted at least one fit")
+        raise ValueError("compare: wanted at least one fit, got none")
     readings = {name: one.model.records.readings for name, one in fits.items()}
     counts = {name: tuple(map(count_of, of_fit)) for name, of_fit in readings.items()}
     if len(set(counts.values())) > 1:
@@ -146,24 +146,24 @@ def cross_validate(
     out = []
     for index, left_out in enumerate(recordings):
         others = [r for k, r in enumerate(recordings) if k != index]
-        of_others = fit(build(others), **options)
-        test_model = _with_shared_fixed(build([left_out]), of_others)
+        fit_of_others = fit(build(others), **options)
+        test_model = _fix_shared_numbers(build([left_out]), fit_of_others)
         out.append(fit(test_model, **{**options, "starts": 1}).rms)
     return tuple(out)
 
 
-def _with_shared_fixed(model: Model, of_others: Fit) -> Model:
+def _fix_shared_numbers(model: Model, fit_of_others: Fit) -> Model:
     """Return a `model` whose body and shared numbers are fixed at their values in the fit
-    `of_others`.
+    `fit_of_others`.
 
     It is used to predict one recording by a fit of all other recordings. The `model` holds this
     recording alone. In the result only two things are free: its initial state, and each `Free` (a
     number that a fit may move) that has a value for each recording.
     """
     x = model.start()
-    for slot, fitted in zip(model.slots, of_others.model.slots, strict=True):
+    for slot, fitted in zip(model.slots, fit_of_others.model.slots, strict=True):
         if slot.shared is not None and fitted.shared is not None:
-            x = x.at[slot.shared].set(of_others.x[fitted.shared])
+            x = x.at[slot.shared].set(fit_of_others.x[fitted.shared])
     record = stacking.pick_records(model.records, 0)
     scene = with_steps(
         scene_at_starting_values(model, record), model.slots, model.index.rows_of_recordings(x)[0]
@@ -174,7 +174,7 @@ def _with_shared_fixed(model: Model, of_others: Fit) -> Model:
         for slot in model.slots
         if slot.own is not None
     ]
-    chart = Known(of_others.body)
+    chart = Known(fit_of_others.body)
     kinds = model.index.start.shape[1] // 3
     index, slots = build_index(
         indices_of_body_numbers(chart, None, model.count), chart.size, own, kinds

@@ -9,13 +9,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
-from rigidjax.identify.filtering.terms import log_density
+from rigidjax.identify.filtering.terms import log_posterior_density
 from rigidjax.identify.model.charts import indices_of_body_numbers
 from rigidjax.identify.model.free import Slot
 from rigidjax.identify.model.index import build_index
@@ -116,19 +116,20 @@ class LogDensity(eqx.Module):
             what = " ".join(one.in_words for one in fit.undetermined_combinations)
             hint = "" if process is None else _GUESS
             raise ValueError(
-                "fit: neither the data nor a prior determine some direction, so there is no "
-                f"posterior; give a prior or fewer free numbers{hint}. {what}".rstrip()
+                "fit: neither the data nor a prior determine some combination of the free "
+                "numbers, so there is no posterior; give a prior or fewer free numbers"
+                f"{hint}. {what}".rstrip()
             )
         known = process is None or deviation is None
         prior = None if known else jnp.asarray(_checks.positive_float(deviation, "deviation"))
-        noise_slots, variances = _noise_slots(model)
-        process_slots = [] if prior is None else _process_slots(process, prior)
+        noise_slots, variances = _slots_and_variances_of_unknown_noise(model)
+        process_slots = [] if prior is None else _slots_of_random_torque(process, prior)
         total = sum(int(reading.host_mask.sum()) for reading in model.records.readings)
         variances += [np.full(1, 1 / math.sqrt(total)) for _ in process_slots]
         new_slots = [*noise_slots, *process_slots]
-        self.model, places = _with_slots(model, fit.noises, process, new_slots)
-        follows_the_motion = process is None and not model.walks
-        covariance = _covariance_of_white_errors(fit, follows_the_motion)
+        self.model, places = _add_free_numbers_and_reindex(model, fit.noises, process, new_slots)
+        has_deterministic_motion = process is None and not model.walks
+        covariance = _covariance_for_white_errors(fit, has_deterministic_motion)
         self.x0 = jnp.zeros(self.model.size, fit.x.dtype).at[places].set(fit.x)
         whole = np.zeros((self.model.size, self.model.size))
         whole[np.ix_(places, places)] = covariance
@@ -144,7 +145,7 @@ class LogDensity(eqx.Module):
         return self.x0.size
 
     def __call__(self, x: Float[Array, " n"]) -> Scalar:
-        return log_density(self.model, _checks.array_of_shape(x, self.x0.shape, "x"))
+        return log_posterior_density(self.model, _checks.array_of_shape(x, self.x0.shape, "x"))
 
     def unpack(self, x: Float[Array, " n"]) -> Unpacked:
         """Return what the vector x (n,) represents, as an `Unpacked`.
@@ -162,16 +163,17 @@ class LogDensity(eqx.Module):
 @eqx.filter_jit
 def map_draws(
     function: Callable[[Unpacked], Any], density: LogDensity, x: Float[Array, "m n"]
-) -> Any:
+) -> PyTree:
     """Return `function(point)` for each of m draws x (m, n), where `point` is what the draw
     represents.
 
-    The program is compiled once for all densities with the same structure and shapes.
+    The results are stacked: each array has a leading axis of length m. The program is compiled once
+    for all densities with the same structure and shapes.
     """
     return jax.vmap(lambda one: function(density.unpack(one)))(x)
 
 
-def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
+def _slots_and_variances_of_unknown_noise(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
     """Return two things: a slot for each sensor of a `model` whose noise is unknown; and variances.
 
     A slot is the description of a `Free`, a number that a fit may move. Here it is a factor of the
@@ -186,16 +188,18 @@ def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
         rows = np.bincount(groups, np.asarray(reading.host_mask.sum(axis=1)))
         # The logarithm of a standard deviation has the variance 1/(2n) if n numbers were read.
         variances.append(0.5 / np.maximum(rows * reading.sensor.components, 1))
-        path = _path_of(model, lambda s, index=index: s.sensors[index].noise)
+        path = _path_of_picked_leaf(model, lambda s, index=index: s.sensors[index].noise)
         name = f"noise of {type(reading.sensor).__name__} {index}"
         labels = tuple(str(group) for group in range(rows.size))
         slots.append(
-            _slot_of_factor(path, name, (1,), reading.sensor.unit, labels, model.noise_groups)
+            _slot_of_positive_factor(
+                path, name, (1,), reading.sensor.unit, labels, model.noise_groups
+            )
         )
     return slots, variances
 
 
-def _process_slots(process: Process | None, prior: Array) -> list[Slot]:
+def _slots_of_random_torque(process: Process | None, prior: Array) -> list[Slot]:
     """Return a slot for the factor of each number of a random torque, such as its spectral density.
 
     A slot is the description of a `Free`, a number that a fit may move; the free number is the
@@ -210,11 +214,13 @@ def _process_slots(process: Process | None, prior: Array) -> list[Slot]:
         # The first number of each torque in a process is its density: count the torques by it.
         number += path[-1].name == "density"
         name = f"{path[-1].name} {number}" if several else path[-1].name
-        slots.append(_slot_of_factor(path, name, (1,) * jnp.ndim(leaf), "", (), None, prior))
+        slots.append(
+            _slot_of_positive_factor(path, name, (1,) * jnp.ndim(leaf), "", (), None, prior)
+        )
     return slots
 
 
-def _slot_of_factor(
+def _slot_of_positive_factor(
     path: tuple[Any, ...],
     name: str,
     shape: tuple[int, ...],
@@ -243,7 +249,7 @@ def _slot_of_factor(
     return Slot(path, name, unit, False, True, shape, labels, groups, one, prior, None)
 
 
-def _path_of(model: Model, where: Callable[[Scene], Any]) -> tuple[Any, ...]:
+def _path_of_picked_leaf(model: Model, where: Callable[[Scene], Any]) -> tuple[Any, ...]:
     """Return the path, in the tree of a scene of the `model`, of the leaf that `where` picks.
 
     A scene is the body, torques, sensors and initial state of a recording. The function `where`
@@ -259,7 +265,7 @@ def _path_of(model: Model, where: Callable[[Scene], Any]) -> tuple[Any, ...]:
 _MARK = object()
 
 
-def _with_slots(
+def _add_free_numbers_and_reindex(
     model: Model, noises: Noise, process: Process | None, slots: list[Slot]
 ) -> tuple[Model, np.ndarray]:
     """Return two things: a model with additional free numbers; and the new indices of its old ones.
@@ -297,7 +303,7 @@ def _with_slots(
     return new_model, places
 
 
-def _covariance_of_white_errors(fit: Fit, follows_the_motion: bool) -> np.ndarray:
+def _covariance_for_white_errors(fit: Fit, has_deterministic_motion: bool) -> np.ndarray:
     """Return the covariance (n, n) of the free numbers of a `fit` for a posterior density, which
     takes the errors of the readings as white.
 
@@ -306,10 +312,10 @@ def _covariance_of_white_errors(fit: Fit, follows_the_motion: bool) -> np.ndarra
 
     - The covariance of the fit allows for constant errors of the sensors within their `Tolerance`.
     - It is a sandwich covariance, which allows for autocorrelated errors, and it is singular or
-      `follows_the_motion` is true.
+      `has_deterministic_motion` is true.
 
-    `follows_the_motion` says that the model has no random torque and no number that drifts as a
-    random walk, so that the readings are normal about one motion.
+    `has_deterministic_motion` says that the model has no random torque and no number that drifts as
+    a random walk, so that the readings are normal about one motion.
     """
     covariance = np.asarray(fit.covariance)
     if fit.considered and fit.linear is not None:
@@ -319,6 +325,6 @@ def _covariance_of_white_errors(fit: Fit, follows_the_motion: bool) -> np.ndarra
         # errors. For many recordings it may be singular as well, and is then no scale for a search.
         size = np.sqrt(np.diagonal(covariance))
         definite = np.linalg.eigvalsh(covariance / np.outer(size, size)).min() > 1e-10
-        if (follows_the_motion or not definite) and fit.linear is not None:
+        if (has_deterministic_motion or not definite) and fit.linear is not None:
             covariance = white_covariance(fit.linear).covariance
     return covariance

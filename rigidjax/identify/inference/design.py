@@ -44,8 +44,8 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
     >>> bool(expected_quantities(model, plan)[0].deviation < 1.0)
     True
     """
-    _require_known(model, x)
-    _require_noise(model, x)
+    _require_not_traced(model, x)
+    _require_known_noise(model, x)
     near = flat_limit.thicken(model, x)
     information = np.asarray(_fisher(model, x if near is None else near))
     if not np.isfinite(information).all():
@@ -70,7 +70,7 @@ def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
     >>> fisher(model, model.start()).shape
     (8, 8)
     """
-    _require_noise(model, x)
+    _require_known_noise(model, x)
     return _fisher(model, x)
 
 
@@ -94,7 +94,7 @@ def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
     return normal_matrix_of_jacobians(rows, model.index.places, model.size).core
 
 
-def _require_noise(model: Model, x: Float[Array, " n"]) -> None:
+def _require_known_noise(model: Model, x: Float[Array, " n"]) -> None:
     """Raise `ValueError` if a sensor of the `model` has unknown noise, or jitter to be estimated.
 
     It is also raised unless x is a vector (n,) of the free numbers of the `model`.
@@ -106,10 +106,13 @@ def _require_noise(model: Model, x: Float[Array, " n"]) -> None:
                 f"design: wanted a {type(sensor).__name__} with known noise, got noise=None"
             )
         if (jitter := getattr(sensor, "jitter", None)) is not None and jitter.estimated:
-            raise ValueError(f"design: wanted a {type(sensor).__name__} with known jitter, in s")
+            raise ValueError(
+                f"design: wanted a {type(sensor).__name__} with known jitter, in s, got one "
+                "that is to be estimated"
+            )
 
 
-def _require_known(model: Model, motion: PyTree) -> None:
+def _require_not_traced(model: Model, motion: PyTree) -> None:
     """Raise `TypeError` if the `model`, or one of the arrays in the tree `motion`, is traced by
     JAX.
     """
@@ -145,36 +148,38 @@ def best_first_rate(
     """
     require_single_model(model)
     max_steps = _checks.integer(max_steps, "max_steps", 1)
-    _require_known(model, (body, omega))
-    _require_noise(model, model.start(body, omega))
+    _require_not_traced(model, (body, omega))
+    _require_known_noise(model, model.start(body, omega))
     start = _checks.array_of_shape(omega, (3,), "omega").astype(model.records.t.dtype)
     size = jnp.sqrt(jnp.sum(start**2))
-    best = _best_direction(model, body, start / size, size, max_steps)
+    best = _most_informative_rate_direction(model, body, start / size, size, max_steps)
     rate = size * best / jnp.sqrt(jnp.sum(best**2))
     return rate, expected_quantities(model, model.start(body, rate))
 
 
 @eqx.filter_jit
-def _best_direction(model: Model, body: PyTree, start: Array, size: Array, max_steps: int) -> Array:
+def _most_informative_rate_direction(
+    model: Model, body: PyTree, initial_direction: Array, rate_size: Array, max_steps: int
+) -> Vec3:
     """Return the direction (3,) of the initial body rate that determines the body best, by BFGS.
 
     The direction minimises the mean logarithm of the standard deviations of the body's numbers,
-    near the direction `start`. Its length is only near 1.
+    near the direction `initial_direction`. Its length is only near 1.
 
     **Arguments:**
 
     - `model`: the planned recordings and sensors.
     - `body`: the expected body.
-    - `start`: (3,) the unit vector from which the search starts.
-    - `size`: the length of the initial rate, rad/s.
+    - `initial_direction`: (3,) the unit vector from which the search starts.
+    - `rate_size`: the length of the initial rate, rad/s.
     - `max_steps`: the largest number of steps of the search.
     """
     minimise: Any = optx.minimise
     out = minimise(
-        _log_uncertainty,
+        _log_uncertainty_of_body,
         optx.BFGS(rtol=1e-4, atol=1e-4),
-        start,
-        (model, body, size),
+        initial_direction,
+        (model, body, rate_size),
         options={"autodiff_mode": "fwd"},
         max_steps=max_steps,
         throw=False,
@@ -182,7 +187,7 @@ def _best_direction(model: Model, body: PyTree, start: Array, size: Array, max_s
     return out.value
 
 
-def _log_uncertainty(direction: Array, args: tuple[Model, PyTree, Array]) -> Scalar:
+def _log_uncertainty_of_body(direction: Array, args: tuple[Model, PyTree, Array]) -> Scalar:
     """Return the mean logarithm of the standard deviations of the body's numbers, with a penalty.
 
     It is ½ log det C / n, where C (n, n) is the covariance of the n free numbers of the body in

@@ -19,12 +19,12 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.body.inertia import tensor_of
-from rigidjax.identify.filtering.terms import curvature
+from rigidjax.identify.filtering.terms import cost_gradient_and_information
 from rigidjax.identify.inference.density import LogDensity, map_draws
 from rigidjax.identify.model.model import Unpacked
 from rigidjax.identify.model.normal import NormalMatrix
 from rigidjax.identify.search.least_squares import Settings, minimise
-from rigidjax.identify.search.stages import is_order_one
+from rigidjax.identify.search.stages import order_one_indicator
 from rigidjax.identify.uncertainty.quantities import interval_about
 from rigidjax.motion.torques.composite import parts_of
 
@@ -105,7 +105,7 @@ class Nuts(eqx.Module):
                 window_ends, end_window, lambda: (steps, scale, jnp.exp(steps.log_step_size))
             )
 
-        def body(carry: tuple, row: tuple) -> tuple[tuple, Array]:
+        def draw_step(carry: tuple, row: tuple) -> tuple[tuple, Array]:
             state, (steps, scale, size) = carry
             key, drawing, slow, ends = row
             size = jnp.where(drawing, settle(steps), size)
@@ -123,7 +123,7 @@ class Nuts(eqx.Module):
         first = (begin(1.0), metric_begin(start.size), jnp.ones((), start.dtype))
         state = blackjax.nuts.init(start, density)
         xs = (jax.random.split(key, drawing.size), drawing, slow, ends)
-        _, draws = lax.scan(body, (state, first), xs)
+        _, draws = lax.scan(draw_step, (state, first), xs)
         return draws[self.warmup :]
 
 
@@ -249,7 +249,9 @@ def posterior(
 
 
 @eqx.filter_jit
-def _draw_chains(density: LogDensity, root: Array, keys: Array, sampler: Sampler) -> Array:
+def _draw_chains(
+    density: LogDensity, root: Array, keys: Array, sampler: Sampler
+) -> Float[Array, "chains samples n"]:
     """Draw from a posterior density by Markov chains, one for each key, in one compiled program.
 
     **Arguments:**
@@ -366,10 +368,13 @@ class Refit(eqx.Module):
             low, high = np.apply_along_axis(quantiles, 0, each)
             return np.asarray(low), np.asarray(high)
 
-        def value(x: Array) -> Array:
+        def function_of_numbers(x: Array) -> Array:
             return jnp.asarray(function(self.density.unpack(x)))
 
-        centre, slope = (np.asarray(a) for a in (value(self.x), jax.jacfwd(value)(self.x)))
+        centre, slope = (
+            np.asarray(a)
+            for a in (function_of_numbers(self.x), jax.jacfwd(function_of_numbers)(self.x))
+        )
         null, reach = np.zeros((0, self.x.size)), NormalDist().inv_cdf(0.5 + 0.5 * level)
         return interval_about(centre, slope, np.asarray(self.covariance), null, reach)
 
@@ -435,10 +440,10 @@ def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: in
     """
 
     def evaluate(x: Array) -> tuple[None, Array, NormalMatrix, Array]:
-        cost, gram, slope = curvature(density.model, x)
+        cost, gram, slope = cost_gradient_and_information(density.model, x)
         return None, cost, NormalMatrix(gram), slope
 
-    order_one = is_order_one(density.model, density.x0.dtype)
+    order_one = order_one_indicator(density.model, density.x0.dtype)
     end = minimise(evaluate, density.x0, order_one, settings, None)
     covariance = jnp.linalg.inv(end.normal.core)
     draws, weights = _weighted_draws(density, end.point, covariance, key, count)

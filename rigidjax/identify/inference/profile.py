@@ -12,7 +12,7 @@ from rigidjax._types import Scalar
 from rigidjax.identify.answer.result import Fit, require_one_fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.model.model import AbstractPull, Model
-from rigidjax.identify.search.stages import Attempt, Task, cost_of, polish
+from rigidjax.identify.search.stages import Attempt, Task, cost_of, search_whole_records
 from rigidjax.identify.uncertainty import quantities
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
@@ -88,7 +88,7 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
         point = fit.x
 
         @functools.cache
-        def pull_to(steps: float, side: float = side) -> tuple[float, float]:
+        def growth_and_value_at(steps: float, side: float = side) -> tuple[float, float]:
             # The pull is weak: after the fit the quantity lies between its best value and the
             # target. This makes no error, because the fitted point has the least misfit of all
             # points with the same value of the quantity.
@@ -99,11 +99,13 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
             pulled_model = eqx.tree_at(
                 lambda m: m.pull, model, pull, is_leaf=lambda node: node is None
             )
-            point = polish(Attempt(point), Task(pulled_model, fit.noises, 1e-4, 100)).x
+            point = search_whole_records(
+                Attempt(point), Task(pulled_model, fit.noises, 1e-4, 100)
+            ).x
             grown = (2.0 * cost_of(model, point, fit.noises) - bottom) / shares - reach**2
             return grown, float(_value(model, point)[index])
 
-        ends.append(_interval_end(pull_to, reach, wide / deviation, side))
+        ends.append(_profile_interval_end(growth_and_value_at, reach, wide / deviation, side))
     low, high = (np.exp(end) if quantity.positive else end for end in ends)
     return float(low), float(high)
 
@@ -111,34 +113,37 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
 _value = eqx.filter_jit(quantities.quantity_vector)
 
 
-def _interval_end(
-    pull_to: Callable[[float], tuple[float, float]], reach: float, largest: float, side: float
+def _profile_interval_end(
+    growth_and_value_at: Callable[[float], tuple[float, float]],
+    first_distance: float,
+    largest_distance: float,
+    side: float,
 ) -> float:
     """Return one end of a profile interval of a quantity, or infinity if the search finds no end.
 
-    At an end the misfit, minimised over all other numbers, has grown by the square of `reach`. An
-    infinite end has the sign of `side`.
+    At an end the misfit, minimised over all other numbers, has grown by the square of
+    `first_distance`. An infinite end has the sign of `side`.
 
     **Arguments:**
 
-    - `pull_to`: a function that fits the model with the quantity pulled towards a target. Given the
-      distance of the target from the best value, in standard deviations, it returns two numbers:
-      the growth of the misfit minus the square of `reach`; and the value of the quantity (its
-      logarithm, if the quantity is positive).
-    - `reach`: the first distance to try, in standard deviations.
-    - `largest`: the search is given up beyond this distance or four times `reach`, whichever is
-      larger, in standard deviations.
+    - `growth_and_value_at`: a function that fits the model with the quantity pulled towards a
+      target. Given the distance of the target from the best value, in standard deviations, it
+      returns two numbers: the growth of the misfit minus the square of `first_distance`; and the
+      value of the quantity (its logarithm, if the quantity is positive).
+    - `first_distance`: the first distance to try, in standard deviations.
+    - `largest_distance`: the search is given up beyond this distance or four times
+      `first_distance`, whichever is larger, in standard deviations.
     - `side`: −1 for the lower end of the interval, 1 for the upper end.
     """
     from scipy.optimize import brentq
 
-    inner, outer = 0.0, reach
-    while pull_to(outer)[0] < 0:
+    inner, outer = 0.0, first_distance
+    while growth_and_value_at(outer)[0] < 0:
         inner, outer = outer, 2.0 * outer
-        if outer > max(largest, 4.0 * reach):
+        if outer > max(largest_distance, 4.0 * first_distance):
             return side * np.inf
 
-    def excess(steps: float) -> float:
-        return pull_to(steps)[0] if steps > 0 else -(reach**2)
+    def misfit_excess(steps: float) -> float:
+        return growth_and_value_at(steps)[0] if steps > 0 else -(first_distance**2)
 
-    return pull_to(brentq(excess, inner, outer, xtol=1e-2 * reach))[1]  # pyright: ignore
+    return growth_and_value_at(brentq(misfit_excess, inner, outer, xtol=1e-2 * first_distance))[1]  # pyright: ignore

@@ -172,10 +172,12 @@ def minimise(
         jnp.zeros((), kind),
     )
 
-    def step(state: LMState) -> LMState:
+    def evaluate_and_update(state: LMState) -> LMState:
         return _next_state(state, evaluate(state.trial), order_one, settings, gain_of_noise)
 
-    return lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
+    return lax.while_loop(
+        lambda now: ~now.done & (now.taken <= settings.steps), evaluate_and_update, begun
+    )
 
 
 def _next_state(
@@ -231,7 +233,7 @@ def _next_state(
         (state.trial, cost, normal, slope),
         (state.point, state.cost, state.normal, state.slope),
     )
-    move, root = _damped_step(normal, slope, order_one, damping)
+    move, root = _damped_step_and_scale(normal, slope, order_one, damping)
     sound = jnp.isfinite(move).all()
     move = jnp.where(sound, move, 0.0)
     hoped = -(slope @ move) - 0.5 * move @ (normal @ move)
@@ -267,9 +269,9 @@ def _next_state(
     )
 
 
-def _damped_step(
+def _damped_step_and_scale(
     normal: NormalMatrix, slope: Array, order_one: Array, damping: Array
-) -> tuple[Array, Array]:
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Return two things: the damped step (n,) of Levenberg and Marquardt from a point; and the
     square root (n,) of the diagonal of the normal matrix.
 

@@ -37,7 +37,7 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
     errors = blocks[0]
     weights = reading_weights(model, errors, noise)
     groups, out = np.asarray(model.noise_groups), []
-    shares = _remaining_shares(model, x, blocks, noise)
+    shares = _shares_of_squared_error_left_by_fit(model, x, blocks, noise)
     readings = list(model.records.readings)
     for index, (reading, error, sigma, weight, share) in enumerate(
         zip(readings, errors, noise, weights, shares, strict=True)
@@ -98,7 +98,9 @@ def initial_noise(model: Model) -> Noise:
     return tuple(out)
 
 
-def _variance_by_median(squares: np.ndarray, mask: np.ndarray, groups: np.ndarray) -> np.ndarray:
+def _variance_by_median(
+    squared_errors: np.ndarray, mask: np.ndarray, groups: np.ndarray
+) -> np.ndarray:
     """Return the variance (groups,) of a component of the errors for each group of recordings, by a
     median that outliers hardly change.
 
@@ -108,29 +110,33 @@ def _variance_by_median(squares: np.ndarray, mask: np.ndarray, groups: np.ndarra
     (which gives outliers less weight) would be too small without outliers, and too large with many
     outliers.
 
-    - `squares`: (R, T) the squared lengths of the errors, at T times of R recordings.
+    - `squared_errors`: (R, T) the squared lengths of the errors, at T times of R recordings.
     - `mask`: (R, T, k) true for each of the k components of an error that is used.
     - `groups`: (R,) the index of the group of each recording.
     """
-    half, _ = median_of_chi2(mask.shape[-1])
+    half, _ = median_and_density_of_chi2(mask.shape[-1])
     whole = mask.all(axis=-1)
-    rows = (squares[groups == g][whole[groups == g]] for g in range(groups.max() + 1))
+    rows = (squared_errors[groups == g][whole[groups == g]] for g in range(groups.max() + 1))
     return np.array([np.median(row) / half if row.size else 0.0 for row in rows])
 
 
-def median_of_chi2(size: int) -> tuple[float, float]:
-    """Return two numbers for χ² with `size` degrees of freedom: its median; and its density
-    there.
+def median_and_density_of_chi2(degrees_of_freedom: int) -> tuple[float, float]:
+    """Return the median of the χ² distribution with `degrees_of_freedom`, and its density at the
+    median.
     """
     from scipy.special import chdtri, gammaln
 
-    median = float(chdtri(size, 0.5))
-    power = 0.5 * size - 1
-    density = 0.5 * np.exp(power * np.log(0.5 * median) - 0.5 * median - gammaln(0.5 * size))
+    median = float(chdtri(degrees_of_freedom, 0.5))
+    power = 0.5 * degrees_of_freedom - 1
+    density = 0.5 * np.exp(
+        power * np.log(0.5 * median) - 0.5 * median - gammaln(0.5 * degrees_of_freedom)
+    )
     return median, float(density)
 
 
-def _remaining_shares(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[np.ndarray]:
+def _shares_of_squared_error_left_by_fit(
+    model: Model, x: Array, blocks: Blocks, noise: Noise
+) -> list[np.ndarray]:
     """Return, for each sensor, the share (groups,) of the expected sum of squared errors that
     remains after a fit, for each group of recordings.
 

@@ -97,7 +97,7 @@ class Task(NamedTuple):
     max_steps: int
 
     @property
-    def stride(self) -> int:
+    def steps_per_run(self) -> int:
         """Return the number of steps of one compiled run, after which an interrupt (Ctrl-C) is
         noticed.
         """
@@ -152,7 +152,7 @@ def least_squares_from(
         if e.size:
             total, slope = total + jnp.sum(e**2), slope + e @ row
             normal = normal.add_residual_rows(row)
-        normal = normal.add_residual_rows(_curvature_rows(model, x, slope))
+        normal = normal.add_residual_rows(_rows_for_chart_curvature(model, x, slope))
         return Evaluation((errors, slopes), pulls), 0.5 * total, normal, slope
 
     zeros = _zeros_of_evaluation(model, kind)
@@ -160,8 +160,8 @@ def least_squares_from(
         (jnp.zeros((places.shape[0], 0, 0, places.shape[1]), kind),), places, number, alone
     )
     windows = model.clusters is not None
-    by_noise = partial(_expected_gain_of_noise, model) if windows else None
-    order_one = is_order_one(model, kind)
+    by_noise = partial(_expected_cost_drop_from_noise, model) if windows else None
+    order_one = order_one_indicator(model, kind)
     end = minimise(evaluate, x, order_one, settings, zeros, zero_normal, by_noise)
     # If the cost is finite at no point, not even at the start, the start stays the best point.
     lost = ~jnp.isfinite(end.cost)
@@ -173,7 +173,7 @@ def least_squares_from(
     )
 
 
-def _expected_gain_of_noise(
+def _expected_cost_drop_from_noise(
     model: Model, evaluation: Evaluation, normal: NormalMatrix
 ) -> Float[Array, ""]:
     """Return `½ tr(K G⁻¹)`, the mean amount by which a fit that follows only the noise lowers the
@@ -206,20 +206,22 @@ def _expected_gain_of_noise(
     return 0.5 * jnp.sum(scaled * definite.solve(scaled.T).T)
 
 
-def is_order_one(model: Model, kind: DTypeLike) -> Float[Array, " n"]:
+def order_one_indicator(model: Model, dtype: DTypeLike) -> Float[Array, " n"]:
     """Return an array (n,) with one for each free number of a `model` that is of order one, and
     zero for each number of a `Free`.
 
-    The user chooses the unit of a `Free`, so that its numbers may have any size. `kind` is the
+    The user chooses the unit of a `Free`, so that its numbers may have any size. `dtype` is the
     dtype of the result.
     """
-    ones = jnp.zeros(model.size, kind).at[: model.index.bodies].set(1.0)
+    ones = jnp.zeros(model.size, dtype).at[: model.index.bodies].set(1.0)
     return ones.at[model.index.start].set(1.0)
 
 
-def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
-    """Return a matrix B (m, n) for the curvature of the charts of the bodies: BᵀB is added to the
-    normal matrix of the n free numbers of a `model`.
+def _rows_for_chart_curvature(
+    model: Model, x: Array, slope: Float[Array, " n"]
+) -> Float[Array, "m n"]:
+    """Return rows B (m, n) by which the normal matrix allows for the curvature of the charts of the
+    bodies: BᵀB is added to the normal matrix of the n free numbers of a `model`.
 
     A chart is a map from free numbers to a possible body. Its curvature matters if a body may be
     flat, and each chart gives its own part of the m rows (`AbstractBodyChart.bend`).
@@ -255,23 +257,23 @@ def _model_until_last_weight(model: Model, weights: Float[Array, "records times"
     return eqx.tree_at(lambda m: m.integrator, model, shorter)
 
 
-def _zeros_of_evaluation(model: Model, kind: DTypeLike) -> Evaluation:
+def _zeros_of_evaluation(model: Model, dtype: DTypeLike) -> Evaluation:
     """Return an `Evaluation` that holds zeros in place of the errors of a `model`, their
     derivatives, and the gradients of the cost; a compiled search needs it for the shapes of its
     first state.
 
-    `kind` is the dtype of the zeros. The shapes are computed from the shapes in the model, since
+    `dtype` is the dtype of the zeros. The shapes are computed from the shapes in the model, since
     tracing the function that computes the errors (`terms.errors_and_jacobians`) would take seconds.
     """
     count, times = model.records.t.shape
     columns = model.index.places.shape[1]
     shapes = [(count, times, sensor.components) for sensor in model.records.sensors]
-    errors = tuple(jnp.zeros(shape, kind) for shape in shapes)
-    slopes = tuple(jnp.zeros((*shape, columns), kind) for shape in shapes)
-    return Evaluation((errors, slopes), jnp.zeros(model.index.places.shape, kind))
+    errors = tuple(jnp.zeros(shape, dtype) for shape in shapes)
+    slopes = tuple(jnp.zeros((*shape, columns), dtype) for shape in shapes)
+    return Evaluation((errors, slopes), jnp.zeros(model.index.places.shape, dtype))
 
 
-def whole_record(model: Model) -> Float[Array, "records times"]:
+def weights_of_whole_record(model: Model) -> Float[Array, "records times"]:
     """Return the weights (R, T) of the readings for a fit of a `model` to the whole of each of its
     R recordings: ones.
     """
@@ -291,7 +293,7 @@ def weights_of_beginning(model: Model, part: float) -> Float[Array, "records tim
     return jnp.asarray((since <= part * length).astype(t.dtype))
 
 
-def _attempt_of(state: LMState) -> Attempt:
+def _attempt_at_best_point(state: LMState) -> Attempt:
     """Return the best point of a search as an `Attempt` (free numbers, cost, convergence).
 
     The `Attempt` also has the errors and derivatives at this point if the last evaluation of the
@@ -302,37 +304,42 @@ def _attempt_of(state: LMState) -> Attempt:
     return Attempt(state.point, state.cost, state.converged, blocks)
 
 
-def _search_stride(
+def _take_marquardt_steps(
     x: Float[Array, " n"],
     task: Task,
     weights: Float[Array, "records times"],
     damping: float,
     aim: float = 0.0,
-    margin: float = 0.0,
+    sufficient_cost: float = 0.0,
     steps: int | None = None,
-    level: float | None = None,
+    noise_gain_fraction: float | None = None,
 ) -> LMState:
-    """Return the last state of a search after one stride (one compiled run of a few steps of
-    Levenberg and Marquardt) from the free numbers x.
+    """Return the last state of a search after a few steps of Levenberg and Marquardt from the free
+    numbers x, in one compiled run.
 
     **Arguments:**
 
-    - `x`: (n,) the free numbers at the start of the stride.
+    - `x`: (n,) the free numbers before the first step.
     - `task`: the model, its noise, and the tolerance.
     - `weights`: (R, T) the weights of the readings at T times of R recordings.
     - `damping`: the damping of the first step.
     - `aim`: a cost that another search reached; this search ends if it is not likely to reach this
       cost. Zero for none.
-    - `margin`: the search ends at a cost of this value or less. Zero for none.
-    - `steps`: the largest number of steps, `task.stride` unless given.
-    - `level`: for a model of windows (short parts of a record of measured states), the search ends
-      after a step whose gain (fall of the cost) is about the predicted gain, but less than this
-      fraction of the gain of a fit from noise alone. Without a `level` the fraction is chosen so
-      that the search ends at a distance of about `TOLERANCES` tolerances from the minimum.
+    - `sufficient_cost`: the search ends at a cost of this value or less. Zero for none.
+    - `steps`: the largest number of steps, `task.steps_per_run` unless given.
+    - `noise_gain_fraction`: for a model of windows (short parts of a record of measured states),
+      the search ends after a step whose gain (fall of the cost) is about the predicted gain, but
+      less than this fraction of the gain of a fit from noise alone. Without the argument the
+      fraction is chosen so that the search ends at a distance of about `TOLERANCES` tolerances from
+      the minimum.
     """
-    steps, count = task.stride if steps is None else steps, nominal_count(task.model)
-    level = (TOLERANCES * task.tolerance) ** 2 if level is None else level
-    settings = Settings(task.tolerance, damping, steps, aim, margin, count, level)
+    steps, count = (
+        task.steps_per_run if steps is None else steps,
+        count_of_errors_if_unit_noise(task.model),
+    )
+    default_fraction = (TOLERANCES * task.tolerance) ** 2
+    level = default_fraction if noise_gain_fraction is None else noise_gain_fraction
+    settings = Settings(task.tolerance, damping, steps, aim, sufficient_cost, count, level)
     return least_squares_from(task.model, x, task.noise, weights, settings)
 
 
@@ -344,7 +351,9 @@ def _evaluate_at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
     k components. The evaluation uses the compiled program of the search, so that no second program
     is compiled.
     """
-    return least_squares_from(model, x, noise, whole_record(model), Settings(0.0, 1.0, 0))
+    return least_squares_from(
+        model, x, noise, weights_of_whole_record(model), Settings(0.0, 1.0, 0)
+    )
 
 
 def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Blocks:
@@ -369,7 +378,7 @@ def cost_of(model: Model, x: Float[Array, " n"], noise: Noise) -> float:
     return float(_evaluate_at(model, x, noise).cost)
 
 
-def polish(
+def search_whole_records(
     begin: Attempt,
     task: Task,
     *,
@@ -377,40 +386,40 @@ def polish(
     aim: float = 0.0,
     watch: Callable[[Attempt], None] = lambda attempt: None,
 ) -> Attempt:
-    """Return the result of a search over the whole of the records, in strides of `STRIDE` steps.
+    """Return the result of a search over the whole of the records, in runs of `STRIDE` steps.
 
-    The search ends when a stride hardly changes the misfit. Large damping alone makes steps short,
-    which can look like convergence. Each stride after the first stride therefore begins with little
+    The search ends when a run hardly changes the misfit. Large damping alone makes steps short,
+    which can look like convergence. Each run after the first run therefore begins with little
     damping.
 
     **Arguments:**
 
     - `begin`: the attempt at the first point.
     - `task`: the model, its noise, the tolerance, and the largest number of steps.
-    - `damping`: the damping of the first stride.
+    - `damping`: the damping of the first run.
     - `aim`: the cost that another start reached; a search that is not likely to reach this cost
       ends early.
-    - `watch`: a function that is called with the attempt after each stride.
+    - `watch`: a function that is called with the attempt after each run.
     """
-    attempt, weights = begin, whole_record(task.model)
+    attempt, weights = begin, weights_of_whole_record(task.model)
     for first in range(0, task.max_steps, STRIDE):
         before = float(attempt.cost)
-        end = _search_stride(attempt.x, task, weights, BOLD if first else damping, aim)
+        end = _take_marquardt_steps(attempt.x, task, weights, BOLD if first else damping, aim)
         if not np.isfinite(float(end.cost)):
             # The misfit has become infinite or NaN. The search returns to the point before this
-            # stride.
+            # run.
             attempt = Attempt(attempt.x, cost_of(task.model, attempt.x, task.noise))
             watch(attempt)
             break
-        attempt = _attempt_of(end)
+        attempt = _attempt_at_best_point(end)
         # At the minimum every step may be refused because of round-off. The search therefore also
-        # ends if the misfit does not fall any more. This test needs a whole stride: with a small
+        # ends if the misfit does not fall any more. This test needs a whole run: with a small
         # `max_steps`, one or two steps may all be refused only because they are too long.
         stands = before - float(attempt.cost) < SETTLED * (1.0 + abs(before))
-        stands = stands and task.stride == STRIDE
+        stands = stands and task.steps_per_run == STRIDE
         settled = bool(attempt.converged) or stands
-        # The search is hopeless if the misfit would still be above the aim after another stride
-        # that lowers the misfit by the same factor as this stride.
+        # The search is hopeless if the misfit would still be above the aim after another run
+        # that lowers the misfit by the same factor as this run.
         hopeless = aim > 0 and not settled and float(attempt.cost) ** 2 > aim * before
         attempt = dataclasses.replace(attempt, converged=settled)
         watch(attempt)
@@ -443,8 +452,8 @@ def fit_in_stages(
     model, noise, *_ = task
     if model.clusters is not None:
         return _fit_windows(x, task, aim, watch)
-    end = _search_stride(x, task, whole_record(model), CAREFUL, aim)
-    at_once = _attempt_of(end)
+    end = _take_marquardt_steps(x, task, weights_of_whole_record(model), CAREFUL, aim)
+    at_once = _attempt_at_best_point(end)
     if bool(end.converged) and float(end.cost) <= sufficient_misfit(model):
         watch(at_once)
         return at_once
@@ -452,7 +461,7 @@ def fit_in_stages(
     for part in HORIZONS[:-1]:
         # The fit to the beginning of the record need not converge.
         weights = weights_of_beginning(model, part)
-        end = _search_stride(x, task, weights, CAREFUL, aim * part, aim * part)
+        end = _take_marquardt_steps(x, task, weights, CAREFUL, aim * part, aim * part)
         # A point that explains the beginning of the record may be far off later in the record, for
         # instance if its drag has the wrong sign.
         after = cost_of(model, end.point, noise)
@@ -464,12 +473,16 @@ def fit_in_stages(
             attempt = Attempt(x, level)
             watch(attempt)
             return attempt
-    attempt = polish(Attempt(x), task, damping=CAREFUL, aim=aim, watch=watch)
+    attempt = search_whole_records(Attempt(x), task, damping=CAREFUL, aim=aim, watch=watch)
     if not float(at_once.cost) < (1.0 - SETTLED) * float(attempt.cost):
         return attempt
     # The fits to the beginning of the record may have led away from the minimum of the whole
     # record's misfit.
-    return at_once if bool(at_once.converged) else polish(at_once, task, aim=aim, watch=watch)
+    return (
+        at_once
+        if bool(at_once.converged)
+        else search_whole_records(at_once, task, aim=aim, watch=watch)
+    )
 
 
 def _fit_windows(
@@ -496,11 +509,13 @@ def _fit_windows(
         steps = length // part
         if steps >= SHORTEST:
             weights = weights_of_beginning(model, (steps + 0.5) / length)
-            end = _search_stride(begin, task, weights, BOLD, steps=FEW, level=ROUGH)
+            end = _take_marquardt_steps(
+                begin, task, weights, BOLD, steps=FEW, noise_gain_fraction=ROUGH
+            )
             begin = end.point if np.isfinite(float(end.cost)) else begin
-    attempt = polish(Attempt(begin), task, aim=aim, watch=watch)
+    attempt = search_whole_records(Attempt(begin), task, aim=aim, watch=watch)
     if begin is not x and not float(attempt.cost) <= cost_of(model, x, task.noise):
-        attempt = polish(Attempt(x), task, aim=aim, watch=watch)
+        attempt = search_whole_records(Attempt(x), task, aim=aim, watch=watch)
     return attempt
 
 
@@ -511,9 +526,9 @@ def has_unit_noise(reading: Reading) -> bool:
     return getattr(reading.sensor, "nominal", False)
 
 
-def nominal_count(model: Model) -> int:
+def count_of_errors_if_unit_noise(model: Model) -> int:
     """Return the number of errors of a `model` (readings times components) if the noise of every
-    sensor is only a unit for its errors, else 0.
+    sensor is only a unit for its errors, whose size is not known; else 0.
     """
     readings = model.records.readings
     return sum(map(count_of, readings)) if all(map(has_unit_noise, readings)) else 0

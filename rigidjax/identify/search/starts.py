@@ -78,9 +78,9 @@ def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) ->
             return None
         if not depends_on_rate_only(torque):
             return None
-        balances.append(balance_of_momentum(recording, torque, np.eye(3)))
+        balances.append(integrated_euler_equations(recording, torque, np.eye(3)))
     matrix, side, _ = (np.concatenate(part) for part in zip(*balances, strict=True))
-    components, _ = tensor_and_margin(matrix, side)
+    components, _ = inertia_components_and_feasibility_margin(matrix, side)
     if not components[:3].sum() > 0:
         return None
     tensor = np.einsum("k,kij->ij", components, BASIS)
@@ -90,7 +90,9 @@ def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) ->
     return Inertia(jnp.asarray(np.trace(second_moment) * np.eye(3) - second_moment))
 
 
-def tensor_and_margin(matrix: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, float]:
+def inertia_components_and_feasibility_margin(
+    matrix: np.ndarray, rhs: np.ndarray
+) -> tuple[np.ndarray, float]:
     """Return two things: the components (6,) of an inertia tensor by least squares; and a margin,
     which is positive if a body can have this tensor.
 
@@ -119,8 +121,8 @@ def depends_on_rate_only(torque: Torque | None) -> bool:
     )
 
 
-def balance_of_momentum(
-    recording: Recording, torque: Torque | None, turn: np.ndarray
+def integrated_euler_equations(
+    recording: Recording, torque: Torque | None, rate_matrix: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Euler's equations integrated over a recording, as n linear equations for the six
     components of the inertia.
@@ -131,10 +133,10 @@ def balance_of_momentum(
 
     - `recording`: the recording, which shows the body rates.
     - `torque`: a torque that depends on time and body rate alone, or `None`.
-    - `turn`: (3, 3) a matrix by which the recorded rates are multiplied first.
+    - `rate_matrix`: (3, 3) a matrix by which the recorded rates are multiplied first.
     """
     t, w = rates(recording)
-    w, pushed = w @ turn.T, np.zeros((t.size, 3))
+    w, pushed = w @ rate_matrix.T, np.zeros((t.size, 3))
     if torque is not None:
         pushed = np.asarray(_torques_at(bind(torque, sources_of(recording)), t, w))
     momenta = np.einsum("kij,tj->tki", BASIS, w)
@@ -153,7 +155,7 @@ def balance_of_momentum(
 
 
 @eqx.filter_jit
-def _torques_at(torque: Torque, t: ArrayLike, w: ArrayLike) -> Array:
+def _torques_at(torque: Torque, t: ArrayLike, w: ArrayLike) -> Float[Array, "n 3"]:
     """Return the values (n, 3) of a `torque`, N m, at the times t (n,), s, and the body rates w (n,
     3), rad/s.
 

@@ -159,7 +159,12 @@ def descend_from(
 
 @eqx.filter_jit
 def _descent_steps(
-    x: Float[Array, " n"], memory: PyTree, model: Model, noise: Noise, descent: Descent, keys: Array
+    x: Float[Array, " n"],
+    optimiser_state: PyTree,
+    model: Model,
+    noise: Noise,
+    descent: Descent,
+    keys: Array,
 ) -> tuple[Float[Array, " n"], PyTree, Float[Array, " steps"]]:
     """Return three things after several steps of stochastic gradient descent: the free numbers x
     (n,); the state of the optimiser; and an array (steps,) with the misfit before each step.
@@ -168,7 +173,7 @@ def _descent_steps(
     scaled up to the number of all recordings, plus that of the priors.
 
     - `x`: (n,) the free numbers before the first step.
-    - `memory`: the state of the optimiser before the first step.
+    - `optimiser_state`: the state of the optimiser before the first step.
     - `model`: the readings and the free numbers.
     - `noise`: for each sensor the standard deviations (R, k) of its noise, for R recordings and k
       components of an error.
@@ -176,22 +181,24 @@ def _descent_steps(
     - `keys`: (steps,) a random key for each step, which draws its recordings.
     """
 
-    def step(carry: tuple, key: Array) -> tuple[tuple, Array]:
-        x, memory = carry
+    def descent_step(carry: tuple, key: Array) -> tuple[tuple, Array]:
+        x, optimiser_state = carry
         update: Any = descent.optimiser.update
         rows = jax.random.choice(key, model.count, (descent.batch,), replace=False)
         cost, slope = jax.value_and_grad(misfit_of)(x, model, noise, rows)
         # optax multiplies its integer count of steps by floats, which strict promotion would
         # refuse.
         with jax.numpy_dtype_promotion("standard"):
-            move, memory = update(slope, memory, x)
-        return (x + move, memory), cost
+            move, optimiser_state = update(slope, optimiser_state, x)
+        return (x + move, optimiser_state), cost
 
-    (x, memory), costs = jax.lax.scan(step, (x, memory), keys)
-    return x, memory, costs
+    (x, optimiser_state), costs = jax.lax.scan(descent_step, (x, optimiser_state), keys)
+    return x, optimiser_state, costs
 
 
-def misfit_of(x: Float[Array, " n"], model: Model, noise: Noise, rows: Array) -> Float[Array, ""]:
+def misfit_of(
+    x: Float[Array, " n"], model: Model, noise: Noise, recording_indices: Array
+) -> Float[Array, ""]:
     """Return the misfit of some recordings, scaled up to the number of all recordings, plus the
     misfit of the priors.
 
@@ -199,21 +206,28 @@ def misfit_of(x: Float[Array, " n"], model: Model, noise: Noise, rows: Array) ->
 
     - `x`: (n,) the free numbers of the `model`.
     - `noise`: for each sensor the standard deviations (R, k) of its noise.
-    - `rows`: the indices of the recordings.
+    - `recording_indices`: the indices of the recordings.
     """
-    few, sizes = chosen_recordings(model, rows), stacking.pick_records(noise, rows)
+    few, sizes = (
+        chosen_recordings(model, recording_indices),
+        stacking.pick_records(noise, recording_indices),
+    )
     weights = jnp.ones_like(few.records.t)
     residuals = reading_residuals(few, all_errors(few, x), sizes, weights)
-    scale = model.count / rows.shape[0]
+    scale = model.count / recording_indices.shape[0]
     return half_sum_of_squares(residuals) * scale + half_sum_of_squares(prior_residuals(model, x))
 
 
-def chosen_recordings(model: Model, rows: Array) -> Model:
-    """Return the model with only the recordings of indices `rows`, and with all free numbers.
+def chosen_recordings(model: Model, recording_indices: Array) -> Model:
+    """Return the model with only the recordings of indices `recording_indices`, and with all free
+    numbers.
 
     The indices may be traced; the recordings keep their padding.
     """
     parts = lambda m: (m.records, m.reference, m.body_indices, m.index.places, m.index.start)  # noqa: E731
     return eqx.tree_at(
-        parts, model, stacking.pick_records(parts(model), rows), is_leaf=lambda node: node is None
+        parts,
+        model,
+        stacking.pick_records(parts(model), recording_indices),
+        is_leaf=lambda node: node is None,
     )

@@ -467,10 +467,12 @@ class TestBadInput:
 
     def test_a_step_without_each_reading(self):
         with pytest.raises(
-            ValueError, match=r"readings: wanted one for each sensor \(Gyro\), got 0"
+            ValueError, match=r"readings: wanted one entry for each sensor \(Gyro\), got 0"
         ):
             identify.step(self.model, self.start(), 0.1)
-        with pytest.raises(ValueError, match=r"mask: wanted one for each sensor \(Gyro\), got 2"):
+        with pytest.raises(
+            ValueError, match=r"mask: wanted one entry for each sensor \(Gyro\), got 2"
+        ):
             identify.step(self.model, self.start(), 0.1, jnp.zeros(3), mask=[True, False])
 
     def test_several_recordings(self):
@@ -524,7 +526,7 @@ class TestBadInput:
             identify.first_belief(self.model, state=records.START, rate=0.1)
         with pytest.raises(ValueError, match="rate: wanted a finite"):
             identify.first_belief(self.model, rate=-1.0)
-        with pytest.raises(ValueError, match="attitude: a Spin has none"):
+        with pytest.raises(ValueError, match="attitude: a Spin has no attitude"):
             identify.first_belief(self.model, rate=0.1, attitude=0.1)
 
     def test_readings_that_show_no_attitude(self):

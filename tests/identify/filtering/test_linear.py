@@ -87,7 +87,7 @@ def test_roots_of_a_covariance_that_is_singular():
 def test_a_million_to_one_in_single_precision():
     # Where the covariance itself loses its sign: P = diag(1, 1) read to 1e-6 along (1, 1).
     one = jnp.ones(1, jnp.float32)
-    found = roots.update(
+    found = roots.kalman_update(
         jnp.zeros(2, jnp.float32),
         jnp.eye(2, dtype=jnp.float32),
         jnp.ones((1, 2), jnp.float32),

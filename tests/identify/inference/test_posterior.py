@@ -15,7 +15,7 @@ from identify.filtering import records
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.answer.answers import Answer
-from rigidjax.identify.filtering.terms import curvature
+from rigidjax.identify.filtering.terms import cost_gradient_and_information
 from rigidjax.identify.model.terms import errors_and_jacobians
 from rigidjax.identify.uncertainty.covariance import linearise
 
@@ -484,7 +484,9 @@ def test_the_information_is_the_covariance_of_the_gradient(fitted, process):
         real = records.truth(keys[0], torque, rj.Spin(records.START.omega), ts, 2, body=body)
         omega = records.gyro(keys[1], real.states.omega, 0.02)
         where = lambda d: d.model.records.readings[0].values
-        return curvature(eqx.tree_at(where, density, omega[None]).model, density.x0)
+        return cost_gradient_and_information(
+            eqx.tree_at(where, density, omega[None]).model, density.x0
+        )
 
     keys = jax.random.split(jax.random.key(5), many)
     found = jax.jit(lambda keys: jax.lax.map(one, keys))(keys)
