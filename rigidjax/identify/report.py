@@ -175,7 +175,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
         "rms": {
             f"{index} {name}": {"value": plain(rms), "axes": list(map(plain, axes)), "unit": unit}
             for index, ((name, axes, unit), rms) in enumerate(
-                zip(_rms_of_axes(fit), fit.rms, strict=True)
+                zip(_rms_errors_of_components(fit), fit.rms, strict=True)
             )
         },
         "noise": [
@@ -206,7 +206,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
     }
 
 
-def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
+def _rms_errors_of_components(fit: Fit) -> list[tuple[str, list[float], str]]:
     """Return three things for each sensor of a `fit`: its name; the root mean square error of each
     of its components; and its unit.
 
@@ -214,7 +214,7 @@ def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
     """
     out = []
     for error, reading in zip(fit.residuals, fit.model.records.readings, strict=True):
-        mask = reading.channel_mask
+        mask = reading.usable_channel_mask
         squares = np.where(mask, np.asarray(error).reshape(mask.shape) ** 2, 0.0)
         mean = squares.sum(axis=(0, 1)) / np.maximum(mask.sum(axis=(0, 1)), 1)
         sensor = reading.sensor
@@ -274,10 +274,14 @@ def write_html(
     '<!doctype html>'
     """
     require_one_fit(fit)
-    units = [_show.scale_and_unit_to_show(unit, rate_unit) for *_, unit in _rms_of_axes(fit)]
+    units = [
+        _show.scale_and_unit_to_show(unit, rate_unit) for *_, unit in _rms_errors_of_components(fit)
+    ]
     sizes = _table_rows_as_html(
         (name, " ".join(f"{scale * x:.3g}" for x in axes), unit)
-        for (name, axes, _), (scale, unit) in zip(_rms_of_axes(fit), units, strict=True)
+        for (name, axes, _), (scale, unit) in zip(
+            _rms_errors_of_components(fit), units, strict=True
+        )
     )
     starts = _table_rows_as_html(
         (

@@ -26,9 +26,9 @@ from rigidjax.identify.model.model import Model, require_single_model
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.identify.uncertainty import covariance as uncertainty
 from rigidjax.identify.uncertainty.quantities import (
-    quantities,
+    quantities_and_derivatives_in_numpy,
+    reported_quantities,
     standard_deviations,
-    values_and_slopes,
 )
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot
@@ -365,14 +365,14 @@ def _widen_covariance_for_shape_errors(best: Fit) -> Fit:
         np.asarray(c) + shift @ shift.T for c in (best.covariance, best.determined_covariance)
     )
     null = np.asarray(best.null_directions)
-    numbers = values_and_slopes(best.model, best.x, best.near)
+    numbers = quantities_and_derivatives_in_numpy(best.model, best.x, best.near)
     freedom = best.degrees_of_freedom(numbers[1])
     return dataclasses.replace(
         best,
         covariance=jnp.asarray(covariance),
         determined_covariance=jnp.asarray(seen),
         covariance_kind=f"sandwich: a shape {SHAPE:.0%} off the ellipsoid; {best.covariance_kind}",
-        quantities=quantities(best.model, numbers, seen, null, best.limits, freedom),
+        quantities=reported_quantities(best.model, numbers, seen, null, best.limits, freedom),
     )
 
 

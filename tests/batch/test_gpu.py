@@ -77,7 +77,9 @@ def test_reverse_over_reverse_is_refused():
 
 
 def test_a_gpu_takes_steps_in_pieces(monkeypatch):
-    """A rollout with that loop; with its barriers, without which XLA compiles for minutes on a CPU."""
+    """A rollout with that loop; with its barriers, without which XLA compiles for minutes on a
+    CPU.
+    """
     taken = []
 
     def in_pieces(*args):
@@ -135,15 +137,15 @@ def test_a_small_fit_on_a_machine_with_a_gpu(monkeypatch):
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), jnp.ones((9, 3))))
     model = rj.identify.Model(record, rj.identify.PrincipalRatios())
     cpu = jax.devices("cpu")[0]
-    assert fits._faster_device(model) is None
+    assert fits._cpu_if_faster(model) is None
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert platform() == "gpu"
-    assert fits._faster_device(model) == cpu
+    assert fits._cpu_if_faster(model) == cpu
     with jax.default_device(cpu):
         assert platform() == "cpu"
-        assert fits._faster_device(model) is None
+        assert fits._cpu_if_faster(model) is None
     monkeypatch.setattr(fits, "_FEW", 10)
-    assert fits._faster_device(model) is None
+    assert fits._cpu_if_faster(model) is None
 
 
 def test_the_benchmark_in_small():

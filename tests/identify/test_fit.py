@@ -286,7 +286,12 @@ def test_a_record_of_another_length_is_the_same_program(caplog):
         short = fitted(92)
     # `simulate` is another one, with what it does beside.
     programs = set(re.findall(r"Compiling jit\((\w+)\)", caplog.text))
-    named = {"least_squares_from", "_errors_without_derivatives", "_linearised", "value_and_slope"}
+    named = {
+        "least_squares_from",
+        "_errors_without_derivatives",
+        "_weighted_errors_and_derivatives",
+        "_compiled_quantities_and_derivatives",
+    }
     assert not programs & named
     assert short.residuals[0].shape == (92, 3) and short.model.recording.t.shape == (92,)
     with pytest.MonkeyPatch.context() as patch:

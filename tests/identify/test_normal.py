@@ -114,8 +114,8 @@ def test_a_matrix_that_is_not_positive_has_no_solution():
 def jacobian(linear):
     """The weighted Jacobian, row by row, in the columns of all numbers."""
     rows = [np.diag(linear.prior_weights), linear.extra_slopes]
-    for block, where in zip(linear.dense, linear.places, strict=True):
-        wide = np.zeros((len(block), linear.size + 1))
+    for block, where in zip(linear.weighted_jacobian, linear.places, strict=True):
+        wide = np.zeros((len(block), linear.free_count + 1))
         np.add.at(wide.T, where, block.T)
         rows.append(wide[:, :-1])
     return np.concatenate(rows)
@@ -150,17 +150,17 @@ def test_the_covariance_is_the_inverse_of_the_information(count):
 def test_the_sandwich_is_the_product_of_its_definition(count):
     linear = linear_at(several(9) if count > 1 else near_a_guess())
     white = uncertainty.white_covariance(linear)
-    _, triangles = np.linalg.qr(linear.dense)
+    _, triangles = np.linalg.qr(linear.weighted_jacobian)
     meat = RNG.normal(size=(count, triangles.shape[2], triangles.shape[1]))
     meat = meat @ meat.swapaxes(1, 2)
     # Priors have their own information in the middle.
     middle = np.diag(linear.prior_weights**2) + linear.extra_slopes.T @ linear.extra_slopes
     for triangle, where, m in zip(triangles, linear.places, meat, strict=True):
-        wide = np.zeros((len(triangle), linear.size + 1))
+        wide = np.zeros((len(triangle), linear.free_count + 1))
         wide[:, where] = triangle
         middle += wide[:, :-1].T @ m @ wide[:, :-1]
     wanted = white.determined @ middle @ white.determined
-    found = white.root.sandwich(triangles, linear.places, meat)
+    found = white.root.sandwich_covariance(triangles, linear.places, meat)
     size = np.sqrt(np.diag(wanted))
     np.testing.assert_allclose(
         found / np.outer(size, size), wanted / np.outer(size, size), atol=1e-7
@@ -180,7 +180,11 @@ def test_what_is_not_determined_is_found_in_the_shared_numbers_and_in_those_of_o
     size = np.sqrt(np.sum(rows**2, axis=0))
     # A column of round-off is none.
     size = np.maximum(size, 1e-6 * size.max())
-    assert len(found.null_directions) == linear.size - np.linalg.matrix_rank(rows / size, 1e-8) == 4
+    assert (
+        len(found.null_directions)
+        == linear.free_count - np.linalg.matrix_rank(rows / size, 1e-8)
+        == 4
+    )
     reach = np.abs(rows @ found.null_directions.T).max(axis=0)
     assert (reach < 1e-7 * np.abs(rows).max()).all()
     # Within the others it is the inverse: H C H = H.
@@ -228,7 +232,7 @@ def test_fewer_readings_than_numbers_are_told():
     linear = linear_at(identify.Model(few, identify.Ratios(), free=free))
     found = uncertainty.white_covariance(linear)
     # Six numbers read and nine of its own in each recording, and five of all.
-    assert len(found.null_directions) == linear.size - 54 == 32
+    assert len(found.null_directions) == linear.free_count - 54 == 32
 
 
 def test_many_recordings_are_fitted_as_few_are():

@@ -13,9 +13,9 @@ import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import report
 from rigidjax.identify.uncertainty.quantities import (
-    quantities,
+    quantities_and_derivatives_in_numpy,
+    reported_quantities,
     standard_deviations,
-    values_and_slopes,
 )
 
 NONE = np.zeros((0, 2))
@@ -64,9 +64,9 @@ def test_an_indefinite_information_is_told():
     found = fitted()
     seen = np.asarray(found.determined_covariance).copy()
     seen[0, 0] = -seen[0, 0]
-    numbers = quantities(
+    numbers = reported_quantities(
         found.model,
-        values_and_slopes(found.model, found.x, None),
+        quantities_and_derivatives_in_numpy(found.model, found.x, None),
         seen,
         np.asarray(found.null_directions),
     )
@@ -87,18 +87,18 @@ def test_an_indefinite_information_is_told():
 def test_a_fitted_number_has_a_width():
     # Exact readings whose noise is estimated: round-off is all there is.
     found = fitted()
-    exact = quantities(
+    exact = reported_quantities(
         found.model,
-        values_and_slopes(found.model, found.x, None),
+        quantities_and_derivatives_in_numpy(found.model, found.x, None),
         1e-40 * np.asarray(found.determined_covariance),
         np.zeros((0, 5)),
     )
     for number in exact:
         low, high = number.interval(0.95)
         assert low < number.value < high
-    still = quantities(
+    still = reported_quantities(
         found.model,
-        values_and_slopes(found.model, found.x, None),
+        quantities_and_derivatives_in_numpy(found.model, found.x, None),
         np.zeros((5, 5)),
         np.zeros((0, 5)),
     )

@@ -690,26 +690,28 @@ leave_out(
     "taken: tests/identify/test_flat_limit.py",
     *(f"identify.{name}.bend" for name in (
         "AbstractBodyChart", "Mass", "Principal", "PrincipalRatios", "Ratios", "Tensor")),
-    "body.parameters.flat_bend", "identify.Fit.derivative_point", "identify.Limit", "identify.Limit.bound",
-    "identify.Limit.deviation", "identify.Limit.is_near",
+    "body.parameters.flat_bend", "identify.Fit.derivative_point", "identify.Limit", "identify.Limit.flatness_upper_bound",
+    "identify.Limit.flatness_deviation", "identify.Limit.is_flat_within",
 )  # fmt: skip
 leave_out(
     "errors that are considered, against refits of readings that are off: "
     "tests/identify/uncertainty/test_considered.py",
     "identify.Consideration",
-    "identify.Freedom.estimated_degrees",
+    "identify.Freedom.degrees_of_freedom_of_estimated_variance",
 )
 leave_out(
     "the errors and derivatives of a fit, from which its covariance follows: "
     "tests/identify/test_uncertainty.py",
     "identify.Linearisation",
     *(f"identify.Linearisation.{name}" for name in (
-        "squared_change", "blocks", "dense", "first_times", "information", "rows", "scores", "size",
-        "misfit_gradient", "to_all_numbers")),
+        "squared_residual_change", "covariance_by_recording", "first_times", "free_count",
+        "information_by_sensor", "weighted_jacobian", "weighted_jacobians_by_sensor",
+        "misfit_gradients_by_recording",
+        "misfit_gradient", "rows_for_all_numbers")),
 )  # fmt: skip
 leave_out(
     "compared with the intervals of Welch and Student: tests/identify/test_freedom.py",
-    "identify.Fit.degrees_of_freedom", "identify.Freedom", "identify.Freedom.degrees",
+    "identify.Fit.degrees_of_freedom", "identify.Freedom", "identify.Freedom.degrees_of_freedom_of_variance",
 )  # fmt: skip
 leave_out(
     "abstract: made by subclassing",

@@ -8,10 +8,10 @@ from jaxtyping import Float
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.uncertainty.considered import (
     Consideration,
-    describe_considered,
-    slot_of,
+    describe_considered_errors,
+    slot_of_sensor_member,
 )
-from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
+from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
 from rigidjax.identify.uncertainty.quantities import Quantity
 
 # One sentence names at most this number of quantities.
@@ -25,14 +25,14 @@ _WAYS = {
     "cross_axis": "an axis that leans by 1°",
 }
 
-Moves = Sequence[tuple[int, dict[str, Float[np.ndarray, " quantities"]]]]
+UsualShifts = Sequence[tuple[int, dict[str, Float[np.ndarray, " quantities"]]]]
 
 
-def allowance(
+def describe_allowed_sensor_errors(
     model: Model,
-    parts: tuple[Consideration, ...],
-    moves: Moves,
-    named: Sequence[Quantity],
+    considered_errors: tuple[Consideration, ...],
+    usual_shifts: UsualShifts,
+    quantities: Sequence[Quantity],
 ) -> str:
     """Return sentences on the sensor errors that the intervals of a fit allow for, and on the
     sensor errors that the intervals do not allow for.
@@ -40,20 +40,21 @@ def allowance(
     **Arguments:**
 
     - `model`: the fitted model.
-    - `parts`: the considered errors, which are the errors of the sensors with a `Tolerance`.
-    - `moves`: for each sensor without a tolerance a pair: the index of the sensor, and for each
-      kind of error ("scale", "cross_axis") how far a usual error would move each quantity in
-      `named` (from `considered.unit_moves`).
-    - `named`: the quantities to write about.
+    - `considered_errors`: the errors that the intervals allow for. They are the errors of the
+      sensors with a `Tolerance`.
+    - `usual_shifts`: for each sensor without a tolerance a pair: the index of the sensor, and a
+      dict of kind of error ("scale" or "cross_axis") → how far a usual error of this kind would
+      move each of the `quantities` (from `considered.quantity_shifts_by_usual_errors`).
+    - `quantities`: the reported quantities that the sentences name.
     """
     out = []
     sensors = model.records.sensors
-    if parts:
-        out.append(f"They allow for {describe_considered(parts, sensors)}.")
-    for index, by_kind in moves:
+    if considered_errors:
+        out.append(f"They allow for {describe_considered_errors(considered_errors, sensors)}.")
+    for index, by_kind in usual_shifts:
         clauses = [
-            f"{_WAYS[kind]} would move {_describe_shifts(named, sizes)}"
-            for kind, sizes in by_kind.items()
+            f"{_WAYS[kind]} would move {_describe_quantity_shifts(quantities, shifts)}"
+            for kind, shifts in by_kind.items()
         ]
         name = type(sensors[index]).__name__
         out.append(
@@ -74,7 +75,7 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
     """
     out = []
     for index, reading in enumerate(model.records.readings):
-        slot, sensor = slot_of(model, index, "bias"), reading.sensor
+        slot, sensor = slot_of_sensor_member(model, index, "bias"), reading.sensor
         if slot is None or slot.prior is not None:
             continue
         largest = max(
@@ -92,22 +93,25 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
     return " ".join(out)
 
 
-def _describe_shifts(named: Sequence[Quantity], sizes: Float[np.ndarray, " quantities"]) -> str:
-    """Return words such as "I1 by 0.02 (interval ±0.1)", which say how far each reported quantity
-    would move if a sensor had a small constant error, such as an error of 1 % in the scale of one
-    axis.
+def _describe_quantity_shifts(
+    quantities: Sequence[Quantity], shifts: Float[np.ndarray, " quantities"]
+) -> str:
+    """Describe by how much each reported quantity would move if a sensor had a small constant
+    error, such as an error of 1 % in the scale of one axis.
 
-    In brackets stands half the width of the 95 % interval of the quantity, if it is finite. At most
-    `MOST` quantities are named.
+    The words are such as "I1 by 0.02 (interval ±0.1)": in brackets stands half the width of the
+    95 % interval of the quantity, if it is finite. At most `MOST` quantities are named.
 
-    - `named`: the reported quantities, q of them.
-    - `sizes`: (q,) by how much each quantity moves: relative to its value if the quantity is
+    **Arguments:**
+
+    - `quantities`: the q reported quantities.
+    - `shifts`: (q,) by how much each quantity moves: relative to its value if the quantity is
       positive (a moment, a mass), else in its unit.
     """
     words = []
-    for quantity, size in list(zip(named, sizes, strict=True))[:MOST]:
+    for quantity, shift in list(zip(quantities, shifts, strict=True))[:MOST]:
         unit = quantity.value if quantity.positive else 1.0
-        half = float(quantile(0.95, quantity.freedom)) * quantity.deviation
-        shown = f"{quantity.name} by {abs(unit) * size:.2g}"
+        half = float(two_sided_student_quantile(0.95, quantity.freedom)) * quantity.deviation
+        shown = f"{quantity.name} by {abs(unit) * shift:.2g}"
         words.append(f"{shown} (interval ±{half:.2g})" if np.isfinite(half) else shown)
     return ", ".join(words)

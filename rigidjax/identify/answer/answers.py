@@ -60,9 +60,9 @@ class Cause(eqx.Module):
 
 
 def joined_status(search: Answer, model: Answer) -> str:
-    """Return the answers on the `search` and on the `model` in one line.
+    """Return the answer on the `search` and the answer on the `model` in one line of text.
 
-    The line is `ok` if the search found the best point, the model explains the readings, and
+    The text is `ok` if the search found the best point, the model explains the readings, and
     neither answer has a reason.
     """
     if search == Answer(FOUND) and model == Answer(EXPLAINS):
@@ -70,13 +70,13 @@ def joined_status(search: Answer, model: Answer) -> str:
     return f"search: {search}; model: {model}"
 
 
-def advice(
+def advice_on_intervals(
     search: Answer,
     model: Answer,
     causes: tuple[Cause, ...],
-    kind: str,
-    above: float,
-    allowed: str,
+    covariance_kind: str,
+    error_ratio: float,
+    allowance: str,
 ) -> str:
     """Return words that say whether the intervals can be trusted, and what to try.
 
@@ -84,9 +84,11 @@ def advice(
 
     - `search`, `model`: the answers on the search and on the model.
     - `causes`: the likely causes of the errors.
-    - `kind`: the method by which the covariance was computed, in words, such as "jackknife".
-    - `above`: the size of the errors over the given noise.
-    - `allowed`: the sentences that `allowance` returned on the sensor errors.
+    - `covariance_kind`: the method by which the covariance was computed, in words, such as
+      "jackknife: …".
+    - `error_ratio`: by how many times the errors are larger than the given noise of the sensors.
+    - `allowance`: sentences on the sensor errors that the intervals allow for, as
+      `describe_allowed_sensor_errors` returns them.
     """
     remedies = list(dict.fromkeys(cause.remedy for cause in causes))
     tries = f" Try: {'; '.join(remedies)}." if remedies else ""
@@ -109,15 +111,17 @@ def advice(
             "The intervals cannot be trusted: they assume random errors, and one cause makes "
             f"most of these errors.{tries}"
         )
-    if above > FAR:
+    if error_ratio > FAR:
         return f"The intervals cannot be trusted: the sensors make no errors of this size.{tries}"
-    if kind.startswith("jackknife") and model.word != LEAVES:
+    if covariance_kind.startswith("jackknife") and model.word != LEAVES:
         remarks = "; read the remarks, too" if search.reasons or model.reasons else ""
         words = "The intervals allow for errors that differ from stretch to stretch of the windows"
-        return f"{words}{remarks}. {allowed}"
+        return f"{words}{remarks}. {allowance}"
     if model.word == LEAVES:
-        lasting = "allow" if kind.startswith(("sandwich", "jackknife")) else "do not allow"
-        return f"The intervals {lasting} for autocorrelated errors of this size. {allowed}{tries}"
+        lasting = (
+            "allow" if covariance_kind.startswith(("sandwich", "jackknife")) else "do not allow"
+        )
+        return f"The intervals {lasting} for autocorrelated errors of this size. {allowance}{tries}"
     if search.reasons or model.reasons:
-        return f"The intervals allow for the noise; read the remarks, too. {allowed}{tries}"
-    return f"The intervals allow for the noise. {allowed}"
+        return f"The intervals allow for the noise; read the remarks, too. {allowance}{tries}"
+    return f"The intervals allow for the noise. {allowance}"

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rigidjax import _show
-from rigidjax.identify.answer.allowance import allowance, describe_large_biases
+from rigidjax.identify.answer.allowance import describe_allowed_sensor_errors, describe_large_biases
 from rigidjax.identify.answer.answers import (
     EXPLAINS,
     FAILS,
@@ -33,19 +33,23 @@ from rigidjax.identify.search.stages import (
     has_unit_noise,
 )
 from rigidjax.identify.uncertainty import considered, covariance as uncertainty, flat_limit
-from rigidjax.identify.uncertainty.covariance import CorrelationTimes, Linearisation, scatter
-from rigidjax.identify.uncertainty.degrees_of_freedom import freedom_of
-from rigidjax.identify.uncertainty.flat_limit import unreal_bodies
+from rigidjax.identify.uncertainty.covariance import (
+    CorrelationTimes,
+    Linearisation,
+    white_noise_variance,
+)
+from rigidjax.identify.uncertainty.degrees_of_freedom import prepare_degrees_of_freedom
+from rigidjax.identify.uncertainty.flat_limit import describe_unreal_bodies
 from rigidjax.identify.uncertainty.quantities import (
     Quantity,
-    charts_by_suffix,
-    quantities as quantities_of,
-    values_and_slopes,
+    name_suffixes_and_charts,
+    quantities_and_derivatives_in_numpy,
+    reported_quantities,
 )
 from rigidjax.identify.uncertainty.stretches import (
-    jackknife,
-    remarks_on_stretches as remarks_on,
-    stretches_of,
+    jackknife_covariance,
+    leave_out_each_stretch,
+    remarks_on_dependence_on_one_stretch,
 )
 
 # The test for autocorrelated errors has this rate of false alarms. The rate is low because one fit
@@ -60,7 +64,7 @@ LAGS = 10
 HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
-def goodness(
+def goodness_of_fit(
     model: Model,
     noise: Noise,
     linear: Linearisation,
@@ -86,14 +90,14 @@ def goodness(
     - `times`: the autocorrelation times of the errors.
     - `covariance`: (n, n) the covariance of the free numbers for white errors.
     """
-    chi2, count, word, free = 0.0, 0, EXPLAINS, linear.size
+    chi2, count, word, free = 0.0, 0, EXPLAINS, linear.free_count
     words: list[str] = []
     sensors: list[int] = []
-    own, readings = linear.blocks(covariance), model.records.readings
+    own, readings = linear.covariance_by_recording(covariance), model.records.readings
     parts = zip(readings, linear.raw, linear.errors, linear.weights, linear.mask, strict=True)
     for index, (reading, error, e, weight, mask) in enumerate(parts):
         has_noise = reading.sensor.noise is not None
-        left, varies, tiny = _sums_of_squares(reading, error, mask)
+        left, varies, tiny = _sums_of_squares_of_errors_readings_round_off(reading, error, mask)
         factor = 1.0
         if has_noise:
             total, many = float(np.sum((weight[..., None] * e**2)[mask])), int(mask.sum())
@@ -102,7 +106,7 @@ def goodness(
             factor = float(np.sqrt(total / dof)) if total > dof + 5 * np.sqrt(2 * dof) else 1.0
             if model.loss is not None and many:
                 squares = np.sum(e[mask.all(axis=-1)] ** 2, axis=-1)
-                factor = _excess_by_median(squares, e.shape[-1])
+                factor = _noise_ratio_by_median(squares, e.shape[-1])
         root = np.sqrt(weight)[..., None]
         slope = linear.slopes[index] * root[..., None]
         white = left <= tiny or _is_white(e * root, mask, slope, own, has_noise)
@@ -121,7 +125,7 @@ def goodness(
         # An error has the unit of the reading only if both have the same number of components.
         alike = int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
         share = left / varies if varies > tiny and alike else None
-        span = None if white else times.longest
+        span = None if white else times.longest_span
         words.append(_describe_errors(model, reading, error, mask, factor, share, span))
     return chi2, max(count - free, 1), Answer(word, tuple(words)), tuple(sensors)
 
@@ -161,14 +165,14 @@ def _describe_errors(
     if span is not None:
         channels = [np.moveaxis(x, -1, 0).reshape(-1, x.shape[1]) for x in (error, mask)]
         rows = [row[mask] for row, mask in zip(*channels, strict=True)]
-        apart = scatter(rows)
+        apart = white_noise_variance(rows)
         over = np.sqrt(np.mean(np.concatenate(rows) ** 2) / apart) if apart > 0 else np.inf
         words.append(f"{over:.3g} times their scatter between neighbours")
         words.append(f"autocorrelated over {span:.0f} samples")
-    return f"{', '.join(words)}, {_describe_interval(model, error, mask)}"
+    return f"{', '.join(words)}, {_describe_time_of_largest_errors(model, error, mask)}"
 
 
-def _describe_interval(model: Model, error: np.ndarray, mask: np.ndarray) -> str:
+def _describe_time_of_largest_errors(model: Model, error: np.ndarray, mask: np.ndarray) -> str:
     """Describe the shortest interval of time that contains half of the sum of squared errors of a
     sensor.
 
@@ -196,46 +200,57 @@ def _describe_interval(model: Model, error: np.ndarray, mask: np.ndarray) -> str
     return f"half of the squared ones from {times} s{of_recording}"
 
 
-def _sums_of_squares(
+def _sums_of_squares_of_errors_readings_round_off(
     reading: Reading, error: np.ndarray, mask: np.ndarray
 ) -> tuple[float, float, float]:
-    """Return three sums of squares of one sensor: of its errors; of its readings about their mean;
-    and of the round-off of its readings.
+    """Return three sums of squares for one sensor: of its errors; of the differences of its
+    readings from their mean; and of the round-off of its readings.
 
-    **Arguments:** `reading` the readings of the sensor with their mask; `error` (R, T, k) reading
-    minus prediction, for R recordings, T times and k components; `mask` (R, T, k) true for the
-    errors to use, those of readings that are neither masked nor at full scale.
+    **Arguments:**
+
+    - `reading`: the readings of the sensor, with their mask.
+    - `error`: (R, T, k) reading minus prediction, for R recordings, T times and k components.
+    - `mask`: (R, T, k) true for the errors to use: those of readings that are neither masked nor at
+      full scale.
     """
     values = np.asarray(reading.values)[reading.host_mask]
     varies = float(np.sum((values - values.mean(axis=0)) ** 2))
     return float(np.sum(error[mask] ** 2)), varies, 1e-12 * float(np.sum(values**2))
 
 
-def _excess_by_median(squares: np.ndarray, size: int) -> float:
-    """Return the factor by which whitened errors are larger than noise of unit variance.
+def _noise_ratio_by_median(squared_lengths: np.ndarray, components: int) -> float:
+    """Return the factor by which errors are larger than their given noise.
 
-    The factor is √(m/m₁): m is the median of the squared lengths of the errors, and m₁ is the
-    median that noise of unit variance has. The factor is 1 if m is less than five of its standard
-    deviations above m₁, since so small an excess may be chance. The median is taken because
-    outliers are expected under a robust loss, and outliers would dominate χ².
+    The errors are given in standard deviations of the noise. The factor is √(m/m₁): m is the median
+    of their squared lengths, and m₁ is the median for errors that are as large as the noise. The
+    factor is 1 if m is less than five of its standard deviations above m₁, since so small an excess
+    may be chance. The median takes the place of χ² under a robust loss: outliers are expected
+    there, and outliers would dominate χ².
 
-    **Arguments:** `squares` (N,) the squared length of each of N errors, in standard deviations of
-    the noise; `size` the number of components of an error.
+    **Arguments:**
+
+    - `squared_lengths`: (N,) the squared length of each of N errors.
+    - `components`: the number of components of an error.
     """
-    if not squares.size:
+    if not squared_lengths.size:
         return 1.0
-    middle = float(np.median(squares))
-    half, density = median_and_density_of_chi2(size)
+    middle = float(np.median(squared_lengths))
+    half, density = median_and_density_of_chi2(components)
     # The standard deviation of the median of n samples is 1 / (2 f √n), with f the density at the
     # median.
-    wide = 0.5 / (density * np.sqrt(squares.size))
+    wide = 0.5 / (density * np.sqrt(squared_lengths.size))
     return float(np.sqrt(middle / half)) if middle > half + 5 * wide else 1.0
 
 
 def _is_white(
-    errors: np.ndarray, used: np.ndarray, slope: np.ndarray, covariance: np.ndarray, has_noise: bool
+    errors: np.ndarray,
+    mask_of_used: np.ndarray,
+    slope: np.ndarray,
+    covariance: np.ndarray,
+    has_noise: bool,
 ) -> bool:
-    """Return whether the errors of a sensor are not autocorrelated, by Ljung and Box's test.
+    """Return whether the errors of a sensor are white (not autocorrelated), by Ljung and Box's
+    test.
 
     A fit makes white errors correlated: it subtracts `slope covariance slopeᵀ` from their
     covariance, which shows in many short recordings (Box and Pierce 1970,
@@ -245,8 +260,8 @@ def _is_white(
 
     - `errors`: (R, T, k) the whitened errors (in standard deviations) in R recordings, at T times,
       of k components.
-    - `used`: (R, T, k) true for the errors to use: those of readings that are neither masked nor at
-      full scale.
+    - `mask_of_used`: (R, T, k) true for the errors to use: those of readings that are neither
+      masked nor at full scale.
     - `slope`: (R, T, k, m) the derivatives of the errors with respect to the m free numbers of each
       recording.
     - `covariance`: (R, m, m) the covariance of the free numbers of each recording, computed as if
@@ -258,8 +273,8 @@ def _is_white(
 
     total, degrees = 0.0, 0
     for channel in range(errors.shape[-1]):
-        long = used[..., channel].sum(axis=1) >= 2 * LAGS
-        mask = used[long, :, channel]
+        long = mask_of_used[..., channel].sum(axis=1) >= 2 * LAGS
+        mask = mask_of_used[long, :, channel]
         x = _masked_entries_about_mean(errors[long, :, channel, None], mask)[..., 0]
         j = _masked_entries_about_mean(slope[long, :, channel], mask)
         taken, count = j @ covariance[long], len(mask)
@@ -297,8 +312,8 @@ AT_THE_END = 0.05
 def _answer_on_search(
     best_cost: float, ended: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
 ) -> Answer:
-    """Return the answer of a fit on its search: found, not alone (another motion fits too), or not
-    ended.
+    """Return the answer of a fit on its search: `found`, `not alone` (another motion fits, too), or
+    `not ended`.
 
     **Arguments:**
 
@@ -344,7 +359,7 @@ def _count_rivals(
             away = item.x - x
             # Two points of a flat valley differ, but predict the same readings: such points are not
             # counted as different.
-            count += linear.squared_change(np.asarray(away)) > 2 * margin
+            count += linear.squared_residual_change(np.asarray(away)) > 2 * margin
     return count
 
 
@@ -371,25 +386,34 @@ def assess(
     - `interrupted`, `remarks`: reasons for the answer on the search, in words.
     """
     x = best.x
-    near = flat_limit.thicken(model, x)
+    near = flat_limit.thicken_flat_bodies(model, x)
     thickened = None if near is None else (near, errors_and_slopes(model, near))
     linear = uncertainty.linearise(model, x, noise, best.blocks, thickened)
     times = uncertainty.correlation_times(linear)
     white = uncertainty.white_covariance(linear)
-    stretches = stretches_of(model, linear)
-    numbers, of = values_and_slopes(model, x, near), charts_by_suffix(model)
-    hidden = np.zeros((0, linear.size))
+    stretches = leave_out_each_stretch(model, linear)
+    numbers, of = (
+        quantities_and_derivatives_in_numpy(model, x, near),
+        name_suffixes_and_charts(model),
+    )
+    hidden = np.zeros((0, linear.free_count))
     if stretches is None:
-        covariance = uncertainty.covariance_of(linear, times, white)
+        covariance = uncertainty.white_or_sandwich_covariance(linear, times, white)
     else:
-        covariance, hidden = jackknife(stretches, white), stretches.hidden_directions
-        remarks = (*remarks, *remarks_on(stretches, model, numbers, white))
+        covariance, hidden = (
+            jackknife_covariance(stretches, white),
+            stretches.directions_shown_by_one_stretch,
+        )
+        remarks = (
+            *remarks,
+            *remarks_on_dependence_on_one_stretch(stretches, model, numbers, white),
+        )
     remarks = (*remarks, *describe_delays_outside_windows(model, x))
-    parts = considered.considerations(model, linear, noise, white.determined)
-    covariance = _with_considered(covariance, parts, model)
-    shifts = considered.stacked_shifts(parts, linear.size)
-    freedom = freedom_of(model, linear, times, white.determined, shifts)
-    limits = flat_limit.flat_limits(
+    considered_errors = considered.compute_considered_errors(model, linear, noise, white.determined)
+    covariance = _covariance_with_considered_errors(covariance, considered_errors, model)
+    shifts = considered.shift_matrix(considered_errors, linear.free_count)
+    freedom = prepare_degrees_of_freedom(model, linear, times, white.determined, shifts)
+    limits = flat_limit.distances_from_flat_bodies(
         model, numbers, -white.determined @ linear.misfit_gradient, [n for n, _ in of]
     )
     # In a long curved valley the steps of a search stay short, although the misfit can hardly fall
@@ -399,14 +423,14 @@ def assess(
     if count := count_of_errors_if_unit_noise(model):
         near_end *= float(np.sqrt(2.0 * best_cost / count))
     done = bool(best.converged) or uncertainty.distance_to_minimum(linear, white, held) < near_end
-    chi2, dof, explanation, left = goodness(model, noise, linear, times, white.determined)
+    chi2, dof, explanation, left = goodness_of_fit(model, noise, linear, times, white.determined)
     believable = explanation.word != FAILS
     # A start fits as well as the best one if its log-likelihood is at most ten units lower. The
     # unit is that of the estimated noise if some noise is estimated, and autocorrelated errors
     # count as fewer independent errors.
-    guessed = not all(r.known_noise and not has_unit_noise(r) for r in model.records.readings)
+    guessed = not all(r.has_known_noise and not has_unit_noise(r) for r in model.records.readings)
     unit = 2 * best_cost / model.records.size if guessed else 1.0
-    margin = 10.0 * unit * max(times.longest, 1.0)
+    margin = 10.0 * unit * max(times.longest_span, 1.0)
 
     level = best_cost + margin if believable else -np.inf
     ends = [(one.x, float(one.cost), bool(one.converged)) for one in attempts]
@@ -415,19 +439,19 @@ def assess(
     rival = f"{rivals} of {len(starts)} starts fit as well elsewhere" if rivals else ""
     if believable and not any(start.fits for start in starts):
         remarks = ("no single start came near the best point", *remarks)
-    unreal = unreal_bodies(of, flat_limit.bodies_of(model, x))
+    unreal = describe_unreal_bodies(of, flat_limit.bodies_at(model, x))
     reasons = (*unreal, *explanation.reasons)
     explanation = Answer(explanation.word, reasons) if best_cost < np.inf else Answer(FAILS)
-    quantities = quantities_of(
+    quantities = reported_quantities(
         model,
         numbers,
         covariance.determined,
         np.concatenate([covariance.null_directions, hidden]),
         limits,
-        freedom.degrees(numbers[1]),
+        freedom.degrees_of_freedom_of_variance(numbers[1]),
     )
-    words = _sentences_on_allowance(
-        model, linear, noise, white.determined, parts, quantities, numbers[1]
+    words = _describe_constant_sensor_errors(
+        model, linear, noise, white.determined, considered_errors, quantities, numbers[1]
     )
     words = f"{words} {describe_large_biases(model, quantities)}".rstrip()
     return Fit(
@@ -440,7 +464,7 @@ def assess(
         tuple(starts),
         chi2,
         dof,
-        times.longest,
+        times.longest_span,
         times.independent,
         jnp.asarray(covariance.singular_values),
         jnp.asarray(covariance.null_directions),
@@ -452,23 +476,23 @@ def assess(
         near,
         freedom,
         linear.first_times(original.records.t.shape[1]),
-        parts,
+        considered_errors,
         words,
         jnp.asarray(hidden),
     )
 
 
-def _sentences_on_allowance(
+def _describe_constant_sensor_errors(
     model: Model,
     linear: Linearisation,
     noise: Noise,
     covariance: np.ndarray,
-    parts: tuple[considered.Consideration, ...],
+    considered_errors: tuple[considered.Consideration, ...],
     quantities: Sequence[Quantity],
     slopes: np.ndarray,
 ) -> str:
-    """Return sentences on the constant errors of sensors that the intervals of a fit allow for, and
-    on those that the intervals do not allow for.
+    """Return sentences on the constant errors of sensors, such as an error of scale: on those that
+    the intervals of a fit allow for, and on those that the intervals do not allow for.
 
     Intervals allow for the errors of a sensor that has a `Tolerance`. For a sensor without one, the
     sentences say how far a small error of its scale or of its axes would move the moments and
@@ -480,24 +504,38 @@ def _sentences_on_allowance(
     - `model`, `noise`: the fitted model, and the standard deviations of the errors of its sensors.
     - `linear`: the errors and their derivatives at the best point.
     - `covariance`: (n, n) the covariance of the free numbers, computed as if the errors were white.
-    - `parts`: the errors that the intervals allow for: the constant errors, within its `Tolerance`,
-      of each sensor that has one.
+    - `considered_errors`: the errors that the intervals allow for: the constant errors, within its
+      `Tolerance`, of each sensor that has one.
     - `quantities`: the q reported quantities.
     - `slopes`: (q, n) the derivatives of the quantities with respect to the free numbers; further
       rows, for the flatness of bodies, are not used.
     """
-    bodies = {log + name for name, chart in charts_by_suffix(model) for log in chart.log_names}
+    bodies = {
+        log + name for name, chart in name_suffixes_and_charts(model) for log in chart.log_names
+    }
     free = {slot.name for slot in model.slots}
     rows = [i for i, one in enumerate(quantities) if one.name in bodies and one.name != "mass"]
     rows = rows or [i for i, one in enumerate(quantities) if one.name.split(" ")[0] in free]
     rows = [i for i in rows if np.isfinite(quantities[i].deviation)]
-    known = rows if np.isfinite(linear.dense).all() and np.isfinite(covariance).all() else []
-    moves = considered.unit_moves(model, linear, noise, covariance, slopes[known]) if known else []
-    return allowance(model, parts, moves, [quantities[i] for i in known])
+    known = (
+        rows
+        if np.isfinite(linear.weighted_jacobian).all() and np.isfinite(covariance).all()
+        else []
+    )
+    usual_shifts = (
+        considered.quantity_shifts_by_usual_errors(model, linear, noise, covariance, slopes[known])
+        if known
+        else []
+    )
+    return describe_allowed_sensor_errors(
+        model, considered_errors, usual_shifts, [quantities[i] for i in known]
+    )
 
 
-def _with_considered(
-    covariance: uncertainty.Covariance, parts: tuple[considered.Consideration, ...], model: Model
+def _covariance_with_considered_errors(
+    covariance: uncertainty.Covariance,
+    considered_errors: tuple[considered.Consideration, ...],
+    model: Model,
 ) -> uncertainty.Covariance:
     """Return the `covariance` of a fit plus the covariance that the constant errors of sensors
     within their `Tolerance` make.
@@ -508,13 +546,16 @@ def _with_considered(
     **Arguments:**
 
     - `covariance`: the covariance of the free numbers.
-    - `parts`: the considered errors, with the change of the free numbers by each.
+    - `considered_errors`: the considered errors, with the change of the free numbers by each.
     - `model`: the fitted model.
     """
-    if not parts:
+    if not considered_errors:
         return covariance
-    root = considered.stacked_shifts(parts, len(covariance.determined))
-    added, words = root @ root.T, considered.describe_considered(parts, model.records.sensors)
+    root = considered.shift_matrix(considered_errors, len(covariance.determined))
+    added, words = (
+        root @ root.T,
+        considered.describe_considered_errors(considered_errors, model.records.sensors),
+    )
     return dataclasses.replace(
         covariance,
         covariance=covariance.covariance + added,

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from rigidjax.identify.answer.answers import Cause
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, readings_of
-from rigidjax.identify.data.reference_states import attitudes, rates_of
+from rigidjax.identify.data.reference_states import attitudes, rates_between_attitudes
 from rigidjax.identify.model.charts import bodies_as_list, tensor_of
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, standardised_error_changes
@@ -58,7 +58,7 @@ ATTITUDES = {
 }
 
 
-def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause | None:
+def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None) -> Cause | None:
     """Return the mistake with which the gyro or the attitudes of one body were read from a file.
 
     The result is `None` if no mistake is likely. The rates of the gyro are compared with the rates
@@ -80,18 +80,23 @@ def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause 
         return None
     known = [attitudes(recording) for recording in recordings]
     if all(len(t) > 10 for t, _ in known):
-        bound = BETTER * _rate_difference(recordings, known, _SAME)
-        ratios = {name: _rate_difference(recordings, known, turn) for name, turn in RATES.items()}
+        bound = BETTER * _relative_rate_difference(recordings, known, _SAME)
+        ratios = {
+            name: _relative_rate_difference(recordings, known, turn) for name, turn in RATES.items()
+        }
         for name, change in ATTITUDES.items():
             changed = [(t, change(q)) for t, q in known]
-            ratios[name] = _rate_difference(recordings, changed, _SAME)
+            ratios[name] = _relative_rate_difference(recordings, changed, _SAME)
     elif depends_on_rate_only(torque):
-        bound, margin = _euler_residual(recordings, torque, _SAME)
+        bound, margin = _euler_residual_and_tensor_margin(recordings, torque, _SAME)
         # Sensor errors alone can make the best body slightly unreal, but not far from real bodies.
         bound *= BETTER if margin > -0.8 else EQUAL
-        fits = {name: _euler_residual(recordings, torque, turn) for name, turn in RATES.items()}
+        fits = {
+            name: _euler_residual_and_tensor_margin(recordings, torque, turn)
+            for name, turn in RATES.items()
+        }
         if torque is not None:
-            fits["the torque with the other sign"] = _euler_residual(
+            fits["the torque with the other sign"] = _euler_residual_and_tensor_margin(
                 recordings, torque, _SAME, -1.0
             )
         # A margin near 1 belongs to a ball: any constant rate is a free motion of a ball.
@@ -105,8 +110,11 @@ def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause 
     return Cause("misread", "Gyro", 1.0, f"most likely {words}", f"read the log again: {words}")
 
 
-def _euler_residual(
-    recordings: Sequence[Recording], torque: Torque | None, turn: np.ndarray, sign: float = 1.0
+def _euler_residual_and_tensor_margin(
+    recordings: Sequence[Recording],
+    torque: Torque | None,
+    correction: np.ndarray,
+    sign: float = 1.0,
 ) -> tuple[float, float]:
     """Return two numbers: the relative residual of Euler's equations, for the inertia tensor that
     fits the recorded body rates best; and the margin of this tensor, positive if a body can have
@@ -120,21 +128,21 @@ def _euler_residual(
 
     - `recordings`: the recordings of one body, with its gyro.
     - `torque`: the torque on the body, or `None`.
-    - `turn`: (3, 3) the matrix by which the recorded rates are multiplied, to try a permutation or
-      a mirror of the axes, or another unit.
+    - `correction`: (3, 3) the matrix by which the recorded rates are multiplied, to try a
+      permutation or a mirror of the axes, or another unit.
     - `sign`: the factor by which the torque is multiplied.
     """
-    balances = [integrated_euler_equations(recording, torque, turn) for recording in recordings]
+    balances = [integrated_euler_equations(recording, torque, correction) for recording in recordings]
     matrix, side, momentum = (np.concatenate(part) for part in zip(*balances, strict=True))
     components, margin = inertia_components_and_feasibility_margin(matrix, sign * side)
     left = np.linalg.norm(matrix @ components - sign * side)
     return float(left / np.linalg.norm(momentum @ components)), margin
 
 
-def _rate_difference(
+def _relative_rate_difference(
     recordings: Sequence[Recording],
     attitudes: Sequence[tuple[np.ndarray, np.ndarray]],
-    turn: np.ndarray,
+    correction: np.ndarray,
 ) -> float:
     """Return how far the body rates of a gyro differ from those between successive recorded
     attitudes.
@@ -145,18 +153,20 @@ def _rate_difference(
 
     - `recordings`: the recordings of one body, with its gyro.
     - `attitudes`: for each recording the times (n,), s, and the quaternions (n, 4).
-    - `turn`: (3, 3) the matrix by which the rates of the gyro are multiplied, to try a permutation
-      or a mirror of the axes, or another unit.
+    - `correction`: (3, 3) the matrix by which the rates of the gyro are multiplied, to try a
+      permutation or a mirror of the axes, or another unit.
     """
     left, size = 0.0, 1e-300
     for recording, (t, q) in zip(recordings, attitudes, strict=True):
-        when, wanted = rates_of(t, jnp.asarray(q))
+        when, wanted = rates_between_attitudes(t, jnp.asarray(q))
         reading = readings_of(recording, Gyro)[0]
         gyro_times, w = (
             np.asarray(recording.t)[reading.host_mask],
             np.asarray(reading.values)[reading.host_mask],
         )
-        shown = np.stack([np.interp(when, gyro_times, axis) for axis in (w @ turn.T).T], axis=1)
+        shown = np.stack(
+            [np.interp(when, gyro_times, axis) for axis in (w @ correction.T).T], axis=1
+        )
         left += float(np.sum((shown - wanted) ** 2))
         size += float(np.sum(wanted**2))
     return float(np.sqrt(left / size))
@@ -200,12 +210,12 @@ def causes(
         stacking.recordings_on_host(model.records, model.counts), model.body_names, strict=True
     )
     mine = [recording for recording, name in given if name == model.body_names[0]]
-    wrong = misreading(mine, model.torque)
+    wrong = cause_by_misread_file(mine, model.torque)
     if wrong is not None:
         return (wrong,)
-    if not np.isfinite(linear.dense).all():
+    if not np.isfinite(linear.weighted_jacobian).all():
         return ()
-    free = np.linalg.qr(linear.dense)[0]
+    free = np.linalg.qr(linear.weighted_jacobian)[0]
     out = []
     for index in indices:
         sensor: Any = model.records.readings[index].sensor
@@ -214,7 +224,7 @@ def causes(
             rows = _candidate_causes(model, x, linear, index)
             given = model, noise, linear, index, free
             shares = [_explained_share(*given, row[1]) for row in rows]
-            cause = _largest_cause(sensor, rows, shares)
+            cause = _cause_with_largest_share(sensor, rows, shares)
         if cause is None and hasattr(sensor, "suspect"):
             cause = Cause(sensor.suspect[0], type(sensor).__name__, None, *sensor.suspect[1:])
         out += [] if cause is None else [cause]
@@ -276,8 +286,10 @@ def _cause_with_share(
     return Cause(name, kind, share, f"most likely {words}: {explained}", remedy)
 
 
-def _largest_cause(
-    sensor: AbstractSensor, rows: Sequence[tuple], shares: Sequence[tuple]
+def _cause_with_largest_share(
+    sensor: AbstractSensor,
+    candidates: Sequence[tuple[str, np.ndarray, str, str]],
+    shares: Sequence[tuple[float, np.ndarray]],
 ) -> Cause | None:
     """Return the cause that explains the largest share of the squared errors of a `sensor`.
 
@@ -290,24 +302,24 @@ def _largest_cause(
     **Arguments:**
 
     - `sensor`: the sensor that has the errors.
-    - `rows`: for each possible cause its name; the change (R, T, 3, c) of the readings by a cause
-      of unit size, for R recordings, T times, three axes and the c numbers of the cause; the cause
-      in words; and its remedy in words.
+    - `candidates`: for each possible cause its name; the change (R, T, 3, c) of the readings by a
+      cause of unit size, for R recordings, T times, three axes and the c numbers of the cause; the
+      cause in words; and its remedy in words.
     - `shares`: for each possible cause the share that it explains, and its size (c,).
     """
-    candidates = [
+    kept = [
         (share, name, words.format(size=", ".join(f"{x:.2g}" for x in size)), remedy)
-        for (name, _, words, remedy), (share, size) in zip(rows, shares, strict=True)
+        for (name, _, words, remedy), (share, size) in zip(candidates, shares, strict=True)
         if name not in LINEAR
         or np.abs(size).max() < SMALL
         # A wrong unit, such as g read as m/s², is a large scale error that is the same for all
         # axes.
         or (name == "scale" and np.ptp(size) < 0.1 * abs(size.mean()))
     ]
-    most = max((share for share, *_ in candidates), default=0.0)
+    most = max((share for share, *_ in kept), default=0.0)
     if not most > ENOUGH:
         return None
-    best = [row for share, *row in candidates if share >= NEARLY * most]
+    best = [row for share, *row in kept if share >= NEARLY * most]
     names, words, remedies = (" or ".join(column) for column in zip(*best, strict=True))
     return _cause_with_share(names, sensor, most, words, remedies)
 
@@ -340,7 +352,7 @@ def _candidate_causes(
     axes = np.broadcast_to(np.eye(3), (*shown.shape, 3))
     turned = np.cross(shown[..., None, :], axes).swapaxes(-1, -2)
     unit, itself = reading.sensor.unit, shown[..., None] * axes
-    response = _rate_response(model, x, linear, index)
+    response = _rate_response_to_torques(model, x, linear, index)
     return (
         ("lag", slope_in_time(model, shown)[..., None], "a clock offset of {size} s",
          "let a Free move the sensor's offset, or the delay of the torque's log"),
@@ -364,7 +376,7 @@ def _candidate_causes(
     )  # fmt: skip
 
 
-def _rate_response(
+def _rate_response_to_torques(
     model: Model, x: Float[Array, " n"], linear: Linearisation, index: int
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that maps torques to the changes of the body rate that the torques make.

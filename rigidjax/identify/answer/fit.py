@@ -143,7 +143,7 @@ def fit(
             "identify.descend(model, Descent(optax.adam(1e-2), steps=…, batch=…)), which takes "
             "gradients of a few recordings at a time"
         )
-    if (cpu := _faster_device(model)) is not None:
+    if (cpu := _cpu_if_faster(model)) is not None:
         with jax.default_device(cpu):
             result = fit(
                 model, starts=starts, initial=initial, key=key, tolerance=tolerance,
@@ -167,14 +167,14 @@ def fit(
     attempts = _search_from_each(points, task, checkpoint, progress, interrupts)
     best = min(attempts, key=_finite_cost)
     lowest = float(best.cost)
-    for estimated in (_estimate_noise_in_turn, _estimate_widths_in_turn):
+    for estimated in (_estimate_noise_in_turn, _estimate_spreads_in_turn):
         best, task = estimated(best, task)
-    best = _with_blocks(best, task.model)
+    best = _with_errors_and_derivatives(best, task.model)
     rough.clear()
     while (finer := _converged_integrator(best, task, rough)) is not None:
         task = task._replace(model=_with_integrator(task.model, finer))
         best, task = _estimate_noise_in_turn(search_whole_records(Attempt(best.x), task), task)
-        best = _with_blocks(best, task.model)
+        best = _with_errors_and_derivatives(best, task.model)
     shown = model if task.model is padded else _with_original_readings(model, task.model)
     return assess(task.model, best, task.noise, attempts, lowest, shown, interrupts, rough)
 
@@ -182,7 +182,7 @@ def fit(
 _ON_CPU = "computed on the CPU, which is faster than a GPU for so few readings"
 
 
-def _faster_device(model: Model) -> Any:
+def _cpu_if_faster(model: Model) -> jax.Device | None:
     """Return the CPU if a fit of the `model` is faster there than on the default device, else
     `None`.
 
@@ -236,11 +236,11 @@ def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     its sensors, with the tolerance and the largest number of steps of a search. **Returns** two
     things: the new best point; and the task with the new noise.
     """
-    if all(reading.known_noise for reading in task.model.records.readings):
+    if all(reading.has_known_noise for reading in task.model.records.readings):
         return best, task
 
     def estimate(best: Attempt, task: Task) -> Task:
-        blocks = _with_blocks(best, task.model).blocks
+        blocks = _with_errors_and_derivatives(best, task.model).blocks
         model, noise = estimate_noise(task.model, best.x, blocks, task.noise)
         return task._replace(model=model, noise=noise)
 
@@ -345,7 +345,7 @@ def _search_from_each(
     return attempts
 
 
-def _with_blocks(best: Attempt, model: Model) -> Attempt:
+def _with_errors_and_derivatives(best: Attempt, model: Model) -> Attempt:
     """Return the end of a search with the errors of the `model` there, and with their derivatives.
 
     They are computed only if `best`, the end of the search, does not hold them already.
@@ -369,7 +369,9 @@ def _errors_without_derivatives(
 
 
 def _with_integrator(model: Model, integrator: AbstractIntegrator | None) -> Model:
-    """Return the model with the `integrator`, or the unchanged model for `None`."""
+    """Return the model with this `integrator` in place of its own, or the unchanged model for
+    `None`.
+    """
     if integrator is None:
         return model
     return eqx.tree_at(lambda m: m.integrator, model, integrator)
@@ -419,7 +421,7 @@ def _converged_integrator(
     return None if steps is model.integrator else steps
 
 
-def _estimate_widths_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
+def _estimate_spreads_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     """Estimate the unknown spreads of `Free`s (numbers that a fit may move) and the best point
     alternately, until the spreads settle or a largest number of rounds is reached.
 
@@ -436,8 +438,8 @@ def _estimate_widths_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     before = np.asarray([task.model.slots[i].spread for i in indices], float)
     least = _LEAST * before
     for _ in range(_ROUNDS):
-        best = _with_blocks(best, task.model)
-        new = np.maximum(_expected_widths(best, task, indices), least)
+        best = _with_errors_and_derivatives(best, task.model)
+        new = np.maximum(_expected_spreads(best, task, indices), least)
         widths = [jnp.asarray(width) for width in new]
         model = eqx.tree_at(lambda m: [m.slots[i].spread for i in indices], task.model, widths)
         task = task._replace(model=model)
@@ -448,10 +450,11 @@ def _estimate_widths_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     return best, task
 
 
-def _expected_widths(best: Attempt, task: Task, indices: list[int]) -> np.ndarray:
-    """Return the expected spread (k,) of each of k `Free`s whose value differs between recordings.
+def _expected_spreads(best: Attempt, task: Task, indices: list[int]) -> np.ndarray:
+    """Return the expected spread (k,) of each of k `Free`s (numbers that a fit may move) whose
+    value differs between recordings.
 
-    A `Free` is a number that a fit may move. Its spread is the root mean square, over recordings,
+    The spread is the root mean square, over recordings,
     of the deviation of its value from the value that the recordings share. The expectation is over
     the posterior density at the point `best`, which Laplace's method takes as normal.
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
-from rigidjax.identify.answer import answers, undetermined as identifiability
+from rigidjax.identify.answer import answers, undetermined
 from rigidjax.identify.answer.answers import Answer, Cause
 from rigidjax.identify.answer.causes import causes
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
@@ -19,7 +19,7 @@ from rigidjax.identify.model.model import Model, Unpacked, unpack_with_slopes
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.uncertainty.considered import Consideration
 from rigidjax.identify.uncertainty.covariance import Linearisation
-from rigidjax.identify.uncertainty.degrees_of_freedom import Freedom, quantile
+from rigidjax.identify.uncertainty.degrees_of_freedom import Freedom, two_sided_student_quantile
 from rigidjax.identify.uncertainty.flat_limit import Limit
 from rigidjax.identify.uncertainty.quantities import Quantity, interval_about
 
@@ -150,13 +150,13 @@ class Fit(eqx.Module):
     def advice(self) -> str:
         """Return words that say whether the intervals can be trusted, and what to try."""
         # Do not use χ² under a robust loss: outliers would dominate χ².
-        above = np.sqrt(self.chi2 / self.dof) if self.model.loss is None else 1.0
-        return answers.advice(
+        error_ratio = np.sqrt(self.chi2 / self.dof) if self.model.loss is None else 1.0
+        return answers.advice_on_intervals(
             self.search,
             self.explanation,
             self.causes,
             self.covariance_kind,
-            above,
+            error_ratio,
             self.allowance,
         )
 
@@ -254,7 +254,7 @@ class Fit(eqx.Module):
         out = []
         errors = self._unpadded_errors
         for error, reading in zip(errors, self.model.records.readings, strict=True):
-            mask = reading.channel_mask.all(axis=-1)
+            mask = reading.usable_channel_mask.all(axis=-1)
             lengths = np.sum(np.asarray(error) ** 2, axis=-1)[
                 mask if mask.any() else reading.host_mask
             ]
@@ -309,7 +309,7 @@ class Fit(eqx.Module):
         determined, null = np.asarray(self.determined_covariance), np.asarray(self.null_directions)
         if self.hidden_directions is not None:
             null = np.concatenate([null, np.asarray(self.hidden_directions)])
-        reach = quantile(level, self.degrees_of_freedom(slope))
+        reach = two_sided_student_quantile(level, self.degrees_of_freedom(slope))
         return interval_about(middle, slope, determined, null, reach, self.limits)
 
     def degrees_of_freedom(self, slope: np.ndarray) -> np.ndarray:
@@ -320,7 +320,7 @@ class Fit(eqx.Module):
         return (
             np.full(slope.shape[:-1], np.inf)
             if self.freedom is None
-            else self.freedom.degrees(slope)
+            else self.freedom.degrees_of_freedom_of_variance(slope)
         )
 
     @property
@@ -335,7 +335,7 @@ class Fit(eqx.Module):
     @property
     def identifiability(self) -> tuple[str, ...]:
         """Describe which quantities the data determine well, weakly, and not at all."""
-        return identifiability.identifiability(self)
+        return undetermined.describe_identifiability(self)
 
 
 def require_one_fit(fit: PyTree, name: str = "fit") -> Fit:

@@ -18,17 +18,17 @@ from rigidjax.identify.model.model import Model, with_first_times_only
 from rigidjax.identify.model.terms import jacobian_and_value
 from rigidjax.identify.search.stages import errors_and_slopes
 from rigidjax.identify.sensors import Gyro
-from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
-from rigidjax.identify.uncertainty.flat_limit import bodies_of
+from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
+from rigidjax.identify.uncertainty.flat_limit import bodies_at
 from rigidjax.identify.uncertainty.quantities import (
     Quantity,
-    charts_by_suffix,
-    labels,
+    deviation_of_value_or_logarithm,
+    name_suffixes_and_charts,
+    names_units_and_signs,
+    quantities_and_derivatives,
     quantity_vector,
-    recording_names,
-    reported_deviation,
-    reports_starts,
-    value_and_slope,
+    recording_suffixes,
+    reports_initial_states,
 )
 from rigidjax.motion.manifold import minus, parts_by_name
 from rigidjax.rotation import quaternion
@@ -122,10 +122,14 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
         return ()
     best = basis = None
     slopes, values = map(
-        np.asarray, _values_and_slopes(with_first_times_only(fit.model), fit.derivative_point)
+        np.asarray,
+        _slopes_and_values_for_report(with_first_times_only(fit.model), fit.derivative_point),
     )
-    names, many = _names_and_units(fit.model), len(charts_by_suffix(fit.model))
-    first, turns = len(labels(fit.model)), 3 * fit.model.count
+    names, many = (
+        _names_units_and_relative_flags(fit.model),
+        len(name_suffixes_and_charts(fit.model)),
+    )
+    first, turns = len(names_units_and_signs(fit.model)), 3 * fit.model.count
     for other in (1, 0):
         # First leave out the changes of attitude about the axes of the body, then those about the
         # axes of the world.
@@ -139,7 +143,9 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
         relative = np.array([one[2] for one in here])
         size = np.where(relative | (size == 0), 1.0, size)
         changes = null @ slope.T / size
-        changes = np.where(_mask_to_report(fit, [one[0] for one in here], changes), changes, 0.0)
+        changes = np.where(
+            _mask_of_reported_numbers(fit, [one[0] for one in here], changes), changes, 0.0
+        )
         echelon = _reduced_echelon_form(changes)
         if best is None or np.count_nonzero(echelon) < np.count_nonzero(best[0]):
             best, basis = (echelon, here, size, values[rows]), changes
@@ -147,12 +153,14 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
     # Sort the combinations by the index of their first number: the order in which the elimination
     # returns the combinations depends on round-off.
     rows = sorted((row for row in best[0] if row.any()), key=lambda row: np.flatnonzero(row)[0])
-    switches = [_readings_change(fit, np.linalg.lstsq(basis.T, row)[0] @ null) for row in rows]
+    switches = [
+        _readings_change_along(fit, np.linalg.lstsq(basis.T, row)[0] @ null) for row in rows
+    ]
     both = zip(rows, switches, strict=True)
-    return tuple(_combination_of_row(row, *best[1:], switch) for row, switch in both)
+    return tuple(_combination_from_echelon_row(row, *best[1:], switch) for row, switch in both)
 
 
-def _readings_change(fit: "Fit", direction: np.ndarray) -> bool:
+def _readings_change_along(fit: "Fit", direction: np.ndarray) -> bool:
     """Return whether readings change along a `direction` (n,) although their derivatives along it
     are zero.
 
@@ -174,7 +182,7 @@ def _readings_change(fit: "Fit", direction: np.ndarray) -> bool:
     return total > CHANGED**2
 
 
-def _combination_of_row(
+def _combination_from_echelon_row(
     row: np.ndarray,
     names: list[tuple[str, str, bool]],
     size: np.ndarray,
@@ -215,7 +223,7 @@ def _combination_of_row(
     )
 
 
-def _names_and_units(model: Model) -> list[tuple[str, str, bool]]:
+def _names_units_and_relative_flags(model: Model) -> list[tuple[str, str, bool]]:
     """Return three things for each number that a report may name: its name; its unit; and whether
     its changes are given as relative changes.
 
@@ -225,8 +233,8 @@ def _names_and_units(model: Model) -> list[tuple[str, str, bool]]:
     those that the initial state has are listed, and none for a model of windows
     (short stretches of a log), whose many initial states are not reported.
     """
-    out = labels(model)
-    for name, chart in charts_by_suffix(model):
+    out = names_units_and_signs(model)
+    for name, chart in name_suffixes_and_charts(model):
         unit = chart.unit.replace("SI", "kg m²")
         out += [(f"{part}{name}", unit, False) for part in TENSOR]
     for part, name, unit in (
@@ -235,14 +243,14 @@ def _names_and_units(model: Model) -> list[tuple[str, str, bool]]:
         ("x", "position", "m"),
         ("v", "velocity", "m/s"),
     ):
-        if hasattr(model.reference.state, part) and reports_starts(model):
-            for where in recording_names(model):
+        if hasattr(model.reference.state, part) and reports_initial_states(model):
+            for where in recording_suffixes(model):
                 out += [(f"the initial {name} {k}{where}", unit, False) for k in "xyz"]
     return out
 
 
 @eqx.filter_jit
-def _values_and_slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
+def _slopes_and_values_for_report(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
     """Return the derivatives (M, n) and the values (M,) of all M numbers that a report may name.
 
     The numbers are, in this order: the reported quantities of the `model`, a positive one by its
@@ -252,10 +260,10 @@ def _values_and_slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, 
     derivatives are taken with respect to the n free numbers, at `point` (n,).
     """
     reference = model.reference
-    start = jax.vmap(ReferenceStates.start_at)(reference, point[model.index.start])
+    start = jax.vmap(ReferenceStates.initial_state_at)(reference, point[model.index.start])
 
     def initial_states(x: Array) -> list[Array]:
-        states = jax.vmap(ReferenceStates.start_at)(reference, x[model.index.start])
+        states = jax.vmap(ReferenceStates.initial_state_at)(reference, x[model.index.start])
         one, numbers = jax.tree.map(lambda leaf: leaf[0], states), []
         change = parts_by_name(one, jax.vmap(minus)(states, start))
         offset = parts_by_name(one, jax.vmap(minus)(states, reference.state))
@@ -268,29 +276,29 @@ def _values_and_slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, 
         for body in bodies_as_list(model.bodies(x)):
             tensor = tensor_of(body)
             numbers.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
-        if reports_starts(model):
+        if reports_initial_states(model):
             numbers += initial_states(x)
         return jnp.concatenate([part.reshape(-1) for part in numbers])
 
     return jacobian_and_value(value, point)
 
 
-def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
-    """Return a mask (M,), true for the numbers whose changes along undetermined directions are
-    reported.
+def _mask_of_reported_numbers(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
+    """Return a mask (M,), true for each number that a report names where it says which numbers the
+    data do not determine.
 
-    Of the moments and the tensor components of a body only one kind is reported, since they
-    describe the same changes: the moments, or the components if some change turns the principal
+    The moments and the tensor components of a body describe the same changes, so that only one of
+    these two kinds is reported: the moments, or the components if some change turns the principal
     axes. All other numbers are reported.
 
     **Arguments:** `fit` the fit; `names` the names of the M numbers; `changes` (k, M) the changes
     of the numbers along k directions that the data do not determine.
     """
-    rows = bodies_of(fit.model, fit.derivative_point)
+    rows = bodies_at(fit.model, fit.derivative_point)
     mask = np.ones(len(names), bool)
-    for (where, chart), body in zip(charts_by_suffix(fit.model), rows, strict=True):
+    for (where, chart), body in zip(name_suffixes_and_charts(fit.model), rows, strict=True):
         # A chart may report the components of the tensor as well. Of several entries with one name,
-        # the last entry is the one that `_values_and_slopes` adds.
+        # the last entry is the one that `_slopes_and_values_for_report` adds.
         every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]
         places = [some[-1] for some in every]
         mask[[i for some in every for i in some]] = False
@@ -334,7 +342,7 @@ def _reduced_echelon_form(rows: np.ndarray) -> np.ndarray:
     return np.where(np.abs(rows) > PART * np.abs(rows).max(axis=1, keepdims=True), rows, 0.0)
 
 
-def identifiability(fit: "Fit") -> tuple[str, ...]:
+def describe_identifiability(fit: "Fit") -> tuple[str, ...]:
     """Describe which quantities the data of a fit determine well, weakly, and not at all."""
     lost = fit.explanation.word == FAILS
     if lost or fit.search.word == NOT_ENDED:
@@ -344,11 +352,11 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
             "best point found, and say nothing about the body."
         ]
         # Undetermined directions are the likely reason why a search did not end: name them.
-        out += [] if lost else _describe_undetermined(fit)
+        out += [] if lost else _describe_undetermined_combinations(fit)
         return (*out, *describe_full_scale(fit.model.records.readings))
     out = []
     moments, first = [], 0
-    for _, chart in charts_by_suffix(fit.model):
+    for _, chart in name_suffixes_and_charts(fit.model):
         moments += fit.quantities[first : first + len(chart.log_names)]
         first += len(chart.log_names) + len(chart.plain_names)
     for quantity in moments:
@@ -368,15 +376,18 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
     determined = np.asarray(fit.determined_covariance)
     out += [
         f"A flat body{limit.where} fits as well: (I1 + I2 − I3)/I3 ≤ "
-        f"{limit.bound(determined):.2g} (95 %). Intervals end at the limit of real bodies."
+        f"{limit.flatness_upper_bound(determined):.2g} (95 %). Intervals end at the limit of real "
+        "bodies."
         for limit in fit.limits
-        if limit.is_near(determined, float(quantile(0.95, fit.degrees_of_freedom(limit.slope))))
+        if limit.is_flat_within(
+            determined, float(two_sided_student_quantile(0.95, fit.degrees_of_freedom(limit.slope)))
+        )
     ]
     count = fit.model.count
-    if reports_starts(fit.model):
-        out.append(_describe_rates(fit.quantities[first : first + 3 * count], count))
-    out += _describe_undetermined(fit)
-    out += correlations(fit)
+    if reports_initial_states(fit.model):
+        out.append(_describe_initial_rates(fit.quantities[first : first + 3 * count], count))
+    out += _describe_undetermined_combinations(fit)
+    out += describe_strong_correlations(fit)
     if fit.model.torque is None:
         out.append(
             "Free motion cannot show the absolute inertia, only ratios of moments; nor the mass or "
@@ -396,14 +407,19 @@ def _half_width_of_interval(quantity: Quantity) -> float:
 
     For a positive quantity it is half the width of the interval of its logarithm.
     """
-    return float(quantile(0.95, quantity.freedom)) * reported_deviation(quantity)
+    return float(
+        two_sided_student_quantile(0.95, quantity.freedom)
+    ) * deviation_of_value_or_logarithm(quantity)
 
 
-def _describe_rates(rates: Sequence[Quantity], count: int) -> str:
+def _describe_initial_rates(rates: Sequence[Quantity], count: int) -> str:
     """Describe in a sentence how well the data determine the initial body rates of all recordings.
 
-    **Arguments:** `rates` the three components of each initial body rate, with their deviations,
-    one recording after another; `count` the number of recordings.
+    **Arguments:**
+
+    - `rates`: the three components of each initial body rate, with their standard deviations, one
+      recording after another.
+    - `count`: the number of recordings.
     """
     shares = []
     for index in range(count):
@@ -419,7 +435,7 @@ def _describe_rates(rates: Sequence[Quantity], count: int) -> str:
     return f"{what} {grade} determined, to ±{wide:.2g} of {its}."
 
 
-def _describe_undetermined(fit: "Fit") -> list[str]:
+def _describe_undetermined_combinations(fit: "Fit") -> list[str]:
     """Describe, each in a sentence, the combinations of numbers that the data of a `fit` do not
     determine.
 
@@ -430,7 +446,7 @@ def _describe_undetermined(fit: "Fit") -> list[str]:
     if not combinations:
         return []
     out = []
-    if scale_is_unseen(fit):
+    if inertia_scale_is_undetermined(fit):
         out.append("The data determine the inertia only up to scale.")
     out += [one.in_words for one in combinations[:SEVERAL]]
     if len(combinations) > SEVERAL:
@@ -440,7 +456,7 @@ def _describe_undetermined(fit: "Fit") -> list[str]:
     return out
 
 
-def scale_is_unseen(fit: "Fit") -> bool:
+def inertia_scale_is_undetermined(fit: "Fit") -> bool:
     """Return whether the data leave the scale of the inertia tensor undetermined.
 
     This is the case if some undetermined direction multiplies all components of the tensor by one
@@ -449,29 +465,35 @@ def scale_is_unseen(fit: "Fit") -> bool:
     null = np.asarray(fit.null_directions)
     if not len(null) or isinstance(fit.model.chart, Bodies):
         return False
-    first = len(labels(fit.model))
+    first = len(names_units_and_signs(fit.model))
     slopes, values = (
         np.asarray(a)
-        for a in _values_and_slopes(with_first_times_only(fit.model), fit.derivative_point)
+        for a in _slopes_and_values_for_report(
+            with_first_times_only(fit.model), fit.derivative_point
+        )
     )
     here, moved = values[first : first + 6], slopes[first : first + 6] @ null.T
     wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)
     return bool(np.linalg.norm(moved @ wanted - here) < 1e-3 * np.linalg.norm(here))
 
 
-def correlations(fit: "Fit") -> list[str]:
+def describe_strong_correlations(fit: "Fit") -> list[str]:
     """Describe the pairs of reported quantities whose errors are strongly correlated.
 
     There is one sentence for each of at most five pairs with |ρ| > 0.95, where ρ is the correlation
     coefficient. Components of the inertia tensor are left out, because they follow from the moments
     and axes.
     """
-    slope = np.asarray(value_and_slope(fit.model, fit.derivative_point)[1])[: len(fit.quantities)]
+    slope = np.asarray(quantities_and_derivatives(fit.model, fit.derivative_point)[1])[
+        : len(fit.quantities)
+    ]
     covariance = slope @ np.asarray(fit.determined_covariance) @ slope.T
-    deviation = np.array([reported_deviation(quantity) for quantity in fit.quantities])
+    deviation = np.array([deviation_of_value_or_logarithm(quantity) for quantity in fit.quantities])
     good = np.isfinite(deviation) & (deviation > 0)
     follow = {
-        f"{plain}{name}" for name, c in charts_by_suffix(fit.model) for plain in c.plain_names
+        f"{plain}{name}"
+        for name, c in name_suffixes_and_charts(fit.model)
+        for plain in c.plain_names
     }
     names = [quantity.name for quantity in fit.quantities]
     good &= np.array([name not in follow or name.startswith("com") for name in names])

@@ -40,7 +40,7 @@ def full_scale_of(values: np.ndarray) -> float | None:
     return top if longest >= max(RUN, 2.0 * smooth) else None
 
 
-def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
+def with_full_scale_limits(recordings: Sequence[Recording]) -> list[Recording]:
     """Return the recordings with a `limit` for each sensor whose readings are cut off.
 
     The limit is the full scale that the readings show. A sensor that has a `limit` already keeps
@@ -79,7 +79,7 @@ def describe_full_scale(readings: Sequence[Any]) -> list[str]:
     """
     out = []
     for reading in readings:
-        count = (reading.host_mask[..., None] & ~reading.channel_mask).sum(axis=(0, 1))
+        count = (reading.host_mask[..., None] & ~reading.usable_channel_mask).sum(axis=(0, 1))
         if not count.any():
             continue
         sensor = reading.sensor

@@ -50,7 +50,7 @@ class Reading(eqx.Module):
         return np.asarray(self.mask)
 
     @property
-    def channel_mask(self) -> np.ndarray:
+    def usable_channel_mask(self) -> np.ndarray:
         """Return a mask (…, T, k), true for each channel that was read and is not at full scale
         (the largest value that it can read).
 
@@ -81,7 +81,7 @@ class Reading(eqx.Module):
         return eqx.tree_at(parts, self, (jitter_error, deviation))
 
     @property
-    def known_noise(self) -> bool:
+    def has_known_noise(self) -> bool:
         """Return whether the noise of the sensor is given and its time stamps have no jitter."""
         return self.sensor.noise is not None and self.jitter_error is None
 
@@ -186,7 +186,7 @@ class Recording(eqx.Module):
         """Return how many numbers all sensors read together: for each sensor the number of unmasked
         readings times the number of components of its error.
         """
-        return sum(count_of(reading) for reading in self.readings)
+        return sum(count_numbers_read(reading) for reading in self.readings)
 
     @property
     def sensors(self) -> tuple[AbstractSensor, ...]:
@@ -194,7 +194,9 @@ class Recording(eqx.Module):
         return tuple(reading.sensor for reading in self.readings)
 
 
-def recording_of(t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]) -> Recording:
+def unchecked_recording(
+    t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]
+) -> Recording:
     """Return a `Recording` with the fields `t`, `readings` and `inputs`, without checks.
 
     The arrays may have a leading axis over recordings.
@@ -215,7 +217,7 @@ def readings_of(recording: Recording, kind: type) -> list[Any]:
     return [reading for reading in recording.readings if isinstance(reading.sensor, kind)]
 
 
-def sources_of(recording: Recording) -> dict[str, Any]:
+def inputs_as_functions(recording: Recording) -> dict[str, Any]:
     """Return the inputs (logged quantities such as a motor command) of a `recording` as a dict of
     name → function of time.
 
@@ -232,7 +234,7 @@ def sources_of(recording: Recording) -> dict[str, Any]:
     return out
 
 
-def count_of(reading: Reading) -> int:
+def count_numbers_read(reading: Reading) -> int:
     """Return how many numbers a sensor read: the number of its unmasked readings times the number
     of components of its error.
     """

@@ -103,10 +103,10 @@ def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(recording.t)[reading.host_mask], np.asarray(reading.values)[
             reading.host_mask
         ]
-    return rates_of(*attitudes(recording))
+    return rates_between_attitudes(*attitudes(recording))
 
 
-def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
+def rates_between_attitudes(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
     """Return times (m,), s, and the mean body rates (m, 3), rad/s, between pairs of attitudes.
 
     The quaternions q (n, 4) are the attitudes at the times t (n,), s. Each mean rate belongs to a
@@ -158,7 +158,7 @@ class ReferenceStates(eqx.Module):
     rate: Float[Array, "*records"]
     units: Float[Array, "*records n"]
 
-    def start_at(self, change: Float[Array, " n"]) -> PyTree:
+    def initial_state_at(self, change: Float[Array, " n"]) -> PyTree:
         """Return the initial state of one recording: the reference state changed by the free
         numbers `change` (n,), in `units`.
 
@@ -167,7 +167,7 @@ class ReferenceStates(eqx.Module):
         return plus(self.state, self.units * change) if change.size else self.state
 
 
-def reference_of(recordings: Sequence[Recording], state_type: type) -> ReferenceStates:
+def reference_states_of(recordings: Sequence[Recording], state_type: type) -> ReferenceStates:
     """Return the reference state of each recording, found from its first readings; the free numbers
     of an initial state are changes of it.
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Numbers
-from rigidjax.identify.data.recording import Reading, Recording, recording_of
+from rigidjax.identify.data.recording import Reading, Recording, unchecked_recording
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.sensors.states import StateSensor
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -68,7 +68,7 @@ def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"])
 
 
 @jax.jit
-def held_errors(starts: HasSpin, measured: HasSpin) -> Float[Array, "windows steps n"]:
+def constant_state_errors(starts: HasSpin, measured: HasSpin) -> Float[Array, "windows steps n"]:
     """Return the errors (N, L, n) of a prediction that the state stays constant in each of N
     windows of L steps: the start minus the measured state.
 
@@ -126,7 +126,7 @@ class Windows(eqx.Module):
         """
         if self.noise is not None:
             return jnp.asarray(np.repeat([self.noise[kind] for kind in leaf_names(self.starts)], 3))
-        squares = np.mean(np.asarray(held_errors(self.starts, self.wanted)) ** 2, (0, 1))
+        squares = np.mean(np.asarray(constant_state_errors(self.starts, self.wanted)) ** 2, (0, 1))
         each = np.sqrt(np.mean(squares.reshape(-1, 3), 1))
         return jnp.asarray(np.repeat(np.where(each == 0, 1.0, each), 3))
 
@@ -154,14 +154,14 @@ class Windows(eqx.Module):
             name: jnp.asarray(np.concatenate([rows, rows[:, -1:]], axis=1))
             for name, rows in inputs.items()
         }
-        return recording_of(jnp.asarray(t), (reading,), inputs)
+        return unchecked_recording(jnp.asarray(t), (reading,), inputs)
 
     def held_horizons(self) -> Horizons:
         """Return the errors of a prediction that the state stays constant in each window.
 
         A model must have smaller errors to be of use.
         """
-        return average_by_horizon(self.starts, held_errors(self.starts, self.wanted))
+        return average_by_horizon(self.starts, constant_state_errors(self.starts, self.wanted))
 
     @staticmethod
     def join(*parts: "Windows") -> "Windows":
@@ -267,14 +267,14 @@ def windows(
     samples = {k: np.asarray(v, kind) for k, v in inputs.items()}
     kinds = leaf_names(states)
     if noise is not None:
-        noise = _checked_by_kind(noise, kinds, "noise", _checks.positive_float)
+        noise = _checked_numbers_by_state_part(noise, kinds, "noise", _checks.positive_float)
     if starts is not None:
         if noise is None:
             raise ValueError(
                 "starts: deviations of the starts need the noise of the readings: give noise={…}, "
                 "too"
             )
-        starts = _checked_by_kind(starts, kinds, "starts", _checked_start_deviation)
+        starts = _checked_numbers_by_state_part(starts, kinds, "starts", _checked_start_deviation)
     return Windows(
         round(h, 12),
         jax.tree.map(lambda a: jnp.asarray(a[begin]), arrays),
@@ -286,7 +286,7 @@ def windows(
     )
 
 
-def _checked_by_kind(
+def _checked_numbers_by_state_part(
     numbers: object, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
 ) -> dict[str, float]:
     """Return the numbers of a user for the parts of a state as a dict of kind → number, after
@@ -393,7 +393,7 @@ def require_windows(windows: PyTree) -> None:
             _checks.require_finite(leaf, f"windows: {name}")
 
 
-def mistakes_of_delays(law: PyTree, history: float, length: float) -> list[str]:
+def describe_delays_outside_window_samples(law: PyTree, history: float, length: float) -> list[str]:
     """Describe each delay with which a torque reads an input outside of the samples that a window
     has; return one text for each such delay.
 
@@ -419,7 +419,7 @@ def mistakes_of_delays(law: PyTree, history: float, length: float) -> list[str]:
     return out
 
 
-def starts_of_windows(
+def window_starts_weights_and_stretches(
     windows: Windows, stretches: int
 ) -> tuple[ReferenceStates, Float[Array, "windows m"] | None, Int[Array, " windows"]]:
     """Return the starts of windows, their weights, and the stretch (group of neighbouring windows)

@@ -12,7 +12,7 @@ from rigidjax import _checks
 from rigidjax.identify.answer.fit import fit
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
-from rigidjax.identify.data.recording import Recording, count_of
+from rigidjax.identify.data.recording import Recording, count_numbers_read
 from rigidjax.identify.model.charts import Known, indices_of_body_numbers
 from rigidjax.identify.model.free import with_steps
 from rigidjax.identify.model.index import build_index
@@ -68,7 +68,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     if not fits:
         raise ValueError("compare: wanted at least one fit, got none")
     readings = {name: one.model.records.readings for name, one in fits.items()}
-    counts = {name: tuple(map(count_of, of_fit)) for name, of_fit in readings.items()}
+    counts = {name: tuple(map(count_numbers_read, of_fit)) for name, of_fit in readings.items()}
     if len(set(counts.values())) > 1:
         raise ValueError(f"compare: wanted fits of the same readings, got {counts}")
     shortest = max(min(one.correlation for one in fits.values()), 1.0)

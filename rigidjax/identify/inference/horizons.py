@@ -15,7 +15,7 @@ from rigidjax.identify.data.windows import (
     Windows,
     average_by_horizon,
     require_windows,
-    starts_of_windows,
+    window_starts_weights_and_stretches,
 )
 from rigidjax.identify.model.charts import indices_of_body_numbers
 from rigidjax.identify.model.index import build_index
@@ -79,7 +79,7 @@ def _model_on_windows(
     **Arguments:** `model` the fitted model of windows; `x` (n,) its free numbers at the best point;
     `windows` the other windows.
     """
-    reference, _, clusters = starts_of_windows(windows, 1)
+    reference, _, clusters = window_starts_weights_and_stretches(windows, 1)
     body_indices = None
     bodies = indices_of_body_numbers(model.chart, body_indices, windows.count)
     index, slots = build_index(bodies, model.index.bodies, model.slots, 0)

@@ -17,14 +17,18 @@ from rigidjax._types import HasAttitude, HasPose, NumbersLike, Scalar
 from rigidjax.body import validation
 from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.identify.data import stacking
-from rigidjax.identify.data.full_scale import with_limits
+from rigidjax.identify.data.full_scale import with_full_scale_limits
 from rigidjax.identify.data.recording import Recording
-from rigidjax.identify.data.reference_states import ReferenceStates, first_rates, reference_of
+from rigidjax.identify.data.reference_states import (
+    ReferenceStates,
+    first_rates,
+    reference_states_of,
+)
 from rigidjax.identify.data.windows import (
     Windows,
-    mistakes_of_delays,
+    describe_delays_outside_window_samples,
     require_windows,
-    starts_of_windows,
+    window_starts_weights_and_stretches,
 )
 from rigidjax.identify.model.charts import (
     AbstractBodyChart,
@@ -452,7 +456,7 @@ def _data_of_recordings(
       need a position, the charts must describe bodies with a mass.
     """
     _require_recordings(recordings)
-    recordings = with_limits(recordings)
+    recordings = with_full_scale_limits(recordings)
     _require_inputs(torque, [recording.inputs for recording in recordings])
     for number, one in enumerate(recordings):
         _require_even_times(torque, one, number)
@@ -462,7 +466,7 @@ def _data_of_recordings(
     # The readings are concrete arrays even if the torque is traced by JAX. The reference states are
     # computed at compile time, so that they are concrete arrays, too.
     with jax.ensure_compile_time_eval():
-        reference = reference_of(recordings, state_kind)
+        reference = reference_states_of(recordings, state_kind)
     vectors_in_state = dimension(stacking.pick_records(reference.state, 0)) // 3
     widest = max(float(np.diff(r.t).max()) for r in recordings)
     return _RecordedData(
@@ -492,7 +496,7 @@ def _data_of_windows(
     counts = np.full(windows.count, windows.length + 1, np.int32)
     state_kind = _smallest_state_type(records.sensors, torque, charts)
     stretches = _checks.integer(stretches, "stretches", 2)
-    reference, weight, clusters = starts_of_windows(windows, stretches)
+    reference, weight, clusters = window_starts_weights_and_stretches(windows, stretches)
     _require_state_type(windows, state_kind)
     vectors_in_state = (
         0 if weight is None else dimension(stacking.pick_records(reference.state, 0)) // 3
@@ -565,7 +569,7 @@ def unpack_numbers(model: Model, x: Float[Array, " n"]) -> Unpacked:
 
     For several recordings the initial states have a leading axis.
     """
-    starts = jax.vmap(ReferenceStates.start_at)(model.reference, x[model.index.start])
+    starts = jax.vmap(ReferenceStates.initial_state_at)(model.reference, x[model.index.start])
     state0 = stacking.pick_records(starts, 0) if model.count == 1 else starts
     return Unpacked(x, model.bodies(x), state0, values_of(model, x))
 
@@ -769,7 +773,7 @@ def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
             "windows(t, states, {name: samples}, …)"
         )
     known, length = windows.before * windows.step, windows.length * windows.step
-    if wrong := mistakes_of_delays(torque, known, length):
+    if wrong := describe_delays_outside_window_samples(torque, known, length):
         raise ValueError("; ".join(wrong))
 
 
@@ -785,7 +789,7 @@ def describe_delays_outside_windows(model: Model, x: Float[Array, " n"]) -> list
     t, rows = np.asarray(model.records.t)[0], max(len(a[0]) for a in model.records.inputs.values())
     step = float(t[1] - t[0])
     known, length = (rows - t.size) * step, (t.size - 1) * step
-    return mistakes_of_delays(_compiled_scenes(model, x).torque, known, length)
+    return describe_delays_outside_window_samples(_compiled_scenes(model, x).torque, known, length)
 
 
 @eqx.filter_jit

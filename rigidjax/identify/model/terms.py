@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
 from rigidjax.identify.data import stacking
-from rigidjax.identify.data.recording import Recording, sources_of
+from rigidjax.identify.data.recording import Recording, inputs_as_functions
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.model.charts import Bodies, body_of_recording
 from rigidjax.identify.model.free import with_steps
@@ -67,7 +67,7 @@ def scene_from_row(
     """
     scene = with_steps(scene_at_starting_values(model, record), model.slots, row)
     body = body_of_recording(model.chart, row, body_index)
-    start = reference.start_at(row[model.index.first :])
+    start = reference.initial_state_at(row[model.index.first :])
     return Scene(body, scene.torque, scene.process, scene.sensors, start)
 
 
@@ -98,7 +98,7 @@ def torque_with_inputs(scene: Scene, record: Recording) -> Torque | None:
     """Return the torque of a `scene` that reads the inputs (logged quantities such as a motor
     command) of the recording `record`, or `None` without a torque.
     """
-    return bind(scene.torque, sources_of(record))
+    return bind(scene.torque, inputs_as_functions(record))
 
 
 def errors_in_sensor_units(

@@ -11,7 +11,7 @@ from jaxtyping import Array
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Blocks, Noise, error_derivatives_by_delay, reading_weights
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
-from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
+from rigidjax.identify.uncertainty.degrees_of_freedom import counts_of_determined_numbers
 
 # The joint estimate of noise and jitter takes at most this many iterations.
 ROUNDS = 500
@@ -43,7 +43,7 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
         zip(readings, errors, noise, weights, shares, strict=True)
     ):
         # The mask leaves out readings at full scale, whose errors are not noise.
-        sensor, mask = cast(Any, reading.sensor), reading.channel_mask
+        sensor, mask = cast(Any, reading.sensor), reading.usable_channel_mask
         known = sensor.noise is not None
         if known:
             sigma = sensor.noise
@@ -88,7 +88,7 @@ def initial_noise(model: Model) -> Noise:
     out = []
     for reading in model.records.readings:
         sensor = reading.sensor
-        if reading.known_noise:
+        if reading.has_known_noise:
             out.append(sensor.noise)
         else:
             # The size of this noise matters little, as long as no sensor outweighs another.
@@ -152,7 +152,7 @@ def _shares_of_squared_error_left_by_fit(
       components of an error.
     """
     groups, readings = np.asarray(model.noise_groups), model.records.readings
-    sizes = [np.bincount(groups, one.channel_mask.sum(axis=(1, 2))) for one in readings]
+    sizes = [np.bincount(groups, one.usable_channel_mask.sum(axis=(1, 2))) for one in readings]
     held = model.prior, model.pull, *((slot.prior, slot.spread) for slot in model.slots)
     if len(readings) * sizes[0].size == 1 and not jax.tree.leaves(held):
         # Without priors, and with a single noise, the sum of all leverages is the number of fitted
@@ -160,7 +160,9 @@ def _shares_of_squared_error_left_by_fit(
         taken = [np.array([x.size])]
     else:
         linear = linearise(model, x, noise, blocks)
-        taken = leverages(linear, linear.information, white_covariance(linear).determined)
+        taken = counts_of_determined_numbers(
+            linear, linear.information_by_sensor, white_covariance(linear).determined
+        )
         taken = [np.bincount(groups, each) for each in taken]
     return [np.maximum(1.0 - n / np.maximum(m, 1), 0.1) for n, m in zip(taken, sizes, strict=True)]
 

@@ -14,7 +14,7 @@ from jax.scipy.linalg import block_diag
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
-from rigidjax.identify.data.recording import Reading, count_of
+from rigidjax.identify.data.recording import Reading, count_numbers_read
 from rigidjax.identify.model import terms
 from rigidjax.identify.model.charts import chart_list, numbers_of_each_body
 from rigidjax.identify.model.model import Model
@@ -531,7 +531,7 @@ def count_of_errors_if_unit_noise(model: Model) -> int:
     sensor is only a unit for its errors, whose size is not known; else 0.
     """
     readings = model.records.readings
-    return sum(map(count_of, readings)) if all(map(has_unit_noise, readings)) else 0
+    return sum(map(count_numbers_read, readings)) if all(map(has_unit_noise, readings)) else 0
 
 
 def sufficient_misfit(model: Model) -> float:
@@ -542,6 +542,7 @@ def sufficient_misfit(model: Model) -> float:
     adds a term that allows errors of about 1 % of the signal.
     """
     return sum(
-        (1.0 if reading.known_noise and not has_unit_noise(reading) else 0.01) * count_of(reading)
+        (1.0 if reading.has_known_noise and not has_unit_noise(reading) else 0.01)
+        * count_numbers_read(reading)
         for reading in model.records.readings
     )

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify.data import stacking
-from rigidjax.identify.data.recording import Recording, sources_of
+from rigidjax.identify.data.recording import Recording, inputs_as_functions
 from rigidjax.identify.data.reference_states import rates
 from rigidjax.identify.model.charts import BASIS, Bodies
 from rigidjax.identify.model.model import Model
@@ -138,7 +138,7 @@ def integrated_euler_equations(
     t, w = rates(recording)
     w, pushed = w @ rate_matrix.T, np.zeros((t.size, 3))
     if torque is not None:
-        pushed = np.asarray(_torques_at(bind(torque, sources_of(recording)), t, w))
+        pushed = np.asarray(_torques_at(bind(torque, inputs_as_functions(recording)), t, w))
     momenta = np.einsum("kij,tj->tki", BASIS, w)
     turned = np.concatenate([np.cross(w[:, None, :], momenta), pushed[:, None, :]], axis=1)
     steps = 0.5 * (turned[1:] + turned[:-1]) * np.diff(t)[:, None, None]

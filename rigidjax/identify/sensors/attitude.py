@@ -66,7 +66,9 @@ class AttitudeSensor(ClockedSensor):
         the reason in words.
         """
         wanted = "wanted (w, x, y, z) with the scalar first"
-        return _has_wrong_length(values), f"the quaternion at index {{index}} is not unit; {wanted}"
+        return _differs_from_unit_length(
+            values
+        ), f"the quaternion at index {{index}} is not unit; {wanted}"
 
 
 def _quaternions_of_matrices(matrices: np.ndarray) -> np.ndarray:
@@ -180,10 +182,12 @@ class Direction(ClockedSensor):
         """Return two things: a mask (T,) of the rows of `values` that are not unit vectors; and the
         reason in words.
         """
-        return _has_wrong_length(values), "the direction at index {index} is not of length 1"
+        return _differs_from_unit_length(
+            values
+        ), "the direction at index {index} is not of length 1"
 
 
-def _has_wrong_length(rows: np.ndarray) -> np.ndarray:
+def _differs_from_unit_length(rows: np.ndarray) -> np.ndarray:
     """Return a mask (T,), true where the length of a row of `rows` (T, k) differs from 1 by more
     than 1e-6.
 

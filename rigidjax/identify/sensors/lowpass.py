@@ -82,7 +82,9 @@ class LowPass(eqx.Module):
         usual = jnp.nanmedian(jnp.where(is_last, jnp.nan, gaps))
         gaps = jnp.where(is_last, usual, gaps)
         after_gap = gaps > _GAP * usual
-        before, after = _end_slopes(gaps, jnp.diff(values, axis=0), after_gap, is_last)
+        before, after = _input_slopes_at_interval_ends(
+            gaps, jnp.diff(values, axis=0), after_gap, is_last
+        )
         # On each interval u = u₀ + b s + c s² + d s³, where s is the time since the begin of the
         # interval.
         h = gaps[:, None]
@@ -93,7 +95,7 @@ class LowPass(eqx.Module):
         y0, y1 = particular(values[:-1], ends[0]), particular(values[1:], ends[1])
         begin = y0[0]
         if gaps.size > 2:
-            first = particular(values[:1], _first_derivatives(gaps, chord))[0]
+            first = particular(values[:1], _derivatives_at_first_sample(gaps, chord))[0]
             begin = jnp.where(jnp.any(after_gap[:3]), begin, first)
         return _filter_samples(begin, y0, y1, partial(_propagator, self.order, w), gaps, after_gap)
 
@@ -118,7 +120,9 @@ def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
         raise ValueError("t: wanted increasing times")
 
 
-def _end_slopes(gaps: Array, steps: Array, after_gap: Array, is_last: Array) -> tuple[Array, Array]:
+def _input_slopes_at_interval_ends(
+    gaps: Array, steps: Array, after_gap: Array, is_last: Array
+) -> tuple[Array, Array]:
     """Return two arrays (n, k): the time derivatives of a sampled input at the begin, and at the
     end, of each of n intervals between samples.
 
@@ -143,7 +147,7 @@ def _end_slopes(gaps: Array, steps: Array, after_gap: Array, is_last: Array) -> 
     return chord - begin, chord + end
 
 
-def _first_derivatives(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
+def _derivatives_at_first_sample(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
     """Return the first, second and third time derivative of a sampled input at its first sample.
 
     They are those of the cubic through the first four samples, three arrays (1, k) for k channels.

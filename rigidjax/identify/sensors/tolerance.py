@@ -8,7 +8,7 @@ from rigidjax import _checks
 from rigidjax._types import NumbersLike, Scalar
 
 
-def _tolerance_value(value: NumbersLike | None) -> Scalar | None:
+def _checked_tolerance_deviation(value: NumbersLike | None) -> Scalar | None:
     """Return a standard deviation of a `Tolerance` as an array; `None` stays `None`.
 
     **Raises** `ValueError` unless the `value` is positive.
@@ -44,7 +44,7 @@ class Tolerance(eqx.Module):
     (0.01, None)
     """
 
-    scale: Scalar | None = eqx.field(converter=_tolerance_value, default=None)
-    cross_axis: Scalar | None = eqx.field(converter=_tolerance_value, default=None)
-    bias: Scalar | None = eqx.field(converter=_tolerance_value, default=None)
-    clock: Scalar | None = eqx.field(converter=_tolerance_value, default=None)
+    scale: Scalar | None = eqx.field(converter=_checked_tolerance_deviation, default=None)
+    cross_axis: Scalar | None = eqx.field(converter=_checked_tolerance_deviation, default=None)
+    bias: Scalar | None = eqx.field(converter=_checked_tolerance_deviation, default=None)
+    clock: Scalar | None = eqx.field(converter=_checked_tolerance_deviation, default=None)

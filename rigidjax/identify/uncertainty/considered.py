@@ -55,11 +55,11 @@ class Consideration(eqx.Module):
     shifts: np.ndarray
 
 
-def considerations(
+def compute_considered_errors(
     model: Model, linear: Linearisation, noise: Noise, covariance: np.ndarray
 ) -> tuple[Consideration, ...]:
-    """Return the considered errors of all sensors, with the change of a fit that each of them
-    makes.
+    """Return the considered errors of all sensors, with the change of the free numbers
+    that each of them makes.
 
     A considered error is one that a sensor may have within its `Tolerance`, and that no `Free` of
     the model estimates.
@@ -77,39 +77,47 @@ def considerations(
         tolerance = getattr(sensor, "tolerance", None)
         for kind, member in MEMBERS.items():
             width = getattr(tolerance, kind, None)
-            if width is None or slot_of(model, index, member) is not None:
+            if width is None or slot_of_sensor_member(model, index, member) is not None:
                 continue
             # The tolerance of one sensor may differ between recordings. The largest tolerance is
             # used.
             deviation = float(np.max(np.asarray(width)))
-            shifts = deviation * shifts_of(model, linear, noise, covariance, index, kind)
+            shifts = deviation * shifts_by_unit_errors(
+                model, linear, noise, covariance, index, kind
+            )
             out.append(Consideration(index, kind, deviation, shifts))
     return tuple(out)
 
 
-def slot_of(model: Model, index: int, member: str) -> Slot | None:
-    """Return the slot that moves one `member`, such as "bias", of a sensor; `None` if no slot does.
+def slot_of_sensor_member(model: Model, sensor_index: int, member: str) -> Slot | None:
+    """Return the slot for one attribute (`member`) of a sensor, such as "bias"; `None` if a fit
+    does not estimate this attribute.
 
-    A slot is the description of a `Free`, a number that the fit estimates. **Arguments:** `model`
-    the model; `index` the index of the sensor; `member` the name of the attribute of the sensor.
+    A slot describes a `Free`, a number that the fit estimates.
+
+    **Arguments:**
+
+    - `model`: the model.
+    - `sensor_index`: the index of the sensor.
+    - `member`: the name of the attribute of the sensor.
     """
     for slot in model.slots:
         path = tuple(getattr(key, "name", getattr(key, "idx", None)) for key in slot.path)
-        if path == ("sensors", index, member):
+        if path == ("sensors", sensor_index, member):
             return slot
     return None
 
 
-def shifts_of(
+def shifts_by_unit_errors(
     model: Model,
     linear: Linearisation,
     noise: Noise,
     covariance: np.ndarray,
-    index: int,
-    kind: str,
+    sensor_index: int,
+    error_kind: str,
 ) -> Float[np.ndarray, "n ways"]:
-    """Return the changes (n, c) of the n free numbers of a fit if a sensor has unit errors of one
-    `kind`.
+    """Return the changes (n, c) of the n free numbers of a fit if a sensor has a unit error of the
+    kind `error_kind`.
 
     An error with c components changes the readings of the sensor by D, (R, T, k, c), for R
     recordings, T times and k components of a reading. It changes the least-squares solution by
@@ -123,28 +131,32 @@ def shifts_of(
       W.
     - `noise`: the standard deviations of the noise of the sensors.
     - `covariance`: H⁻¹ (n, n), the covariance of the free numbers for white errors.
-    - `index`: the index of the sensor.
-    - `kind`: "scale", "cross_axis", "bias" or "clock", the name of the error.
+    - `sensor_index`: the index of the sensor.
+    - `error_kind`: "scale", "cross_axis", "bias" or "clock", the name of the error.
     """
-    direction = _changes_by_unit_errors(model, linear, index, kind)
-    jitter_error = model.records.readings[index].jitter_error
+    direction = _reading_changes_by_unit_errors(model, linear, sensor_index, error_kind)
+    jitter_error = model.records.readings[sensor_index].jitter_error
     # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
     scaled = np.asarray(
-        standardised_error_changes(direction, np.asarray(noise[index]), jitter_error)
+        standardised_error_changes(direction, np.asarray(noise[sensor_index]), jitter_error)
     )
     pulls = np.einsum(
-        "rtkm,rt,rtkc->rmc", linear.slopes[index], linear.weights[index], scaled, optimize=True
+        "rtkm,rt,rtkc->rmc",
+        linear.slopes[sensor_index],
+        linear.weights[sensor_index],
+        scaled,
+        optimize=True,
     )
-    rows = np.zeros((linear.size + 1, direction.shape[-1]))
+    rows = np.zeros((linear.free_count + 1, direction.shape[-1]))
     np.add.at(rows, linear.places, pulls)
     return -covariance @ rows[:-1]
 
 
-def _changes_by_unit_errors(
-    model: Model, linear: Linearisation, index: int, kind: str
+def _reading_changes_by_unit_errors(
+    model: Model, linear: Linearisation, sensor_index: int, error_kind: str
 ) -> Float[np.ndarray, "records times 3 ways"]:
-    """Return the changes (R, T, 3, c) of the readings of a sensor if it has a unit error of one
-    `kind`.
+    """Return the changes (R, T, 3, c) of the readings of a sensor if it has a unit error of the
+    kind `error_kind`.
 
     The changes are for R recordings, T times, the three components of a reading, and the c
     components of the error.
@@ -153,19 +165,19 @@ def _changes_by_unit_errors(
 
     - `model`: the fitted model with its readings.
     - `linear`: the errors of the readings at the best point; reading minus error is the prediction.
-    - `index`: the index of the sensor.
-    - `kind`: the name of the error: "scale" has three components, relative errors of scale; "bias"
-      three, in the unit of the sensor; "clock" one, a delay of 1 s; "cross_axis" six, one for each
-      pair of axes (i, j) with i ≠ j, where axis i also reads all that axis j reads.
+    - `sensor_index`: the index of the sensor.
+    - `error_kind`: the name of the error: "scale" has three components, relative errors of scale;
+      "bias" three, in the unit of the sensor; "clock" one, a delay of 1 s; "cross_axis" six, one
+      for each pair of axes (i, j) with i ≠ j, where axis i also reads all that axis j reads.
     """
-    reading = model.records.readings[index]
-    shown = np.asarray(reading.values) - linear.raw[index]
+    reading = model.records.readings[sensor_index]
+    shown = np.asarray(reading.values) - linear.raw[sensor_index]
     eye = np.eye(3)
-    if kind == "scale":
+    if error_kind == "scale":
         return shown[..., None] * eye
-    if kind == "bias":
+    if error_kind == "bias":
         return np.broadcast_to(eye, (*shown.shape, 3))
-    if kind == "clock":
+    if error_kind == "clock":
         return slope_in_time(model, shown)[..., None]
     columns = [eye[i] * shown[..., j, None] for i, j in _OFF_DIAGONAL]
     return np.stack(columns, axis=-1)
@@ -195,24 +207,37 @@ def slope_in_time(
     return np.where(inside[..., None], out, 0.0)
 
 
-def stacked_shifts(parts: tuple[Consideration, ...], size: int) -> Float[np.ndarray, "n ways"]:
+def shift_matrix(
+    considered_errors: tuple[Consideration, ...], number_count: int
+) -> Float[np.ndarray, "n ways"]:
     """Return the matrix S (n, c) of the shifts of the free numbers by all considered errors.
 
     S Sᵀ is the covariance that these errors add to a fit.
 
-    **Arguments:** `parts` the considered errors, each with its shifts by one standard deviation;
-    `size` the number n of free numbers.
+    **Arguments:**
+
+    - `considered_errors`: the considered errors. Each one holds the shifts by an error of one
+      standard deviation.
+    - `number_count`: the number n of free numbers.
     """
-    return np.concatenate([np.zeros((size, 0)), *(part.shifts for part in parts)], axis=1)
+    return np.concatenate(
+        [np.zeros((number_count, 0)), *(part.shifts for part in considered_errors)], axis=1
+    )
 
 
-def describe_considered(parts: tuple[Consideration, ...], sensors: Sequence[AbstractSensor]) -> str:
-    """Describe the considered errors in words: "a Gyro off by 1 % of scale, 0.5° between axes"."""
+def describe_considered_errors(
+    considered_errors: tuple[Consideration, ...], sensors: Sequence[AbstractSensor]
+) -> str:
+    """Describe the considered errors in words, such as "a Gyro off by 1 % of scale, 0.5° between
+    axes".
+
+    **Arguments:** `considered_errors` the errors; `sensors` all sensors of the model.
+    """
     units = {"scale": "{:.3g} % of scale", "cross_axis": "{:.3g}° between axes",
              "bias": "a bias of {:.3g} {unit}", "clock": "a clock offset of {:.3g} s"}  # fmt: skip
     sizes = {"scale": 100.0, "cross_axis": float(np.degrees(1.0)), "bias": 1.0, "clock": 1.0}
     by_sensor: dict[int, list[str]] = {}
-    for part in parts:
+    for part in considered_errors:
         words = units[part.kind].format(
             sizes[part.kind] * part.deviation, unit=sensors[part.sensor].unit
         )
@@ -224,17 +249,17 @@ def describe_considered(parts: tuple[Consideration, ...], sensors: Sequence[Abst
     return "; ".join(named)
 
 
-def unit_moves(
+def quantity_shifts_by_usual_errors(
     model: Model,
     linear: Linearisation,
     noise: Noise,
     covariance: np.ndarray,
     slopes: Float[np.ndarray, "quantities n"],
 ) -> list[tuple[int, dict[str, Float[np.ndarray, " quantities"]]]]:
-    """Return how far usual errors of each sensor without a tolerance would change `quantities` of a
-    fit.
+    """Return by how much each of q quantities of a fit would change if a sensor had a usual error,
+    for each sensor without a `Tolerance`.
 
-    The usual errors, `USUAL`, are 1 % of scale and 1° between two axes.
+    The usual errors (`USUAL`) are 1 % of scale and 1° between two axes.
 
     **Arguments:**
 
@@ -251,11 +276,11 @@ def unit_moves(
     for index, sensor in enumerate(model.records.sensors):
         if not isinstance(sensor, VectorSensor) or sensor.tolerance is not None:
             continue
-        moves = {}
+        shifts_by_kind = {}
         for kind, size in USUAL.items():
-            if slot_of(model, index, MEMBERS[kind]) is None:
-                shifts = size * shifts_of(model, linear, noise, covariance, index, kind)
-                moves[kind] = np.abs(slopes @ shifts).max(axis=1)
-        if moves:
-            out.append((index, moves))
+            if slot_of_sensor_member(model, index, MEMBERS[kind]) is None:
+                shifts = size * shifts_by_unit_errors(model, linear, noise, covariance, index, kind)
+                shifts_by_kind[kind] = np.abs(slopes @ shifts).max(axis=1)
+        if shifts_by_kind:
+            out.append((index, shifts_by_kind))
     return out

@@ -67,69 +67,87 @@ class Linearisation(eqx.Module):
     extra_slopes: np.ndarray
 
     @property
-    def size(self) -> int:
+    def free_count(self) -> int:
         """Return the number n of free numbers."""
         return int(self.extra_slopes.shape[-1])
 
     def first_times(self, count: int) -> "Linearisation":
-        """Return the linearisation at the first `count` times, without the padding of a fit."""
+        """Return the errors and derivatives at the first `count` times, without the padding of a
+        fit.
+        """
         long = ("raw", "raw_slopes", "errors", "slopes", "weights", "mask")
         parts = {name: tuple(a[:, :count] for a in getattr(self, name)) for name in long}
         return dataclasses.replace(self, **parts)
 
     @property
     def misfit_gradient(self) -> np.ndarray:
-        """Return the gradient (n,) of the misfit with respect to the free numbers."""
-        readings = self.to_all_numbers(self.scores).sum(axis=0)
+        """Return the gradient (n,) of the misfit with respect to the free numbers.
+
+        The misfit is half the sum of squared residuals, those of the priors included, or a robust
+        loss of the errors.
+        """
+        readings = self.rows_for_all_numbers(self.misfit_gradients_by_recording).sum(axis=0)
         priors = self.prior_weights * self.prior_residuals
         return readings + priors + self.extra @ self.extra_slopes
 
     @property
-    def dense(self) -> np.ndarray:
-        """Return the weighted derivatives (R, N, m) of all N errors of each recording."""
-        return np.concatenate(self.rows, axis=1)
+    def weighted_jacobian(self) -> np.ndarray:
+        """Return the weighted derivatives (R, N, m) of the N errors of all sensors, for each of R
+        recordings.
+
+        The derivatives are with respect to the m numbers of each recording.
+        """
+        return np.concatenate(self.weighted_jacobians_by_sensor, axis=1)
 
     @property
-    def rows(self) -> list[np.ndarray]:
-        """Return the weighted derivatives (R, T k, m) for each sensor, a row for each error."""
+    def weighted_jacobians_by_sensor(self) -> list[np.ndarray]:
+        """Return for each sensor the weighted derivatives (R, T k, m) of its errors, one row for
+        each error.
+
+        There are R recordings, T times, k components of an error, and m numbers of each recording.
+        """
         return [
-            _flatten_rows(slope * np.sqrt(weight)[..., None, None])
+            _slopes_as_matrices(slope * np.sqrt(weight)[..., None, None])
             for slope, weight in zip(self.slopes, self.weights, strict=True)
         ]
 
     @property
-    def information(self) -> tuple[np.ndarray, ...]:
-        """Return, for each sensor, the information matrices JᵀWJ (R, m, m) of the numbers of each
-        recording.
-        """
-        return tuple(rows.swapaxes(1, 2) @ rows for rows in self.rows)
+    def information_by_sensor(self) -> tuple[np.ndarray, ...]:
+        """Return for each sensor the information matrices JᵀWJ (R, m, m), one for each of R
+        recordings.
 
-    def squared_change(self, step: np.ndarray) -> float:
+        J holds the derivatives of the errors of the sensor with respect to the m numbers of the
+        recording, and W the weights of the errors.
+        """
+        return tuple(rows.swapaxes(1, 2) @ rows for rows in self.weighted_jacobians_by_sensor)
+
+    def squared_residual_change(self, step: np.ndarray) -> float:
         """Return the sum of the squared changes of all residuals if the n free numbers change by
         `step` (n,).
 
         The residuals are linear in the step; they include those of the priors.
         """
         moved = np.append(step, 0.0)[self.places]
-        readings = np.einsum("rim,rm->ri", self.dense, moved)
+        readings = np.einsum("rim,rm->ri", self.weighted_jacobian, moved)
         rest = self.prior_weights * step, self.extra_slopes @ step
         return float(sum(np.sum(part**2) for part in (readings, *rest)))
 
-    def to_all_numbers(self, blocks: np.ndarray) -> np.ndarray:
+    def rows_for_all_numbers(self, rows: np.ndarray) -> np.ndarray:
         """Return rows (R, n) for all n free numbers of a fit, from rows for the numbers of each
         recording.
 
-        The argument `blocks` (R, m) holds, for each of R recordings, one entry for each of the m
+        The argument `rows` (R, m) holds, for each of R recordings, one entry for each of the m
         numbers on which this recording depends. All other entries of the result are zero.
         """
-        wide = np.zeros((len(blocks), self.size + 1))
-        np.add.at(wide, (np.arange(len(blocks))[:, None], self.places), blocks)
+        wide = np.zeros((len(rows), self.free_count + 1))
+        np.add.at(wide, (np.arange(len(rows))[:, None], self.places), rows)
         return wide[:, :-1]
 
-    def blocks(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the blocks (R, m, m) of a `covariance` (n, n) for the numbers of each recording.
+    def covariance_by_recording(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the parts (R, m, m) of a `covariance` (n, n) that belong to the numbers of each
+        recording.
 
-        Each of R recordings depends on m of the n free numbers. The blocks are zero unless the
+        Each of R recordings depends on m of the n free numbers. The result is zero unless the
         covariance is finite.
         """
         known = covariance if np.isfinite(covariance).all() else np.zeros_like(covariance)
@@ -137,19 +155,24 @@ class Linearisation(eqx.Module):
         return wide[self.places[:, :, None], self.places[:, None, :]]
 
     @property
-    def scores(self) -> np.ndarray:
-        """Return the gradient (R, m) of the misfit of each recording with respect to its
+    def misfit_gradients_by_recording(self) -> np.ndarray:
+        """Return the gradient (R, m) of the misfit of each of R recordings with respect to its m
         numbers.
+
+        The misfit is half the sum of squared errors, or a robust loss of the errors.
         """
         total: Any = sum(
-            ((error * weight[..., None]).reshape(len(error), 1, -1) @ _flatten_rows(slope))[:, 0]
+            ((error * weight[..., None]).reshape(len(error), 1, -1) @ _slopes_as_matrices(slope))[
+                :, 0
+            ]
             for error, slope, weight in zip(self.errors, self.slopes, self.weights, strict=True)
         )
         return total
 
 
-def _flatten_rows(slopes: np.ndarray) -> np.ndarray:
-    """Return derivatives of errors as one matrix for each recording, with one row for each error.
+def _slopes_as_matrices(slopes: np.ndarray) -> np.ndarray:
+    """Return the derivatives of errors as one matrix for each recording, with one row for each
+    error.
 
     The argument `slopes` (R, T, k, m) holds the derivatives for R recordings, T times and k
     components, with respect to m numbers; the result has the shape (R, T k, m).
@@ -158,7 +181,9 @@ def _flatten_rows(slopes: np.ndarray) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _linearise_parts(model: Model, x: Array, noise: Noise, blocks: Blocks) -> PyTree[Array]:
+def _weighted_errors_and_derivatives(
+    model: Model, x: Array, noise: Noise, blocks: Blocks
+) -> PyTree[Array]:
     """Return the weighted errors of a model, with their derivatives, in one compiled program.
 
     **Arguments:**
@@ -205,14 +230,14 @@ def linearise(
       with a thicker body, at which the derivatives are computed; and the `blocks` at these numbers.
     """
     (errors, slopes, weights), places, others = jax.tree.map(
-        np.asarray, _linearise_parts(model, x, noise, blocks)
+        np.asarray, _weighted_errors_and_derivatives(model, x, noise, blocks)
     )
     raw, raw_slopes = (tuple(map(np.asarray, part)) for part in blocks)
     if thickened is not None:
         thick = linearise(model, thickened[0], noise, thickened[1])
         slopes, others = thick.slopes, (*others[:-1], thick.extra_slopes)
     pairs = zip(model.records.readings, weights, strict=True)
-    mask = tuple(reading.channel_mask & (weight > 0)[..., None] for reading, weight in pairs)
+    mask = tuple(reading.usable_channel_mask & (weight > 0)[..., None] for reading, weight in pairs)
     return Linearisation(raw, raw_slopes, errors, slopes, weights, mask, places, *others)
 
 
@@ -242,7 +267,9 @@ class Root(eqx.Module):
     ties: np.ndarray
     null: np.ndarray
 
-    def sandwich(self, rows: np.ndarray, places: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    def sandwich_covariance(
+        self, rows: np.ndarray, places: np.ndarray, middle: np.ndarray
+    ) -> np.ndarray:
         """Return the sandwich covariance `H⁻¹ M H⁻¹` (n, n).
 
         H⁻¹ is the covariance for white errors. M is the information of priors plus the sum over
@@ -271,7 +298,7 @@ class Root(eqx.Module):
         out = self.lift @ total @ self.lift.T + both + both.T
         for (mine, *_), block in zip(self.own, blocks, strict=True):
             out[np.ix_(mine, mine)] += block
-        return self._in_units_of_numbers(out)
+        return self._covariance_in_own_units(out)
 
     @property
     def covariance(self) -> np.ndarray:
@@ -282,16 +309,16 @@ class Root(eqx.Module):
         out = half @ half.T
         for mine, root, _ in self.own:
             out[np.ix_(mine, mine)] += root @ root.T
-        return self._in_units_of_numbers(out)
+        return self._covariance_in_own_units(out)
 
-    def _in_units_of_numbers(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the covariance (n, n) of n free numbers in their own units, from the one of scaled
-        numbers.
+    def _covariance_in_own_units(self, scaled_covariance: np.ndarray) -> np.ndarray:
+        """Return the covariance (n, n) of the free numbers in their own units.
 
-        The argument `covariance` (n, n) is that of the numbers multiplied by the field `size`,
-        which makes them of order one. The directions in the field `null`, which the data do not
-        determine, are projected out.
+        The argument `scaled_covariance` (n, n) is the covariance of the numbers multiplied by the
+        field `size`, which makes them of order one. The directions in the field `null`, which the
+        data do not determine, are projected out.
         """
+        covariance = scaled_covariance
         if len(self.null):
             covariance = covariance - self.null.T @ (self.null @ covariance)
             covariance = covariance - (covariance @ self.null.T) @ self.null
@@ -337,11 +364,11 @@ def white_covariance(linear: Linearisation) -> Covariance:
     eliminated first, recording by recording (Schur complement); the singular values are those of
     the eliminated blocks, and of the remaining matrix of the shared numbers.
     """
-    n, dense = linear.size, linear.dense
+    n, dense = linear.free_count, linear.weighted_jacobian
     if not (np.isfinite(dense).all() and np.isfinite(linear.extra_slopes).all()):
         lost, kind = np.full((n, n), np.nan), "none: the motion is not finite"
         return Covariance(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)), None)
-    triangles, owner = np.linalg.qr(dense, mode="r"), _owning_recordings(linear)
+    triangles, owner = np.linalg.qr(dense, mode="r"), _only_dependent_recordings(linear)
     shared = np.flatnonzero(owner < 0)
     # Columns are scaled to order one, so that a bias in rad/s does not look undetermined next to a
     # moment of inertia. The lower bound of the size keeps round-off from being scaled up.
@@ -419,22 +446,23 @@ def _factor_of_shared_numbers(
     - `selected`: (R,) true for recordings whose errors depend on shared numbers only.
     - `shared`: (s,) the indices of the shared numbers among all n.
     """
-    wide = np.zeros((int(selected.sum()), triangles.shape[1], linear.size + 1))
+    wide = np.zeros((int(selected.sum()), triangles.shape[1], linear.free_count + 1))
     columns = np.broadcast_to(linear.places[selected][:, None, :], triangles[selected].shape)
     np.put_along_axis(wide, columns, triangles[selected], axis=2)
-    rows = (wide[..., :-1] / size).reshape(-1, linear.size)
+    rows = (wide[..., :-1] / size).reshape(-1, linear.free_count)
     return np.linalg.qr(rows[:, shared], mode="r")
 
 
-def _owning_recordings(linear: Linearisation) -> np.ndarray:
-    """Return, for each of n free numbers, the index of the only recording that depends on it.
+def _only_dependent_recordings(linear: Linearisation) -> np.ndarray:
+    """Return, for each of n free numbers, the index of the only recording whose errors depend on
+    it.
 
     The index is −1 for a number on which no recording, or more than one, depends. It is −1, too,
     for numbers of different recordings that one prior ties together. The argument `linear` holds
     the numbers of each recording, and the derivatives of the residuals of such priors
     (`extra_slopes`).
     """
-    records, n = len(linear.places), linear.size
+    records, n = len(linear.places), linear.free_count
     owner, used = np.full(n + 1, -1), np.zeros((records, n + 1), bool)
     used[np.arange(records)[:, None], linear.places] = True
     alone = used.sum(axis=0) == 1
@@ -466,10 +494,11 @@ def _range_and_null_space(
     return u[:, determined], root, directions[~determined], singular
 
 
-def covariance_of(
+def white_or_sandwich_covariance(
     linear: Linearisation, times: "CorrelationTimes", white: Covariance | None = None
 ) -> Covariance:
-    """Return the covariance for white errors, or the sandwich `H⁻¹ M H⁻¹` for correlated errors.
+    """Return the covariance for white errors, or the sandwich covariance `H⁻¹ M H⁻¹` if the errors
+    are autocorrelated; H⁻¹ is the covariance for white errors.
 
     M is `Jᵀ C J` plus the information of priors, where C is the covariance of the errors in time.
     In each channel the second differences of the errors give the variance of a white part. The
@@ -481,14 +510,17 @@ def covariance_of(
     variance, and the larger estimate is used. Source: White 1980, doi:10.2307/1912934; Liang and
     Zeger 1986, doi:10.1093/biomet/73.1.13.
 
-    **Arguments:** `linear` the linearisation of the model; `times` the correlation times of its
-    errors; `white` the covariance for white errors, computed unless given.
+    **Arguments:**
+
+    - `linear`: the errors at the best point, with their derivatives J and weights.
+    - `times`: over how many samples the errors are correlated.
+    - `white`: the covariance for white errors; `None` computes it.
     """
     white = white_covariance(linear) if white is None else white
-    if times.longest <= 1.5 or not np.isfinite(white.determined).all():
+    if times.longest_span <= 1.5 or not np.isfinite(white.determined).all():
         return white
     covariance = _sandwich_covariance(linear, white, times)
-    kind = f"sandwich: the errors are autocorrelated over {times.longest:.0f} samples"
+    kind = f"sandwich: the errors are autocorrelated over {times.longest_span:.0f} samples"
     shown = with_infinite_variance(white.null_directions, covariance)
     return dataclasses.replace(white, covariance=shown, determined=covariance, kind=kind)
 
@@ -507,10 +539,11 @@ def with_infinite_variance(null: np.ndarray, covariance: np.ndarray) -> np.ndarr
 
 
 def covariance_root(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two things: a root (n, m) of the inverse of the `information` (n, n); and its null
-    directions (k, n).
+    """Return two things: a root (n, m) of the inverse of the matrix `information` (n, n), and the
+    null directions (k, n) of this matrix.
 
-    The null directions are the directions of the n numbers that the information does not determine.
+    A root of a matrix A is a matrix B with B Bᵀ = A. The null directions are those of the n numbers
+    that the information does not determine; the inverse is taken within the other directions.
     """
     size = np.sqrt(np.diag(information))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-150))
@@ -556,19 +589,23 @@ def _sandwich_covariance(
     - `times`: over how many samples the errors are correlated, and the number of independent
       errors.
     """
-    columns, triangles = np.linalg.qr(linear.dense)
+    columns, triangles = np.linalg.qr(linear.weighted_jacobian)
     longest = max(int(np.median((linear.weights[0] > 0).sum(axis=1))) // 2, 2)
     spans = 2.0 ** np.arange(1, np.log2(longest) + 1)
-    n, records = linear.size, len(linear.places)
+    n, records = linear.free_count, len(linear.places)
     grown = times.independent / max(times.independent - n, 0.1 * times.independent)
-    channels, root = _spectra_in_time(linear, columns), white.root
+    channels, root = _spectra_and_smooth_shares(linear, columns), white.root
     assert root is not None
     meats = [grown * _correlated_information(*channels, span) for span in spans]
-    estimates = [root.sandwich(triangles, linear.places, meat) for meat in meats]
+    estimates = [root.sandwich_covariance(triangles, linear.places, meat) for meat in meats]
     if records > n // 2 and records > 5:
         # The scatter between many recordings gives the variance without a model of the errors.
         between = np.full((records, 1, 1), records / (records - 1))
-        estimates.append(root.sandwich(linear.scores[:, None], linear.places, between))
+        estimates.append(
+            root.sandwich_covariance(
+                linear.misfit_gradients_by_recording[:, None], linear.places, between
+            )
+        )
     # The estimate with the largest variances is scaled up for each number whose variance is larger
     # in another estimate, or for white errors.
     all_ = np.stack([np.diag(white.determined), *(np.diag(c) for c in estimates)])
@@ -579,7 +616,9 @@ def _sandwich_covariance(
     return out * np.outer(factor, factor)
 
 
-def _spectra_in_time(linear: Linearisation, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _spectra_and_smooth_shares(
+    linear: Linearisation, columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return two arrays for all k channels: the spectra in time of the derivatives of a fit; and
     the part of the variance of the errors that is not white.
 
@@ -602,7 +641,7 @@ def _spectra_in_time(linear: Linearisation, columns: np.ndarray) -> tuple[np.nda
             e = error[..., channel] * root
             variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
             slopes.append(np.sqrt(variance) * slope[..., channel, :])
-            shares.append(smooth_share(e, weight > 0))
+            shares.append(smooth_variance_share(e, weight > 0))
     # The columns are padded with zeros to twice the length, since a convolution by FFT would
     # otherwise wrap around.
     size = 2 * slopes[0].shape[1]
@@ -640,25 +679,27 @@ def _correlated_information(
     return np.sum(weighed.reshape(flat).swapaxes(2, 3) @ spectra.reshape(flat), axis=1)
 
 
-def smooth_share(errors: np.ndarray, mask: np.ndarray) -> float:
-    """Return the fraction of the variance of `errors` (R, T) that is not white noise, between 0 and
-    1.
+def smooth_variance_share(errors: np.ndarray, mask: np.ndarray) -> float:
+    """Return the share of the variance of `errors` (R, T) that is not white noise, from 0 to 1.
 
-    The white noise of the R rows of T samples is estimated from the second differences of the
-    errors. Only the errors where `mask` (R, T) is true are used.
+    The variance of the white noise in the R rows of T samples is estimated from the second
+    differences of the errors; the rest of the variance belongs to a part that is smooth in time.
+    Only the errors where `mask` (R, T) is true are used.
     """
     rows = [x[kept] for x, kept in zip(errors, mask, strict=True)]
     total = sum(float(row @ row) for row in rows) / max(sum(row.size for row in rows), 1)
-    return float(np.clip(1.0 - scatter(rows) / total, 0.0, 1.0)) if total > 0 else 1.0
+    return float(np.clip(1.0 - white_noise_variance(rows) / total, 0.0, 1.0)) if total > 0 else 1.0
 
 
-def scatter(rows: list[np.ndarray]) -> float:
-    """Return the variance of the white noise in `rows`, estimated from second differences in time.
+def white_noise_variance(samples: list[np.ndarray]) -> float:
+    """Return the variance of the white noise in `samples`, estimated from second differences in
+    time.
 
-    Each entry of `rows` is an array of samples, such as the errors of one recording. A smooth
-    signal hardly changes the second differences. The variance is 0 if no row has three samples.
+    Each entry of `samples` is an array of successive samples, such as the errors of one recording.
+    A smooth signal hardly changes the second differences. The variance is 0 if no array has three
+    samples.
     """
-    bends = np.concatenate([row[2:] - 2.0 * row[1:-1] + row[:-2] for row in rows])
+    bends = np.concatenate([row[2:] - 2.0 * row[1:-1] + row[:-2] for row in samples])
     # The second difference of white noise has six times the variance of the noise.
     return float(np.mean(bends**2)) / 6.0 if bends.size else 0.0
 
@@ -679,8 +720,10 @@ class CorrelationTimes(eqx.Module):
     independent: float
 
     @property
-    def longest(self) -> float:
-        """Return the longest span of all channels."""
+    def longest_span(self) -> float:
+        """Return the largest number of samples over which the errors of any channel are
+        autocorrelated.
+        """
         return max(span for sensor in self.spans for span in sensor)
 
 
@@ -698,7 +741,7 @@ def correlation_times(linear: Linearisation) -> CorrelationTimes:
         weighted, of_sensor = error * np.sqrt(weight)[..., None], []
         for channel in range(error.shape[-1]):
             mask = kept[..., channel]
-            span, first = _autocorrelation_time(weighted[..., channel], mask)
+            span, first = _autocorrelation_time_and_first_correlation(weighted[..., channel], mask)
             if span > longest:
                 longest, closest = span, first
             of_sensor.append(span)
@@ -707,7 +750,9 @@ def correlation_times(linear: Linearisation) -> CorrelationTimes:
     return CorrelationTimes(tuple(spans), closest, independent)
 
 
-def _autocorrelation_time(errors: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
+def _autocorrelation_time_and_first_correlation(
+    errors: np.ndarray, mask: np.ndarray
+) -> tuple[float, float]:
     """Return two numbers: the autocorrelation time of errors, in samples; and the correlation of
     neighbouring errors.
 

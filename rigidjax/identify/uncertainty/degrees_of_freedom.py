@@ -43,27 +43,29 @@ class Freedom(eqx.Module):
     widths: tuple[tuple[np.ndarray, float, float], ...]
     considered: np.ndarray
 
-    def degrees(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom of the variances of functions with derivative `slope`.
+    def degrees_of_freedom_of_variance(self, slope: np.ndarray) -> np.ndarray:
+        """Return the degrees of freedom (…,) of the variance of each of several functions of the
+        free numbers.
 
-        The `slope` (…, n) is the derivative of the functions with respect to the n free numbers.
-        Considered errors add a known variance. The degrees of freedom of the estimated variance are
-        therefore multiplied by the square of the ratio of the whole variance to the estimated
-        variance.
+        The argument `slope` (…, n) holds the derivative of each function with respect to the n free
+        numbers. Considered errors add a known variance. The degrees of freedom of the estimated
+        variance are therefore multiplied by the square of the ratio of the whole variance to the
+        estimated variance.
         """
         estimated = np.sum((slope @ self.covariance) * slope, axis=-1)
         known = np.sum((slope @ self.considered) ** 2, axis=-1)
         grown = (1.0 + known / np.maximum(estimated, 1e-300)) ** 2
-        return np.asarray(self.estimated_degrees(slope) * grown)
+        return np.asarray(self.degrees_of_freedom_of_estimated_variance(slope) * grown)
 
-    def estimated_degrees(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom of the estimated part of each variance.
+    def degrees_of_freedom_of_estimated_variance(self, slope: np.ndarray) -> np.ndarray:
+        """Return the degrees of freedom (…,) of the estimated part of the variance of each of
+        several functions.
 
         The degrees follow from the share of each noise and of each width in the variance
         (Satterthwaite 1946, doi:10.2307/3002019). If every noise has more than `PLENTY` degrees of
         freedom, the shares of the noises are not computed: the smallest number of degrees is used
-        for all noises. The `slope` (…, n) is the derivative of the functions with respect to the n
-        free numbers.
+        for all noises. The argument `slope` (…, n) holds the derivative of each function with
+        respect to the n free numbers.
         """
         along = slope @ self.covariance
         variance = np.maximum(np.sum(along * slope, axis=-1), 1e-300)
@@ -85,14 +87,14 @@ class Freedom(eqx.Module):
         return np.asarray(1.0 / np.maximum(inverse, 1e-300))
 
 
-def freedom_of(
+def prepare_degrees_of_freedom(
     model: Model,
     linear: Linearisation,
     times: CorrelationTimes,
     covariance: np.ndarray,
     considered: np.ndarray,
 ) -> Freedom:
-    """Return what the degrees of freedom of variances of a fit are computed from.
+    """Return the numbers from which the degrees of freedom of the variances of a fit are computed.
 
     **Arguments:**
 
@@ -104,18 +106,18 @@ def freedom_of(
     - `considered`: (n, c) the changes of the free numbers by one standard deviation of each error
       that a sensor may have and that the fit does not estimate.
     """
-    groups, left, blocks = np.asarray(model.noise_groups), [], linear.information
+    groups, left, blocks = np.asarray(model.noise_groups), [], linear.information_by_sensor
     if model.clusters is not None:
         # The variances of a fit of windows come only from the scatter between stretches of windows.
         degrees = np.array([max(float(np.max(np.asarray(model.clusters))), 1.0)])
         none = np.zeros_like(groups)
         return Freedom(covariance, linear.places, none, blocks[:1], (degrees,), (), considered)
-    taken = leverages(linear, blocks, covariance)
+    taken = counts_of_determined_numbers(linear, blocks, covariance)
     for sensor, mask, spans, lost in zip(
         model.records.sensors, linear.mask, times.spans, taken, strict=True
     ):
         counts = np.bincount(groups, np.sum(mask.sum(axis=1) / np.asarray(spans), axis=1) - lost)
-        has_noise = cast(Any, sensor).noise is not None and times.longest <= 1.5
+        has_noise = cast(Any, sensor).noise is not None and times.longest_span <= 1.5
         left.append(np.full(counts.shape, np.inf) if has_noise else np.maximum(counts, 1.0))
     widths = []
     for slot in model.slots:
@@ -128,30 +130,35 @@ def freedom_of(
     )
 
 
-def leverages(
+def counts_of_determined_numbers(
     linear: Linearisation, information: tuple[np.ndarray, ...], covariance: np.ndarray
 ) -> list[np.ndarray]:
     """Return, for each sensor, how many free numbers its readings determine in each of R recordings
-    (R,).
+    (R,): the sum of the leverages of the readings.
 
     A number that readings and priors determine together counts in part.
 
-    **Arguments:** `linear` the linearisation of the model; `information` for each sensor the
-    information (R, m, m) in its readings on the m numbers of each recording; `covariance` (n, n)
-    the covariance of all n free numbers.
+    **Arguments:**
+
+    - `linear`: the errors of the readings with their derivatives.
+    - `information`: for each sensor the information matrices (R, m, m) of its readings, for the m
+      numbers of each recording.
+    - `covariance`: (n, n) the covariance of all n free numbers.
     """
-    known = linear.blocks(covariance)
+    known = linear.covariance_by_recording(covariance)
     return [np.sum(block * known, axis=(1, 2)) for block in information]
 
 
-def quantile(level: float, freedom: np.ndarray | float) -> np.ndarray:
-    """Return the half-width of an interval of probability `level`, in standard deviations.
+def two_sided_student_quantile(level: float, degrees_of_freedom: np.ndarray | float) -> np.ndarray:
+    """Return the half-width, in standard deviations, of an interval that holds the true value with
+    the probability `level`.
 
-    It is a quantile of Student's distribution with `freedom` degrees of freedom, or of the normal
-    distribution if `freedom` is infinite. **Raises** `ValueError` for a `level` outside (0, 1).
+    It is a quantile of Student's distribution with `degrees_of_freedom`, or of the normal
+    distribution if `degrees_of_freedom` is infinite. **Raises** `ValueError` for a `level` outside
+    (0, 1).
     """
     level = _checks.fraction(level, "level", "a level between 0 and 1")
     from scipy.special import ndtri, stdtrit
 
-    tail, least = 0.5 * (1 + level), np.maximum(freedom, 1.0)
+    tail, least = 0.5 * (1 + level), np.maximum(degrees_of_freedom, 1.0)
     return np.where(np.isinf(least), ndtri(tail), stdtrit(np.minimum(least, 1e300), tail))

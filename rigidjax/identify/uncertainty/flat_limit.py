@@ -41,7 +41,7 @@ class Limit(eqx.Module):
     free: float
     slope: np.ndarray
 
-    def deviation(self, covariance: np.ndarray) -> float:
+    def flatness_deviation(self, covariance: np.ndarray) -> float:
         """Return the standard deviation of the flatness; NaN if its variance is negative.
 
         The `covariance` (n, n) is that of the n free numbers.
@@ -49,24 +49,25 @@ class Limit(eqx.Module):
         with np.errstate(invalid="ignore"):
             return float(np.sqrt(self.slope @ covariance @ self.slope))
 
-    def bound(self, covariance: np.ndarray) -> float:
+    def flatness_upper_bound(self, covariance: np.ndarray) -> float:
         """Return the one-sided 95 % upper bound of the flatness.
 
         The `covariance` (n, n) is that of the n free numbers.
         """
-        wide = self.deviation(covariance)
+        wide = self.flatness_deviation(covariance)
         return self.free + float(np.hypot(ONE_SIDED * wide, min(self.free, 0.0)))
 
-    def is_near(self, covariance: np.ndarray, reach: float) -> bool:
-        """Return whether a flat body lies within `reach` standard deviations.
+    def is_flat_within(self, covariance: np.ndarray, deviations: float) -> bool:
+        """Return whether a flat body lies within this number of standard `deviations` of the best
+        point.
 
         The `covariance` (n, n) is that of the n free numbers.
         """
-        return bool(self.free < reach * self.deviation(covariance))
+        return bool(self.free < deviations * self.flatness_deviation(covariance))
 
 
-def interval_ends(
-    reach: np.ndarray | float, correlation: np.ndarray | float, flatness: float
+def interval_ends_at_flat_body(
+    half_width: np.ndarray | float, correlation: np.ndarray | float, flatness: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends (low, high) of an interval that stops at a flat body, in standard deviations.
 
@@ -77,14 +78,14 @@ def interval_ends(
 
     **Arguments:**
 
-    - `reach`: the quantile of the interval.
+    - `half_width`: the half-width of the interval without the limit, in standard deviations.
     - `correlation`: the correlation of the number y with the flatness z.
     - `flatness`: the flatness at the minimum of the linearised model, divided by its standard
       deviation.
     """
     rho = np.clip(np.asarray(correlation), -1.0, 1.0)
     past = min(flatness, 0.0)
-    middle, square = rho * past, reach**2 + past**2
+    middle, square = rho * past, half_width**2 + past**2
 
     def end(side: float) -> np.ndarray:
         free = middle + side * np.sqrt(square)
@@ -95,15 +96,16 @@ def interval_ends(
     return end(-1.0), end(1.0)
 
 
-def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
+def thicken_flat_bodies(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     """Return the free numbers x (n,) with each flat body made thicker; `None` if no body is flat.
 
-    A flat body has the moments I1 + I2 = I3, or nearly so. The derivative of the body with respect
-    to x is zero there. The information on the inertia tensor itself is regular at a flat body, and
-    is hardly different at the slightly thicker body. The `model` gives the chart (the
-    parametrisation by x) of each body.
+    A flat body has the moments I1 + I2 = I3, or nearly so. The derivative of a flat body with
+    respect to x is zero, so that derivatives are computed at a slightly thicker body. The
+    information on the inertia tensor itself is regular at a flat body, and hardly different at the
+    thicker body. The `model` gives the chart of each body, which is its parametrisation by free
+    numbers.
     """
-    thick = list(map(_numbers_of_thicker_body, chart_list(model.chart), bodies_of(model, x)))
+    thick = list(map(_numbers_of_thicker_body, chart_list(model.chart), bodies_at(model, x)))
     if all(one is None for one in thick):
         return None
     pairs = zip(numbers_of_each_body(model.chart, x[: model.index.bodies]), thick, strict=True)
@@ -111,16 +113,17 @@ def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     return jnp.concatenate([*vectors, x[model.index.bodies :]])
 
 
-def bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
-    """Return the bodies of a `model` at its free numbers x (n,), in the order of their charts.
+def bodies_at(model: Model, x: Float[Array, " n"]) -> list[Any]:
+    """Return the bodies of a `model` at its free numbers x (n,), in the order of the model's
+    charts.
 
     A chart is the parametrisation of one body by free numbers.
     """
-    return _bodies_of(with_first_times_only(model), x)
+    return _compiled_bodies(with_first_times_only(model), x)
 
 
 @eqx.filter_jit
-def _bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
+def _compiled_bodies(model: Model, x: Float[Array, " n"]) -> list[Any]:
     """Return the bodies of a `model` at its free numbers x (n,), computed in one compiled program.
 
     They are in the order of the charts of the model (the maps from free numbers to a possible
@@ -149,7 +152,7 @@ def _numbers_of_thicker_body(
     else:
         tensor = np.asarray(body.tensor)
         second = 0.5 * np.trace(tensor) * np.eye(3) - tensor
-    if not _ends_at_flat_bodies(chart) or not np.isfinite(second).all():
+    if not _is_bounded_by_flat_bodies(chart) or not np.isfinite(second).all():
         return None
     values, axes = np.linalg.eigh(second)
     least = THIN * values.sum()
@@ -161,7 +164,7 @@ def _numbers_of_thicker_body(
     return chart.vector(Inertia(inertia_from_second_moment(second)))
 
 
-def _ends_at_flat_bodies(chart: AbstractBodyChart) -> bool:
+def _is_bounded_by_flat_bodies(chart: AbstractBodyChart) -> bool:
     """Return whether flat bodies, those with the moments I1 + I2 = I3, are the limit of the bodies
     that a `chart` can describe.
 
@@ -182,7 +185,7 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
     out = []
     bodies = bodies_as_list(model.bodies(x))
     for chart, body in zip(chart_list(model.chart), bodies, strict=True):
-        if not _ends_at_flat_bodies(chart):
+        if not _is_bounded_by_flat_bodies(chart):
             out.append(jnp.ones((), x.dtype))
             continue
         # The last logarithms belong to the three moments, or to the ratios of two moments to the
@@ -195,25 +198,30 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
     return jnp.stack(out)
 
 
-def flat_limits(
-    model: Model, numbers: tuple[np.ndarray, np.ndarray], step: np.ndarray, names: list[str]
+def distances_from_flat_bodies(
+    model: Model,
+    values_and_slopes: tuple[np.ndarray, np.ndarray],
+    step_to_minimum: np.ndarray,
+    body_suffixes: list[str],
 ) -> tuple[Limit, ...]:
     """Return, for each body whose moments are free, how far it is from a flat body, I1 + I2 = I3.
 
     **Arguments:**
 
     - `model`: the fitted model.
-    - `numbers`: two arrays, as `quantities.values_and_slopes` returns them: the reported numbers,
-      with the flatness of each body at the end; and their derivatives with respect to the n free
-      numbers.
-    - `step`: (n,) the step of the free numbers from the best point to the minimum of the linear
-      model.
-    - `names`: for each body the suffix of the names of its quantities.
+    - `values_and_slopes`: two arrays, as `quantities_and_derivatives_in_numpy` returns them: the
+      reported numbers, with the flatness of each body at the end; and their derivatives with
+      respect to the n free numbers.
+    - `step_to_minimum`: (n,) the step of the free numbers from the best point to the minimum of the
+      linear model.
+    - `body_suffixes`: for each body the suffix of the names of its quantities.
     """
-    rows = zip(names, *(part[-len(names) :] for part in numbers), strict=True)
-    have_limits = [_ends_at_flat_bodies(chart) for chart in chart_list(model.chart)]
+    rows = zip(
+        body_suffixes, *(part[-len(body_suffixes) :] for part in values_and_slopes), strict=True
+    )
+    have_limits = [_is_bounded_by_flat_bodies(chart) for chart in chart_list(model.chart)]
     return tuple(
-        Limit(name, float(value), float(value + min(slope @ step, 0.0)), slope)
+        Limit(name, float(value), float(value + min(slope @ step_to_minimum, 0.0)), slope)
         for (name, value, slope), has_limit in zip(rows, have_limits, strict=True)
         if has_limit
     )
@@ -233,7 +241,9 @@ def why_unreal(body: PyTree) -> str | None:
     return None
 
 
-def unreal_bodies(charts: list[tuple[str, AbstractBodyChart]], bodies: list[Any]) -> list[str]:
+def describe_unreal_bodies(
+    charts: list[tuple[str, AbstractBodyChart]], bodies: list[Any]
+) -> list[str]:
     """Return one line of text for each body that is physically impossible, with the reason.
 
     Only bodies of charts that a user wrote are checked, since all points of the charts of this

@@ -12,7 +12,7 @@ from rigidjax.identify.model.charts import AbstractBodyChart, Bodies, Ratios, bo
 from rigidjax.identify.model.model import Model, values_of, with_first_times_only
 from rigidjax.identify.model.terms import jacobian_and_value
 from rigidjax.identify.uncertainty import flat_limit
-from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
+from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
 
 # If one end of the interval of a positive number differs from its value by more than this factor,
 # the interval goes from 0 to infinity.
@@ -59,9 +59,9 @@ class Quantity(eqx.Module):
         whose uncertainty is more than a factor of 1e3. **Arguments:** `level` the probability that
         the interval holds the true value. **Raises** `ValueError` for a level outside (0, 1).
         """
-        reach = float(quantile(level, self.freedom))
-        wide = reported_deviation(self)
-        low, high = (float(side) * wide for side in cut_ends(reach, self.cuts))
+        reach = float(two_sided_student_quantile(level, self.freedom))
+        wide = deviation_of_value_or_logarithm(self)
+        low, high = (float(side) * wide for side in interval_cut_at_flat_bodies(reach, self.cuts))
         if not self.positive:
             return self.value + low, self.value + high
         if max(-low, high) > np.log(FARTHEST):
@@ -69,7 +69,7 @@ class Quantity(eqx.Module):
         return float(self.value * np.exp(low)), min(float(self.value * np.exp(high)), self.most)
 
 
-def reported_deviation(quantity: Quantity) -> float:
+def deviation_of_value_or_logarithm(quantity: Quantity) -> float:
     """Return the standard deviation of a reported `quantity`, or that of its logarithm if it is
     positive.
     """
@@ -78,33 +78,40 @@ def reported_deviation(quantity: Quantity) -> float:
     return quantity.deviation / quantity.value if quantity.value else np.inf
 
 
-def cut_ends(reach: np.ndarray | float, cuts: Sequence[tuple[Any, float]]) -> tuple[Any, Any]:
-    """Return the ends (low, high) of an interval in standard deviations, cut at each limit.
+def interval_cut_at_flat_bodies(
+    half_width: np.ndarray | float, cuts: Sequence[tuple[np.ndarray | float, float]]
+) -> tuple[np.ndarray | float, np.ndarray | float]:
+    """Return the ends (low, high) of an interval in standard deviations, which is cut where a body
+    would be flat.
 
-    **Arguments:** `reach` the half-width of the interval without limits; `cuts` for each limit (a
-    flat body) two numbers: the correlation of the quantity with the flatness of the body; and the
-    flatness in standard deviations.
+    A body is flat if its moments are I1 + I2 = I3.
+
+    **Arguments:**
+
+    - `half_width`: the half-width of the interval if it is not cut, in standard deviations.
+    - `cuts`: for each body two numbers: the correlation of the quantity with the flatness of the
+      body; and the flatness in standard deviations.
     """
-    low: Any = -reach
-    high: Any = reach
+    low: Any = -half_width
+    high: Any = half_width
     for correlation, away in cuts:
-        least, most = flat_limit.interval_ends(reach, correlation, away)
+        least, most = flat_limit.interval_ends_at_flat_body(half_width, correlation, away)
         low, high = np.maximum(low, least), np.minimum(high, most)
     return low, high
 
 
-def labels(model: Model) -> list[tuple[str, str, bool]]:
-    """Return the name, the unit and the sign of each quantity that a fit of the `model` reports.
+def names_units_and_signs(model: Model) -> list[tuple[str, str, bool]]:
+    """Return three things for each quantity that a fit of the `model` reports: its name; its unit;
+    and whether it is always positive.
 
-    For each quantity there is a tuple of its name, its unit, and whether it is always positive, in
-    the order of `quantity_vector`.
+    The quantities are in the order of `quantity_vector`.
     """
     out = []
-    for name, chart in charts_by_suffix(model):
+    for name, chart in name_suffixes_and_charts(model):
         out += [(f"{log}{name}", chart.unit, True) for log in chart.log_names]
         out += [(f"{plain}{name}", chart.unit, False) for plain in chart.plain_names]
-    names = recording_names(model)
-    for where in names if reports_starts(model) else ():
+    names = recording_suffixes(model)
+    for where in names if reports_initial_states(model) else ():
         out += [(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]
     for slot in model.slots:
         shape = slot.shape
@@ -116,22 +123,26 @@ def labels(model: Model) -> list[tuple[str, str, bool]]:
     return out
 
 
-def reports_starts(model: Model) -> bool:
-    """Return whether initial states are reported; the many initial states of windows are not."""
+def reports_initial_states(model: Model) -> bool:
+    """Return whether a fit of the `model` reports the initial states of its recordings.
+
+    It does not for windows (short parts of a record), which have many initial states.
+    """
     return model.clusters is None
 
 
-def charts_by_suffix(model: Model) -> list[tuple[str, AbstractBodyChart]]:
+def name_suffixes_and_charts(model: Model) -> list[tuple[str, AbstractBodyChart]]:
     """Return, for each body of a `model`, the suffix of the names of its quantities, and its chart.
 
-    A chart is the parametrisation of a body by free numbers. The suffix is empty for a single body.
+    A chart is the parametrisation of a body by free numbers. The suffix is empty for a single body;
+    otherwise it is the name of the body in brackets.
     """
     if not isinstance(model.chart, Bodies):
         return [("", model.chart)]
     return [(f" [{n}]", c) for n, c in zip(model.chart.names, model.chart.charts, strict=True)]
 
 
-def recording_names(model: Model) -> list[str]:
+def recording_suffixes(model: Model) -> list[str]:
     """Return for each recording the suffix of the names of its quantities.
 
     The suffix is empty for a single recording; otherwise it has the number of the recording among
@@ -154,13 +165,14 @@ def _component_name(index: tuple[int, ...]) -> str:
 def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
     """Return the quantities (q,) that a fit reports, at the free numbers x (n,) of a `model`.
 
-    They are, in the order of `labels`, the moments and other numbers of each body, the initial body
-    rates (rad/s), and the values of each `Free`. A positive quantity is given by its logarithm.
+    They are, in the order of `names_units_and_signs`, the moments and other numbers of each body,
+    the initial body rates (rad/s), and the values of each `Free`. A positive quantity is given by
+    its logarithm.
     """
     parts, bodies = [jnp.zeros(0, x.dtype)], bodies_as_list(model.bodies(x))
-    for (_, chart), body in zip(charts_by_suffix(model), bodies, strict=True):
+    for (_, chart), body in zip(name_suffixes_and_charts(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
-    if reports_starts(model):
+    if reports_initial_states(model):
         rates = x[model.index.start[:, -3:]] * model.reference.rate[:, None]
         parts.append(rates.reshape(-1))
     values = values_of(model, x)
@@ -171,18 +183,20 @@ def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
     return jnp.concatenate([part.astype(x.dtype) for part in parts])
 
 
-def value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
+def quantities_and_derivatives(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
     """Return the reported quantities (q,) of a `model` at the free numbers x (n,), and their
     derivatives (q, n).
 
     Both arrays have further entries at the end for the flatness (I1 + I2 − I3) / I3 of each body. A
     positive quantity is given by its logarithm.
     """
-    return _value_and_slope(with_first_times_only(model), x)
+    return _compiled_quantities_and_derivatives(with_first_times_only(model), x)
 
 
 @eqx.filter_jit
-def _value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
+def _compiled_quantities_and_derivatives(
+    model: Model, x: Float[Array, " n"]
+) -> tuple[Array, Array]:
     """Return the reported quantities (q,) of a `model` at the free numbers x (n,), and their
     derivatives (q, n).
 
@@ -197,7 +211,7 @@ def _value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]
     return values, slope
 
 
-def values_and_slopes(
+def quantities_and_derivatives_in_numpy(
     model: Model, x: Float[Array, " n"], derivative_point: Float[Array, " n"] | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the reported quantities (q,) of a `model` at the free numbers x (n,), and their
@@ -207,36 +221,37 @@ def values_and_slopes(
     The derivatives are computed at x or, if a body is flat at x, at `derivative_point` (n,), the
     free numbers with a thicker body.
     """
-    values, slopes = (np.asarray(part) for part in value_and_slope(model, x))
+    values, slopes = (np.asarray(part) for part in quantities_and_derivatives(model, x))
     if derivative_point is not None:
-        slopes = np.asarray(value_and_slope(model, derivative_point)[1])
+        slopes = np.asarray(quantities_and_derivatives(model, derivative_point)[1])
     return values, slopes
 
 
-def quantities(
+def reported_quantities(
     model: Model,
-    numbers: tuple[np.ndarray, np.ndarray],
+    values_and_slopes: tuple[np.ndarray, np.ndarray],
     covariance: np.ndarray,
-    null: np.ndarray,
+    null_directions: np.ndarray,
     limits: tuple[flat_limit.Limit, ...] = (),
-    freedom: np.ndarray | float = np.inf,
+    degrees_of_freedom: np.ndarray | float = np.inf,
 ) -> tuple[Quantity, ...]:
     """Return every reported quantity with its standard deviation.
 
     **Arguments:**
 
     - `model`: the model.
-    - `numbers`: the two arrays that `values_and_slopes` returns: the values; and their derivatives.
+    - `values_and_slopes`: the two arrays that `quantities_and_derivatives_in_numpy` returns: the
+      values; and their derivatives.
     - `covariance`: (n, n) the covariance of the free numbers within the determined directions.
-    - `null`: (k, n) the directions that are not determined.
+    - `null_directions`: (k, n) the directions of the free numbers that are not determined.
     - `limits`: the flat bodies at which intervals end.
-    - `freedom`: the degrees of freedom of the variances.
+    - `degrees_of_freedom`: the degrees of freedom of the variances.
     """
-    names = labels(model)
-    values, slope = (part[: len(names)] for part in numbers)
-    deviations = standard_deviations(slope, covariance, null)
-    cuts = cuts_of(slope, covariance, deviations, limits)
-    freedom = np.broadcast_to(freedom, numbers[0].shape)
+    names = names_units_and_signs(model)
+    values, slope = (part[: len(names)] for part in values_and_slopes)
+    deviations = standard_deviations(slope, covariance, null_directions)
+    cuts = correlations_with_flatness(slope, covariance, deviations, limits)
+    freedom = np.broadcast_to(degrees_of_freedom, values_and_slopes[0].shape)
     # A quantity that does not depend on any free number, such as a known quantity, gets no
     # deviation (NaN).
     deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
@@ -258,8 +273,8 @@ def interval_about(
     value: np.ndarray,
     slope: np.ndarray,
     covariance: np.ndarray,
-    null: np.ndarray,
-    reach: np.ndarray | float,
+    null_directions: np.ndarray,
+    half_width: np.ndarray | float,
     limits: tuple[flat_limit.Limit, ...] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the low and the high end of the interval of functions of the n free numbers of a fit.
@@ -269,25 +284,27 @@ def interval_about(
     - `value`: (…) the best values of the functions.
     - `slope`: (…, n) their derivatives with respect to the free numbers.
     - `covariance`: (n, n) the covariance of the free numbers within the determined directions.
-    - `null`: (k, n) the directions that the data do not determine.
-    - `reach`: the half-width of the interval in standard deviations.
+    - `null_directions`: (k, n) the directions that the data do not determine.
+    - `half_width`: the half-width of the interval, in standard deviations, if no limit cuts it.
     - `limits`: the flat bodies at which intervals end.
     """
-    wide = standard_deviations(slope, covariance, null)
-    low, high = cut_ends(reach, cuts_of(slope, covariance, wide, limits))
+    wide = standard_deviations(slope, covariance, null_directions)
+    low, high = interval_cut_at_flat_bodies(
+        half_width, correlations_with_flatness(slope, covariance, wide, limits)
+    )
     return np.asarray(value + low * wide), np.asarray(value + high * wide)
 
 
-def cuts_of(
+def correlations_with_flatness(
     slope: np.ndarray,
     covariance: np.ndarray,
     deviations: np.ndarray,
     limits: tuple[flat_limit.Limit, ...],
 ) -> list[tuple[np.ndarray, float]]:
-    """Return how functions of the free numbers of a fit depend on the flatness of each body.
+    """Return the correlations of functions of the free numbers with the flatness of each body.
 
-    The flatness (I1 + I2 − I3) / I3 of a body cannot be negative, and so cuts the intervals of
-    numbers that are correlated with it.
+    The flatness (I1 + I2 − I3) / I3 of a body cannot be negative. This cuts the intervals of
+    functions that are correlated with it.
 
     **Arguments:**
 
@@ -301,7 +318,7 @@ def cuts_of(
     """
     out = []
     for limit in limits:
-        wide = limit.deviation(covariance)
+        wide = limit.flatness_deviation(covariance)
         if np.isfinite(wide) and wide > 0:
             with np.errstate(invalid="ignore", divide="ignore"):
                 rho = slope @ (covariance @ limit.slope) / (deviations * wide)
@@ -312,18 +329,23 @@ def cuts_of(
     return out
 
 
-def standard_deviations(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
-    """Return the standard deviations of functions with derivative `slope` (…, n).
+def standard_deviations(
+    slope: np.ndarray, covariance: np.ndarray, null_directions: np.ndarray
+) -> np.ndarray:
+    """Return the standard deviations (…) of functions of the n free numbers of a fit.
 
-    The `slope` is with respect to the n free numbers. A deviation is infinite if the function
-    changes along a direction of `null` (k, n). It is NaN if the variance is negative or round-off,
-    or if the function depends on a free number whose correlation with another free number is larger
-    than one in magnitude. All intervals use these deviations.
+    **Arguments:** `slope` (…, n) the derivatives of the functions; `covariance` (n, n) the
+    covariance of the free numbers within the determined directions; `null_directions` (k, n) the
+    directions that the data do not determine.
+
+    A deviation is infinite if the function changes along a null direction. It is NaN if the
+    variance is negative or round-off, or if the function depends on a free number whose correlation
+    with another free number is larger than one in magnitude. All intervals use these deviations.
     """
     if not np.isfinite(covariance).all():
         return np.full(slope.shape[:-1], np.nan)
     size = np.abs(slope).max(axis=-1, initial=1e-300)
-    undetermined = np.abs(slope @ null.T).max(axis=-1, initial=0.0) > 1e-6 * size
+    undetermined = np.abs(slope @ null_directions.T).max(axis=-1, initial=0.0) > 1e-6 * size
     unit = np.sqrt(np.abs(np.diag(covariance)))
     unit = np.where(unit > 0, unit, 1.0)
     rows, scaled = (slope * unit).reshape(-1, unit.size), covariance / np.outer(unit, unit)
@@ -336,12 +358,12 @@ def standard_deviations(slope: np.ndarray, covariance: np.ndarray, null: np.ndar
         alike.setdefault((row != 0).tobytes(), []).append(index)
     for key, mine in alike.items():
         used = np.frombuffer(key, bool)
-        deviations = _standard_deviations(rows[mine][:, used], scaled[np.ix_(used, used)])
+        deviations = _deviations_by_eigenvalues(rows[mine][:, used], scaled[np.ix_(used, used)])
         out[mine] = np.nan if beyond[used].any() else deviations
     return np.where(undetermined, np.inf, out.reshape(slope.shape[:-1]))
 
 
-def _standard_deviations(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def _deviations_by_eigenvalues(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return the standard deviations (m,) of m linear functions of n numbers with the `covariance`
     (n, n).
 

@@ -20,7 +20,7 @@ from rigidjax.identify.uncertainty.covariance import (
     covariance_root,
     with_infinite_variance,
 )
-from rigidjax.identify.uncertainty.quantities import labels
+from rigidjax.identify.uncertainty.quantities import names_units_and_signs
 
 # A quantity hangs on one stretch if this stretch causes more than the fraction HANGS of the
 # variance of the quantity. With fewer stretches than FEWEST this is not tested.
@@ -43,22 +43,29 @@ class Stretches(eqx.Module):
     null: tuple[Float[np.ndarray, "_ n"], ...]
 
     @property
-    def hidden_directions(self) -> Float[np.ndarray, "k n"]:
-        """Return the directions (k, n) whose scatter between stretches is not known."""
+    def directions_shown_by_one_stretch(self) -> Float[np.ndarray, "k n"]:
+        """Return the directions (k, n) of the free numbers that only one stretch of windows shows,
+        so that their scatter between stretches is not known.
+        """
         return np.concatenate(self.null)
 
 
-def stretches_of(model: Model, linear: Linearisation) -> Stretches | None:
-    """Return the `Stretches` of a fit of windows; `None` for other recordings.
+def leave_out_each_stretch(model: Model, linear: Linearisation) -> Stretches | None:
+    """Return the changes of a fit of windows if each stretch of windows is left out; `None` for
+    other recordings.
 
-    It is `None`, too, if the motion is not finite. The numbers that one window alone has are
-    eliminated window by window (Schur complement).
+    A stretch is a run of neighbouring windows. The result is `None`, too, if the motion is not
+    finite. The numbers that one window alone has are eliminated window by window (Schur
+    complement).
+
+    **Arguments:** `model` the fitted model; `linear` the errors at the best point, with their
+    derivatives and weights.
     """
     if model.clusters is None:
         return None
     clusters = np.asarray(model.clusters)
     count, alone = int(clusters.max()) + 1, np.asarray(model.index.alone, int)
-    dense = linear.dense
+    dense = linear.weighted_jacobian
     if not np.isfinite(dense).all():
         return None
     shared = np.setdiff1d(np.arange(dense.shape[-1]), alone)
@@ -94,12 +101,12 @@ def stretches_of(model: Model, linear: Linearisation) -> Stretches | None:
         if rest.any():
             half, blind = covariance_root(rest)
             steps[k] = half @ (half.T @ slopes[k])
-        null.append(np.zeros((len(blind), linear.size)))
+        null.append(np.zeros((len(blind), linear.free_count)))
         null[-1][:, places] = blind
     return Stretches(steps, places, tuple(null))
 
 
-def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
+def jackknife_covariance(stretches: Stretches, white: Covariance) -> Covariance:
     """Return the covariance of a fit of windows from its changes if one stretch of windows is left
     out.
 
@@ -116,37 +123,37 @@ def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
     covariance[places], covariance[:, places] = 0.0, 0.0
     square = (count - 1) / count * stretches.steps.T @ stretches.steps
     covariance[np.ix_(places, places)] = square
-    null = np.concatenate([white.null_directions, stretches.hidden_directions])
+    null = np.concatenate([white.null_directions, stretches.directions_shown_by_one_stretch])
     shown = with_infinite_variance(null, covariance)
     kind = f"jackknife: one of {count} stretches of windows left out"
     return dataclasses.replace(white, covariance=shown, determined=covariance, kind=kind)
 
 
-def remarks_on_stretches(
+def remarks_on_dependence_on_one_stretch(
     stretches: Stretches,
     model: Model,
-    numbers: tuple[np.ndarray, np.ndarray],
+    values_and_slopes: tuple[np.ndarray, np.ndarray],
     white: Covariance,
 ) -> list[str]:
-    """Return a remark on each reported quantity whose value or deviation depends on a single
-    stretch.
+    """Return a remark on each reported quantity whose value or standard deviation depends on a
+    single stretch (a run of neighbouring windows).
 
     **Arguments:**
 
-    - `stretches`, `model`: the stretches of a fit, and its model.
-    - `numbers`: the reported quantities and their derivatives, as `quantities.values_and_slopes`
-      returns them.
+    - `stretches`, `model`: the changes of a fit if each stretch is left out; and its model.
+    - `values_and_slopes`: the reported quantities and their derivatives, as
+      `quantities.quantities_and_derivatives_in_numpy` returns them.
     - `white`: the covariance for white errors.
     """
-    count, names = len(stretches.steps), labels(model)
+    count, names = len(stretches.steps), names_units_and_signs(model)
     if count == 1:
         return ["deviations come from the differences between windows, and there is one"]
-    values, slopes = (part[: len(names)] for part in numbers)
+    values, slopes = (part[: len(names)] for part in values_and_slopes)
     steps = stretches.steps @ slopes[:, stretches.places].T
     squares = steps**2
     hanging = squares.max(axis=0) > HANGS * np.maximum(squares.sum(axis=0), 1e-300)
-    unseen = _change_along(white.null_directions, slopes)
-    alone = np.stack([_change_along(null, slopes) & ~unseen for null in stretches.null])
+    unseen = _quantities_change_along(white.null_directions, slopes)
+    alone = np.stack([_quantities_change_along(null, slopes) & ~unseen for null in stretches.null])
     edges = -(-np.arange(count + 1) * model.count // count)
     out = []
     for index, (name, _, positive) in enumerate(names):
@@ -162,14 +169,14 @@ def remarks_on_stretches(
     return out
 
 
-def _change_along(
-    null: Float[np.ndarray, "k n"], slopes: Float[np.ndarray, "q n"]
+def _quantities_change_along(
+    directions: Float[np.ndarray, "k n"], slopes: Float[np.ndarray, "q n"]
 ) -> Bool[np.ndarray, " q"]:
-    """Return a mask (q,), true for each quantity that changes along one of the directions `null`
+    """Return a mask (q,), true for each of q quantities that changes along any of the `directions`
     (k, n).
 
-    The directions are those of the n free numbers of a fit that its data do not determine; `slopes`
-    (q, n) holds the derivatives of the q quantities with respect to these numbers.
+    The directions are directions of the n free numbers of a fit; `slopes` (q, n) holds the
+    derivatives of the quantities with respect to these numbers.
     """
     size = np.abs(slopes).max(axis=-1, initial=1e-300)
-    return np.abs(slopes @ null.T).max(axis=-1, initial=0.0) > 1e-6 * size
+    return np.abs(slopes @ directions.T).max(axis=-1, initial=0.0) > 1e-6 * size
