@@ -207,8 +207,8 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
 
 
 def _rms_errors_of_components(fit: Fit) -> list[tuple[str, list[float], str]]:
-    """Return three things for each sensor of a `fit`: its name; the root mean square error of each
-    of its components; and its unit.
+    """Return three things for each sensor of a `fit`: the name of its class; the root mean square
+    error of each of its components; and its unit.
 
     Masked readings and readings at full scale are left out.
     """

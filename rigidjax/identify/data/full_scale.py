@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax.identify.data.recording import Recording
+from rigidjax.identify.data.recording import Reading, Recording
 
 # Readings are cut off only if at least this number of readings in a row have the largest value.
 RUN = 3
@@ -41,10 +41,11 @@ def full_scale_of(values: np.ndarray) -> float | None:
 
 
 def with_full_scale_limits(recordings: Sequence[Recording]) -> list[Recording]:
-    """Return the recordings with a `limit` for each sensor whose readings are cut off.
+    """Return the recordings with the full scale as the `limit` of each sensor whose readings are
+    cut off.
 
-    The limit is the full scale that the readings show. A sensor that has a `limit` already keeps
-    this limit.
+    The full scale is the largest value that a sensor can read; the readings show it. A sensor that
+    has a `limit` already keeps this limit.
     """
     out = list(recordings)
     for index in range(max(len(r.readings) for r in recordings)):
@@ -71,18 +72,18 @@ def with_full_scale_limits(recordings: Sequence[Recording]) -> list[Recording]:
     return out
 
 
-def describe_full_scale(readings: Sequence[Any]) -> list[str]:
-    """Describe the readings at full scale, in one sentence for each sensor.
+def describe_full_scale(readings: Sequence[Reading]) -> list[str]:
+    """Describe how many readings are at full scale, in one sentence for each sensor.
 
-    `readings` holds a `Reading` for each sensor. A sensor without readings at full scale is left
-    out.
+    The full scale is the largest value that a sensor can read. A sensor without readings at full
+    scale is left out.
     """
     out = []
     for reading in readings:
         count = (reading.host_mask[..., None] & ~reading.usable_channel_mask).sum(axis=(0, 1))
         if not count.any():
             continue
-        sensor = reading.sensor
+        sensor: Any = reading.sensor
         level = np.asarray(sensor.limit)
         parts = []
         for channel in np.flatnonzero(count):

@@ -1,7 +1,7 @@
 """Hold a recording: times, the readings of each sensor, and logged inputs."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -51,8 +51,8 @@ class Reading(eqx.Module):
 
     @property
     def usable_channel_mask(self) -> np.ndarray:
-        """Return a mask (…, T, k), true for each channel that was read and is not at full scale
-        (the largest value that it can read).
+        """Return a mask (…, T, k), true for each component of a reading that was read and is not at
+        full scale (the largest value that the sensor can read).
 
         T is the number of times and k the number of components of an error.
         """
@@ -82,7 +82,9 @@ class Reading(eqx.Module):
 
     @property
     def has_known_noise(self) -> bool:
-        """Return whether the noise of the sensor is given and its time stamps have no jitter."""
+        """Return whether the standard deviation of the sensor's noise is given, and its time stamps
+        have no jitter (random error), so that a fit estimates neither.
+        """
         return self.sensor.noise is not None and self.jitter_error is None
 
 
@@ -137,17 +139,20 @@ class Recording(eqx.Module):
             raise ValueError(f"t: wanted at least two times, shape (T,), got shape {t.shape}")
         if not np.isfinite(t).all():
             index = int(np.argmin(np.isfinite(t)))
-            raise ValueError(f"t: contains NaN or infinity at index {index}")
+            raise ValueError(f"t: contains NaN or infinity at index {index}, wanted finite times")
         if (np.diff(t) <= 0).any():
             index = int(np.argmax(np.diff(t) <= 0)) + 1
-            raise ValueError(f"t: wanted increasing times; t[{index}] is not above the one before")
+            raise ValueError(f"t: wanted increasing times; t[{index}] is not above t[{index - 1}]")
         if not readings:
             raise ValueError("Recording: wanted at least one pair (sensor, values)")
         rows = [_checked_reading(t, *reading) for reading in readings]
         self.inputs = _checked_inputs(t, {} if inputs is None else inputs)
         read = np.any([mask for _, _, mask, _ in rows], axis=0)
         if read.sum() < 2:
-            raise ValueError("Recording: wanted readings at two times at least; the rest is masked")
+            raise ValueError(
+                "Recording: wanted readings at two times at least, got readings at "
+                f"{int(read.sum())}; all others are masked"
+            )
         # The motion starts at the first reading and ends at the last one: the times of rows that a
         # masked array hides before the first reading or after the last one are dropped.
         within = np.maximum.accumulate(read) & np.maximum.accumulate(read[::-1])[::-1]
@@ -197,7 +202,8 @@ class Recording(eqx.Module):
 def unchecked_recording(
     t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]
 ) -> Recording:
-    """Return a `Recording` with the fields `t`, `readings` and `inputs`, without checks.
+    """Return a `Recording` with the fields `t`, `readings` and `inputs`, without the checks that
+    `Recording(…)` makes.
 
     The arrays may have a leading axis over recordings.
 
@@ -212,12 +218,14 @@ def unchecked_recording(
     return record
 
 
-def readings_of(recording: Recording, kind: type) -> list[Any]:
-    """Return the `Reading` of each sensor of the `recording` that is of the class `kind`."""
-    return [reading for reading in recording.readings if isinstance(reading.sensor, kind)]
+def readings_of(recording: Recording, sensor_class: type) -> list[Any]:
+    """Return the `Reading` of each sensor of the `recording` that is of the class
+    `sensor_class`.
+    """
+    return [reading for reading in recording.readings if isinstance(reading.sensor, sensor_class)]
 
 
-def inputs_as_functions(recording: Recording) -> dict[str, Any]:
+def inputs_as_functions(recording: Recording) -> dict[str, Callable[[Any], Any]]:
     """Return the inputs (logged quantities such as a motor command) of a `recording` as a dict of
     name → function of time.
 
@@ -347,7 +355,10 @@ def _checked_reading(
             "a gap"
         )
     if not mask.any():
-        raise ValueError(f"{name}: every reading is masked")
+        raise ValueError(
+            f"{name}: wanted at least one reading, but every reading is masked; a mask is true "
+            "where there is a reading"
+        )
     # Replace masked values by a valid reading: a NaN would make derivatives NaN, since 0 · NaN is
     # NaN.
     if not mask.all():

@@ -107,7 +107,8 @@ def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rates_between_attitudes(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (m,), s, and the mean body rates (m, 3), rad/s, between pairs of attitudes.
+    """Return two things: times (m,), s; and the mean body rate (m, 3), rad/s, between two attitudes
+    for each of these times.
 
     The quaternions q (n, 4) are the attitudes at the times t (n,), s. Each mean rate belongs to a
     turn of about `_TURN`, and its time is the middle of the interval of the turn.
@@ -159,8 +160,8 @@ class ReferenceStates(eqx.Module):
     units: Float[Array, "*records n"]
 
     def initial_state_at(self, change: Float[Array, " n"]) -> PyTree:
-        """Return the initial state of one recording: the reference state changed by the free
-        numbers `change` (n,), in `units`.
+        """Return the initial state of one recording at the free numbers `change` (n,): the
+        reference state changed by `units` times `change`.
 
         If the initial state is known, `change` is empty, and the reference state is returned.
         """

@@ -47,7 +47,7 @@ def _is_stackable(leaf: PyTree) -> bool:
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | complex)
 
 
-def pad_to_few_lengths(model: PyTree) -> Any:
+def pad_to_few_lengths(model: PyTree) -> PyTree:
     """Return a `model` with its recordings padded by masked readings to one of few lengths.
 
     Between a length and its double there are about four such lengths, so that few programs are
@@ -93,7 +93,7 @@ def _padded_length(count: int) -> int:
     return int(lengths[0] if lengths[0] >= count else lengths[1])
 
 
-def _stack_leaves(*leaves: PyTree) -> Any:
+def _stack_leaves(*leaves: PyTree) -> Array:
     """Return arrays of one shape, stacked along a new first axis.
 
     `leaves` are the arrays or numbers with the same place in several trees.
@@ -105,10 +105,13 @@ def _stack_leaves(*leaves: PyTree) -> Any:
 
 
 def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "*rows"]) -> PyTree:
-    """Return one or some of the recordings in a tree: the tree `records` with each array picked at
-    `index` of its leading axis.
+    """Return the recordings with the given `index` on the leading axis of all arrays of a tree.
 
-    `index` is one index, a slice, or an array of indices. Leaves that are not arrays are unchanged.
+    **Arguments:**
+
+    - `records`: the tree, whose arrays have a leading axis over recordings. Leaves that are not
+      arrays are unchanged.
+    - `index`: one index, a slice, or an array of indices.
     """
 
     def pick(leaf: PyTree) -> Any:

@@ -69,8 +69,8 @@ def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"])
 
 @jax.jit
 def constant_state_errors(starts: HasSpin, measured: HasSpin) -> Float[Array, "windows steps n"]:
-    """Return the errors (N, L, n) of a prediction that the state stays constant in each of N
-    windows of L steps: the start minus the measured state.
+    """Return the errors (N, L, n) that a prediction has if it keeps the state constant, in each of
+    N windows of L steps: the state at the start minus each measured state.
 
     - `starts`: the state at the start of each window, with a leading axis (N,).
     - `measured`: the states that follow, with leading axes (N, L).
@@ -289,16 +289,17 @@ def windows(
 def _checked_numbers_by_state_part(
     numbers: object, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
 ) -> dict[str, float]:
-    """Return the numbers of a user for the parts of a state as a dict of kind → number, after
-    checks.
+    """Return the numbers that a user gave for the parts of a state as a dict of kind → number,
+    after checks.
 
     A kind is the name of a part of a state, such as `q` (attitude) or `omega` (body rate).
 
     - `numbers`: the user's mapping of kind → number.
     - `kinds`: the kinds that must be in the mapping; an error is raised unless these and no others
       are there.
-    - `name`: what `numbers` is called in an error.
-    - `check`: a function of a number and its name in an error, which returns the number or raises.
+    - `name`: the name of the argument `numbers` in an error.
+    - `check`: a function of a number and its name in an error, which returns the number or raises
+      an error.
     """
     by_kind = _checks.require_instance(numbers, Mapping, name, requirement="numbers by kind")
     if set(by_kind) != set(kinds):
@@ -388,23 +389,26 @@ def require_windows(windows: PyTree) -> None:
         for leaf in jax.tree.leaves(getattr(windows, name)):
             if leaf.ndim != wanted or not leaf.shape[0]:
                 raise ValueError(
-                    f"windows: wanted a row for each of N windows in {name}, got {leaf.shape}"
+                    f"windows: wanted arrays with one row for each window in {name}, got an "
+                    f"array of shape {leaf.shape}"
                 )
             _checks.require_finite(leaf, f"windows: {name}")
 
 
-def describe_delays_outside_window_samples(law: PyTree, history: float, length: float) -> list[str]:
+def describe_delays_outside_window_samples(
+    torque: PyTree, history: float, length: float
+) -> list[str]:
     """Describe each delay with which a torque reads an input outside of the samples that a window
     has; return one text for each such delay.
 
     An input is a logged quantity such as a motor command.
 
-    - `law`: the torque, a function of time, state and body, or `None`.
+    - `torque`: the torque, a function of time, state and body, or `None`.
     - `history`: s, the time before the start of a window for which inputs are known.
     - `length`: s, the duration of a window.
     """
     out = []
-    for name, delay in delays_of(law):
+    for name, delay in delays_of(torque):
         least, most = float(np.min(np.asarray(delay))), float(np.max(np.asarray(delay)))
         if -least > length:
             out.append(

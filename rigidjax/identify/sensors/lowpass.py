@@ -14,9 +14,9 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 
-# An interval between two samples is a gap (a hole in the log) if it is longer than _GAP times the
-# median interval. After a gap the filter starts anew.
-_GAP = 3.0
+# An interval between two samples is a hole in the log if it is longer than _HOLE times the median
+# interval. After a hole the filter starts anew.
+_HOLE = 3.0
 # Times and values must not be larger than this, since their third powers must be finite in float32,
 # too.
 _LARGEST = 1e12
@@ -33,8 +33,8 @@ class LowPass(eqx.Module):
     The filter is `ẏ = w(u − y)` for order 1, and `ÿ + √2 w ẏ + w² y = w² u` for order 2, with the
     input u, the output y and w = 2π · cutoff. It is solved exactly from sample to sample, for an
     input u that is a cubic between samples. Before the first sample u is the cubic through the
-    first four samples; before the first sample after a gap of more than three intervals u is a
-    straight line.
+    first four samples. Before the first sample after a hole in the log, an interval of more than
+    three times the median, u is a straight line.
 
     **Arguments:** `cutoff` Hz, the frequency of gain 1/√2 (a `Free` may move it); `order` 1 or 2.
     **Raises** `ValueError` for a cutoff that is not positive, and for another order. Source:
@@ -67,7 +67,10 @@ class LowPass(eqx.Module):
         """
         values = _checks.numeric_array(values, "values")
         if values.ndim != 2:
-            raise ValueError(f"values: wanted (T, k), got shape {values.shape}")
+            raise ValueError(
+                f"values: wanted an array (T, k), with a row of k numbers for each of T times, got "
+                f"shape {values.shape}"
+            )
         t = _checks.array_of_shape(t, values.shape[:1], "t", hint="a time for each row of values")
         t = t.astype(values.dtype)
         if _checks.is_known((t, values)):
@@ -75,29 +78,31 @@ class LowPass(eqx.Module):
         if values.shape[0] < 2:
             return values
         w = 2 * math.pi * self.cutoff.astype(values.dtype)
-        gaps = jnp.diff(t)
+        intervals = jnp.diff(t)
         # The padding of a shorter record repeats the last time of the record. The padding gets the
         # median interval here. Its samples are masked, so that their values do not matter.
-        is_last = gaps <= 0
-        usual = jnp.nanmedian(jnp.where(is_last, jnp.nan, gaps))
-        gaps = jnp.where(is_last, usual, gaps)
-        after_gap = gaps > _GAP * usual
+        is_padding = intervals <= 0
+        usual = jnp.nanmedian(jnp.where(is_padding, jnp.nan, intervals))
+        intervals = jnp.where(is_padding, usual, intervals)
+        is_hole = intervals > _HOLE * usual
         before, after = _input_slopes_at_interval_ends(
-            gaps, jnp.diff(values, axis=0), after_gap, is_last
+            intervals, jnp.diff(values, axis=0), is_hole, is_padding
         )
         # On each interval u = u₀ + b s + c s² + d s³, where s is the time since the begin of the
         # interval.
-        h = gaps[:, None]
+        h = intervals[:, None]
         chord = jnp.diff(values, axis=0) / h
         c, d = (3 * chord - 2 * before - after) / h, (before + after - 2 * chord) / h**2
         ends = (before, 2 * c, 6 * d), (after, 2 * c + 6 * d * h, 6 * d)
         particular = partial(_particular_solution, self.order, w)
         y0, y1 = particular(values[:-1], ends[0]), particular(values[1:], ends[1])
         begin = y0[0]
-        if gaps.size > 2:
-            first = particular(values[:1], _derivatives_at_first_sample(gaps, chord))[0]
-            begin = jnp.where(jnp.any(after_gap[:3]), begin, first)
-        return _filter_samples(begin, y0, y1, partial(_propagator, self.order, w), gaps, after_gap)
+        if intervals.size > 2:
+            first = particular(values[:1], _derivatives_at_first_sample(intervals, chord))[0]
+            begin = jnp.where(jnp.any(is_hole[:3]), begin, first)
+        return _filter_samples(
+            begin, y0, y1, partial(_propagator, self.order, w), intervals, is_hole
+        )
 
 
 def lowpass_of(lowpass: object) -> LowPass | None:
@@ -113,15 +118,18 @@ def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
     samples, which must be finite, with cubes that do not overflow.
     """
     if not np.isfinite(values).all() or np.abs(values).max(initial=0.0) > _LARGEST:
-        raise ValueError(f"values: wanted finite numbers up to {_LARGEST:g}, got NaN or more")
+        raise ValueError(
+            f"values: wanted finite numbers up to {_LARGEST:g}, got NaN or a larger one"
+        )
     if not (np.isfinite(t).all() and np.abs(t).max(initial=0.0) <= _LARGEST):
-        raise ValueError(f"t: wanted finite times up to {_LARGEST:g} s, got NaN or more")
+        raise ValueError(f"t: wanted finite times up to {_LARGEST:g} s, got NaN or a larger one")
     if not (np.diff(t) > 1 / _LARGEST).all():
-        raise ValueError("t: wanted increasing times")
+        index = int(np.argmin(np.diff(t) > 1 / _LARGEST)) + 1
+        raise ValueError(f"t: wanted increasing times; t[{index}] is not above t[{index - 1}]")
 
 
 def _input_slopes_at_interval_ends(
-    gaps: Array, steps: Array, after_gap: Array, is_last: Array
+    intervals: Array, changes: Array, is_hole: Array, is_padding: Array
 ) -> tuple[Array, Array]:
     """Return two arrays (n, k): the time derivatives of a sampled input at the begin, and at the
     end, of each of n intervals between samples.
@@ -131,34 +139,38 @@ def _input_slopes_at_interval_ends(
 
     **Arguments:**
 
-    - `gaps`: (n,) the lengths of all intervals, s.
-    - `steps`: (n, k) the changes of the k channels of the input over the intervals.
-    - `after_gap`: (n,) true for an interval that is a hole in the log.
-    - `is_last`: (n,) true for the padding after the last sample.
+    - `intervals`: (n,) the lengths of all intervals, s.
+    - `changes`: (n, k) the changes of the k channels of the input over the intervals.
+    - `is_hole`: (n,) true for an interval that is a hole in the log.
+    - `is_padding`: (n,) true for the padding after the last sample.
     """
-    h, chord = gaps[:, None], steps / gaps[:, None]
-    apart = (after_gap[1:] | after_gap[:-1])[:, None]
+    h, chord = intervals[:, None], changes / intervals[:, None]
+    apart = (is_hole[1:] | is_hole[:-1])[:, None]
     bend = jnp.where(apart, 0.0, jnp.diff(chord, axis=0) / (h[1:] + h[:-1]))
     # The last interval of a record has no next interval. The parabola at its begin is used at its
     # end, too.
-    bend = jnp.where(is_last[1:, None], jnp.roll(bend, 1, axis=0), bend)
+    bend = jnp.where(is_padding[1:, None], jnp.roll(bend, 1, axis=0), bend)
     begin = jnp.concatenate([bend[:1] * h[:1], bend * h[1:]]) if bend.shape[0] else 0.0 * chord
     end = jnp.concatenate([bend * h[:-1], bend[-1:] * h[-1:]]) if bend.shape[0] else 0.0 * chord
     return chord - begin, chord + end
 
 
-def _derivatives_at_first_sample(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
+def _derivatives_at_first_sample(
+    intervals: Array, mean_slopes: Array
+) -> tuple[Array, Array, Array]:
     """Return the first, second and third time derivative of a sampled input at its first sample.
 
     They are those of the cubic through the first four samples, three arrays (1, k) for k channels.
 
-    **Arguments:** `gaps` (n,) the lengths of the intervals between samples, s; `chord` (n, k) the
-    mean slope of the input in each interval.
+    **Arguments:** `intervals` (n,) the lengths of the intervals between samples, s; `mean_slopes`
+    (n, k) the mean slope of the input in each interval.
     """
-    a, b = gaps[0], gaps[0] + gaps[1]
-    one = (chord[1] - chord[0]) / b
-    two = ((chord[2] - chord[1]) / (gaps[1] + gaps[2]) - one) / (b + gaps[2])
-    rate = chord[0] - one * a + two * (a * b)
+    a, b = intervals[0], intervals[0] + intervals[1]
+    one = (mean_slopes[1] - mean_slopes[0]) / b
+    two = ((mean_slopes[2] - mean_slopes[1]) / (intervals[1] + intervals[2]) - one) / (
+        b + intervals[2]
+    )
+    rate = mean_slopes[0] - one * a + two * (a * b)
     return rate[None], 2 * (one - two * (a + b))[None], 6 * two[None]
 
 
@@ -209,8 +221,8 @@ def _filter_samples(
     solution_at_begin: Array,
     solution_at_end: Array,
     propagator: Callable[[Array], Array],
-    gaps: Array,
-    after_gap: Array,
+    intervals: Array,
+    is_hole: Array,
 ) -> Array:
     """Return the output (n + 1, k) of a low-pass filter at all samples, by a scan over n intervals.
 
@@ -225,20 +237,20 @@ def _filter_samples(
       and at the end of each interval.
     - `propagator`: a function of the length of an interval, s, that returns the matrix
       (order, order) by which a transient decays.
-    - `gaps`: (n,) the lengths of all intervals, s.
-    - `after_gap`: (n,) true for an interval that is a hole in the log. At the end of such an
+    - `intervals`: (n,) the lengths of all intervals, s.
+    - `is_hole`: (n,) true for an interval that is a hole in the log. At the end of such an
       interval the state is set to the particular solution at the begin of the next interval,
       without a transient.
     """
 
     def step(state: Array, row: tuple[Array, ...]) -> tuple[Array, Array]:
-        own0, own1, following, h, gap = row
+        own0, own1, following, h, hole = row
         after = own1 + (state - own0) @ propagator(h).T
-        state = jnp.where(gap, following, after)
+        state = jnp.where(hole, following, after)
         return state, state[:, 0]
 
     following = jnp.concatenate([solution_at_begin[1:], solution_at_end[-1:]])
     _, rest = lax.scan(
-        step, start, (solution_at_begin, solution_at_end, following, gaps, after_gap)
+        step, start, (solution_at_begin, solution_at_end, following, intervals, is_hole)
     )
     return jnp.concatenate([start[None, :, 0], rest])

@@ -104,7 +104,10 @@ class Gyro(VectorSensor):
         self.feels = HasSpin if self.gravity is None else HasAttitude
         if self.g_sensitivity is None:
             if self.place is not None or self.gravity is not None:
-                raise ValueError("Gyro: place and gravity need a g_sensitivity")
+                raise ValueError(
+                    "Gyro: place and gravity need a g_sensitivity, which was not given; without it "
+                    "they have no effect on the reading"
+                )
         elif self.place is None:
             self.place = jnp.zeros(3)
 
