@@ -21,7 +21,7 @@ from rigidjax import _checks, _show
 from rigidjax.cli import spec
 from rigidjax.cli.logs.errors import LogError, LogWarning
 from rigidjax.cli.logs.layouts import imu_columns_of
-from rigidjax.cli.logs.units import TIME_UNITS, unit_in
+from rigidjax.cli.logs.units import TIME_UNITS, unit_in_column_name
 from rigidjax.workprecision import command as workprecision
 
 # The demo takes only these options; all other options describe how to read logs, and the demo reads
@@ -118,7 +118,7 @@ def _check_output_files(options: argparse.Namespace, parser: argparse.ArgumentPa
         # Matplotlib adds the ending `.png` to a name without an ending. The ending is added here,
         # so that messages name the right file.
         options.figure = figure.with_name(figure.name.rstrip(".") + ".png")
-    if figure is not None and not _has_matplotlib():
+    if figure is not None and not _prepare_matplotlib_if_installed():
         parser.error("--figure: needs matplotlib: pip install 'rigidjax[view]'")
     if figure is not None and figure.suffix.strip("."):
         from matplotlib.backend_bases import FigureCanvasBase
@@ -304,13 +304,16 @@ def _run_demo(options: argparse.Namespace) -> int:
     return _write_outputs(fit, options, title, [toutatis.CITATION], [title], units, more)
 
 
-def _channels_of_options(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Channel]:
+def _channels_of_options(
+    options: argparse.Namespace, rate_columns: Sequence[str]
+) -> list[spec.Channel]:
     """Return the sensors of a log that the command line describes, each as a `Channel` (kind,
     columns, unit, noise and limit).
 
     - `options`: the options of the command line: `--sensor`, or else `--unit`, `--noise` and
       `--limit` of one gyro.
-    - `rates`: the names of the three columns of the body rates; they are used for this gyro only.
+    - `rate_columns`: the names of the three columns of the body rates; they are used for this gyro
+      only.
     """
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
@@ -323,7 +326,7 @@ def _channels_of_options(options: argparse.Namespace, rates: Sequence[str]) -> l
     noise = None if options.noise is None else spec.broadcast_noise(options.noise, "--noise")
     if options.limit is not None and not options.limit > 0:
         raise LogError(f"--limit: wanted a positive number, got {options.limit}")
-    return [spec.Channel("gyro", tuple(rates), options.unit, noise, options.limit)]
+    return [spec.Channel("gyro", tuple(rate_columns), options.unit, noise, options.limit)]
 
 
 def _read_logs(
@@ -351,32 +354,39 @@ def _read_logs(
             dataclasses.replace(one, unit=spec.unit_of_channel(path, one))
             for one in _channels_of_options(options, rates)
         ]
-        _print_units(path, time, time_unit, channels)
+        _print_units_from_column_names(path, time, time_unit, channels)
         how |= dict(time=time, time_unit=time_unit, flight=options.flight)
         records.append(spec.read_log(path, channels, **how))
         of_first = of_first or channels
-    how = dict(typical=options.typical, wheels=wheels, free=options.free, loss=options.loss)
+    how = dict(typical_moment=options.typical, wheels=wheels, free=options.free, loss=options.loss)
     return of_first or [], records, spec.model_of(records, options.model, **how)
 
 
-def _print_units(path: str, time: str, time_unit: str, channels: Sequence[spec.Channel]) -> None:
-    """Print which units were taken from the names of the columns of a log, if any.
+def _print_units_from_column_names(
+    path: str, time_column: str, time_unit: str, channels: Sequence[spec.Channel]
+) -> None:
+    """Print which units were read from the names of the columns of a log, if any were.
 
     - `path`: the path of the log.
-    - `time`: the name of the time column.
+    - `time_column`: the name of the time column.
     - `time_unit`: the unit of the times.
     - `channels`: the sensors of the log, with their columns and units.
     """
-    units = [("time", (time,), time_unit)] + [(one.kind, one.columns, one.unit) for one in channels]
-    words = [f"{what} in {unit}" for what, names, unit in units if unit_in(names[0], [unit or ""])]
+    units = [(one.kind, one.columns, one.unit) for one in channels]
+    words = [
+        f"{what} in {unit}"
+        for what, names, unit in [("time", (time_column,), time_unit), *units]
+        if unit_in_column_name(names[0], [unit or ""])
+    ]
     if words:
         _print_line(f"{path}: {', '.join(words)}, as the names of its columns say")
 
 
 @contextlib.contextmanager
-def _warnings_as_lines(strict: bool) -> Iterator[None]:
-    """Print each warning about a log that is given within a `with` block, in one line; if `strict`
-    is true, raise the first of these warnings as an error.
+def _print_or_raise_log_warnings(strict: bool) -> Iterator[None]:
+    """Print each warning about a log in one line, for warnings within a `with` block.
+
+    If `strict` is true, raise the first of these warnings as an error in place of printing it.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("error" if strict else "always", LogWarning)
@@ -399,7 +409,7 @@ def _run_logs(options: argparse.Namespace) -> int:
     report, and return the exit code.
     """
     try:
-        with _warnings_as_lines(options.strict):
+        with _print_or_raise_log_warnings(options.strict):
             channels, records, model = _read_logs(options)
     except ValueError as error:
         return _print_error(error)
@@ -476,12 +486,14 @@ def _write_outputs(
       unit.
     """
     report, figure = rj.identify.report, options.figure
-    if options.demo and figure is None and _has_matplotlib():
+    if options.demo and figure is None and _prepare_matplotlib_if_installed():
         figure = Path("toutatis.png")
 
     def write_page() -> None:
         figures = (
-            _report_figures(fit, names, units) if figure is not None or _has_matplotlib() else []
+            _draw_report_figures_skipping_failed(fit, names, units)
+            if figure is not None or _prepare_matplotlib_if_installed()
+            else []
         )
         page: dict[str, Any] = {
             "title": title,
@@ -515,7 +527,9 @@ def _write_outputs(
     return 2 if not all_written else 0 if fit.ok else 1
 
 
-def _report_figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str]) -> list[Any]:
+def _draw_report_figures_skipping_failed(
+    fit: rj.identify.Fit, names: list[str], units: dict[str, str]
+) -> list[Any]:
     """Return the figures of a report, without the figures whose drawing raises an error.
 
     - `fit`: the result of the fit.
@@ -536,9 +550,10 @@ def _report_figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str
     return figures
 
 
-def _has_matplotlib() -> bool:
-    """Return whether matplotlib is installed, and set it to draw without windows; print a line if
-    it is missing.
+def _prepare_matplotlib_if_installed() -> bool:
+    """Set matplotlib to draw without windows, and return whether it is installed.
+
+    If it is not installed, print a line that says so.
     """
     try:
         import matplotlib

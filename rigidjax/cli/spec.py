@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from rigidjax.cli.logs.errors import LogError
-from rigidjax.cli.logs.layouts import usual_unit
+from rigidjax.cli.logs.layouts import known_unit_of_column
 from rigidjax.cli.logs.table import read_table
-from rigidjax.cli.logs.times import mask_of_increasing, remark_on_step, rows_to_use
-from rigidjax.cli.logs.units import TIME_UNITS, UNITS, unit_of
+from rigidjax.cli.logs.times import mask_of_increasing, rows_to_use, warn_of_gap_or_wrong_unit
+from rigidjax.cli.logs.units import TIME_UNITS, UNITS, unit_of_columns
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.model import charts
 from rigidjax.identify.model.free import Free
@@ -121,15 +121,15 @@ def _units_of_kind(kind: str) -> tuple[str, ...]:
     return () if kind == "euler" else SENSOR_UNITS.get(key, ())
 
 
-def broadcast_noise(noise: Sequence[float], place: str) -> tuple[float, ...]:
+def broadcast_noise(noise: Sequence[float], message_start: str) -> tuple[float, ...]:
     """Return the noise of three axes, from one positive number or three.
 
-    It raises `LogError` for other numbers; the message begins with `place`.
+    It raises `LogError` for other numbers; the message begins with `message_start`.
     """
     if len(noise) not in (1, 3):
-        raise LogError(f"{place}: wanted one noise or three, got {len(noise)}")
+        raise LogError(f"{message_start}: wanted one noise or three, got {len(noise)}")
     if not all(0 < part < np.inf for part in noise):
-        raise LogError(f"{place}: wanted a positive noise, got {min(noise):g}")
+        raise LogError(f"{message_start}: wanted a positive noise, got {min(noise):g}")
     return tuple(noise) if len(noise) == 3 else 3 * tuple(noise)
 
 
@@ -178,7 +178,7 @@ def read_log(
       without one, the usual unit of such a log (s for text).
     - `window`: (from, to), s from the first time stamp, or `None` for all.
     - `wheels`: the wheels; their speeds become inputs of the recording, by the names of
-      `input_names`.
+      `names_of_wheel_speeds`.
     - `free`: some of `bias`, `drag`, `delay`; for `bias` the sensors get a bias, which a fit can
       estimate.
     - `flight`: as in `read_table`.
@@ -194,7 +194,7 @@ def read_log(
     table = read_table(path, names, flight=flight)
     # Times are taken since the first stamp: in seconds or nanoseconds since 1970 they would have
     # few digits left for the steps.
-    t = (table[time] - _first_time(table[time])) * UNITS[unit]
+    t = (table[time] - _first_finite_time(table[time])) * UNITS[unit]
     kept = rows_to_use(path, t, time, window)
     # A slice is used if all rows are kept, since indexing with a slice makes no copy of a large
     # log.
@@ -206,11 +206,11 @@ def read_log(
         values *= factor
         mask = np.isfinite(values).all(axis=1)
         if one.kind == "gyro":
-            rate = _typical_rate(path, one, values[kept][mask[kept]])
+            rate = _median_body_rate(path, one, values[kept][mask[kept]])
         sensor, values = _sensor_and_readings(one, values, factor, "bias" in free)
         readings.append((sensor, values[kept], mask[kept]))
-    remark_on_step(path, t[kept], unit, rate)
-    inputs = _logged_speeds(path, t, table, wheels)
+    warn_of_gap_or_wrong_unit(path, t[kept], unit, rate)
+    inputs = _wheel_speed_series(path, t, table, wheels)
     # The memory of a large log is freed before the recording copies its columns.
     del table
     try:
@@ -219,7 +219,7 @@ def read_log(
         raise LogError(f"{path}: {error}") from None
 
 
-def _first_time(t: np.ndarray) -> float:
+def _first_finite_time(t: np.ndarray) -> float:
     """Return the first of the times `t` (T,) that is not missing (NaN), or zero if all are
     missing.
     """
@@ -232,19 +232,19 @@ def unit_of_channel(path: str | Path, channel: Channel) -> str:
     else the usual unit of such columns.
     """
     allowed = _units_of_kind(channel.kind)
-    usual = usual_unit(path, channel.columns[0]) or allowed[0]
-    return unit_of(channel.columns, channel.unit, usual, allowed, str(path))
+    usual = known_unit_of_column(path, channel.columns[0]) or allowed[0]
+    return unit_of_columns(channel.columns, channel.unit, usual, allowed, str(path))
 
 
 def unit_of_time(path: str | Path, column: str, stated_unit: str | None) -> str:
     """Return the unit of times: the `stated_unit`, else the unit in the name of the `column`, else
     the usual unit of such a column.
     """
-    usual = usual_unit(path, column) or "s"
-    return unit_of([column], stated_unit, usual, TIME_UNITS, str(path))
+    usual = known_unit_of_column(path, column) or "s"
+    return unit_of_columns([column], stated_unit, usual, TIME_UNITS, str(path))
 
 
-def _typical_rate(path: str | Path, channel: Channel, rates: np.ndarray) -> float:
+def _median_body_rate(path: str | Path, channel: Channel, rates: np.ndarray) -> float:
     """Return the median length of the body rates, rad/s, and raise `LogError` if there are none or
     all are zero.
 
@@ -293,7 +293,7 @@ def _sensor_and_readings(
         raise LogError(f"sensor {channel.kind}: {error}") from None
 
 
-def input_names(wheels: Sequence[WheelColumn]) -> list[str]:
+def names_of_wheel_speeds(wheels: Sequence[WheelColumn]) -> list[str]:
     """Return the name of the input that holds the speed of each wheel."""
     return [f"wheel {i + 1}" if len(wheels) > 1 else "wheel" for i in range(len(wheels))]
 
@@ -322,7 +322,7 @@ def _fill_missing_rows(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, n
     return t[0] + step * places, np.interp(places, np.round(place), values)
 
 
-def _logged_speeds(
+def _wheel_speed_series(
     path: str | Path, t: np.ndarray, table: dict[str, np.ndarray], wheels: Sequence[WheelColumn]
 ) -> dict[str, Series]:
     """Return the logged speed of each wheel as a series in time, rad/s, by the name (`wheel`, or
@@ -337,8 +337,8 @@ def _logged_speeds(
     # Speeds outside of the window are kept as well, since a delayed speed is from a time before the
     # reading.
     kept = mask_of_increasing(t) if wheels else slice(None)
-    for name, one in zip(input_names(wheels), wheels, strict=True):
-        unit = unit_of([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
+    for name, one in zip(names_of_wheel_speeds(wheels), wheels, strict=True):
+        unit = unit_of_columns([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
         try:
             samples = table[one.column][kept] * UNITS[unit]
             speeds[name] = Series(*_fill_missing_rows(t[kept], samples))
@@ -360,7 +360,7 @@ def _torque_of_options(wheels: Sequence[WheelColumn], free: Sequence[str]) -> To
     delay = 0.0 if "delay" in free else None
     parts: list[Torque] = [
         Flywheel(Wheel(one.inertia, one.axis, Input(name), delay=delay))
-        for name, one in zip(input_names(wheels), wheels, strict=True)
+        for name, one in zip(names_of_wheel_speeds(wheels), wheels, strict=True)
     ]
     if "drag" in free:
         parts.append(Damping([0.0, 0.0, 0.0]))
@@ -369,9 +369,9 @@ def _torque_of_options(wheels: Sequence[WheelColumn], free: Sequence[str]) -> To
 
 def model_of(
     recordings: Sequence[Recording],
-    chart: str,
+    body_chart: str,
     *,
-    typical: float = 1.0,
+    typical_moment: float = 1.0,
     wheels: Sequence[WheelColumn] = (),
     free: Sequence[str] = (),
     loss: str = "soft-l1",
@@ -383,21 +383,24 @@ def model_of(
     **Arguments:**
 
     - `recordings`: the recordings of one body.
-    - `chart`: a key of `MODELS`, which is the word of the option `--model`.
-    - `typical`: the typical size of a moment of inertia, kg m².
+    - `body_chart`: a key of `MODELS`, which is the word of the option `--model`. It names the chart
+      of the body, a map from free numbers to a possible body.
+    - `typical_moment`: the typical size of a moment of inertia, kg m².
     - `wheels`, `free`: as for `read_log`.
     - `loss`: a key of `LOSSES`.
 
-    **Raises** `LogError` for another word as `chart` or `loss`.
+    **Raises** `LogError` for another word as `body_chart` or `loss`.
     """
-    if chart not in MODELS:
-        raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {chart!r}")
+    if body_chart not in MODELS:
+        raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {body_chart!r}")
     if loss not in LOSSES:
         raise LogError(f"loss: wanted one of {', '.join(LOSSES)}, got {loss!r}")
-    moving = _free_numbers_of_options(recordings[0].sensors, input_names(wheels), typical, free)
+    moving = _free_numbers_of_options(
+        recordings[0].sensors, names_of_wheel_speeds(wheels), typical_moment, free
+    )
     return Model(
         list(recordings),
-        MODELS[chart](typical),
+        MODELS[body_chart](typical_moment),
         torque=_torque_of_options(wheels, free),
         free=moving,
         loss=LOSSES[loss],
@@ -405,15 +408,18 @@ def model_of(
 
 
 def _free_numbers_of_options(
-    sensors: Sequence[AbstractSensor], wheels: Sequence[str], typical: float, free: Sequence[str]
+    sensors: Sequence[AbstractSensor],
+    wheels: Sequence[str],
+    typical_moment: float,
+    free: Sequence[str],
 ) -> list[Free]:
     """Return a list of `Free`, each of them numbers that a fit may move in addition to the body and
     its motion: biases of sensors, places of accelerometers, the drag, and the delays of wheels.
 
     - `sensors`: the sensors of one recording; a bias is free if the sensor has one.
     - `wheels`: the names of the wheels, for the names of their delays.
-    - `typical`: the typical size of a moment of inertia, kg m², from which the scale of the drag
-      follows.
+    - `typical_moment`: the typical size of a moment of inertia, kg m², from which the scale of the
+      drag follows.
     - `free`: some of `bias`, `drag`, `delay`; drag and delays are free if they are named here.
     """
 
@@ -435,7 +441,7 @@ def _free_numbers_of_options(
             items.append(Free(of_sensor(index, "place"), f"{name} place", scale=0.01))
     if "drag" in free:
         where = of_torque(-1, "coefficient")
-        items.append(Free(where, "drag", scale=0.1 * typical, unit="N m s"))
+        items.append(Free(where, "drag", scale=0.1 * typical_moment, unit="N m s"))
     if "delay" in free:
         for index, wheel in enumerate(wheels):
             where = of_torque(index, "momentum.delay")

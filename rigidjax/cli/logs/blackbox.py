@@ -36,11 +36,14 @@ def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None)
     """Return two things: the names of all fields in one flight of a Blackbox log; and a dict of the
     fields that `columns` name.
 
+    A frame is one record of the log: an I frame holds whole values, and a P frame holds differences
+    from the frames before it. P frames before the first I frame, and all frames from a damaged
+    frame to the next I frame, are left out with a warning. A log without its end mark is read to
+    the end of the file.
+
     Rates are in deg/s and accelerations in g, by the scales in the header, as in the flight
-    controllers' own viewer; other fields are as logged. A log without its end mark is read to the
-    end of the file. P frames before the first I frame, and all frames from a damaged frame to the
-    next I frame, are left out with a warning. **Raises** `LogError` if there are several flights
-    and `flight` is `None`.
+    controllers' own viewer; other fields are as logged. **Raises** `LogError` if there are several
+    flights and `flight` is `None`.
     """
     library = _checks.import_library("orangebox.reader", "blackbox", str(path))
     pointers = library.Reader(str(path)).log_pointers
@@ -56,13 +59,14 @@ def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None)
     index = flight or 1
     data = path.read_bytes()[pointers[index - 1] : (*pointers, None)[index]]
     log = _Flight(library.Reader(str(path), index), data)
-    scales, wanted = _scales(log.headers), [name for name in columns if name in log.names]
+    factors = _factors_to_deg_per_s_and_g(log.headers)
+    wanted = [name for name in columns if name in log.names]
     rows, groups = {name: array("d") for name in wanted}, array("q")
-    for group, frame in log.frames():
+    for group, frame in log.decode_frames_with_groups():
         groups.append(group)
         for name, numbers in rows.items():
             numbers.append(frame[name])
-    keep = ~np.isin(np.frombuffer(groups, np.int64), log.order.incomplete_groups())
+    keep = ~np.isin(np.frombuffer(groups, np.int64), log.order.groups_with_missing_frames())
     log.left_out += int((~keep).sum())
     if log.left_out:
         warn(
@@ -71,7 +75,7 @@ def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None)
         )
     return log.names, {
         name: log.wrap_to_32_bits(name, np.frombuffer(numbers, float)[keep])
-        * scales.get(name.partition("[")[0], 1.0)
+        * factors.get(name.partition("[")[0], 1.0)
         for name, numbers in rows.items()
     }
 
@@ -120,15 +124,20 @@ class _Flight:
             return (values + _WRAP / 2) % _WRAP - _WRAP / 2
         return values % _WRAP
 
-    def frames(self) -> Iterator[tuple[int, Mapping[str, float]]]:
-        """Yield the group, and the fields by name, of each frame that can be decoded.
+    def decode_frames_with_groups(self) -> Iterator[tuple[int, Mapping[str, float]]]:
+        """Yield a pair for each frame that can be decoded: its group, and its fields by name.
 
-        The group of a P frame is the number of its I frame. The I frame itself, which depends on no
-        other frame, has the group -1. Fields of slow and GPS frames have the values of the last
-        such frame, and are NaN before the first such frame.
+        A frame is one record of the log. An I frame holds whole values; a P frame holds differences
+        from the frames before it. The group of a P frame is the number of the last I frame before
+        it, counted from 1. An I frame, which depends on no other frame, has the group -1. Fields of
+        slow and GPS frames have the values of the last such frame, and are NaN before the first
+        such frame.
         """
         order, lost = self.order, 0
-        stream, others = _Bytes(self.data, self._header_size()), dict.fromkeys(self.others, np.nan)
+        stream, others = (
+            _Bytes(self.data, self._header_size_in_bytes()),
+            dict.fromkeys(self.others, np.nan),
+        )
         while stream.place < len(self.data):
             kind = self.kinds.get(next(stream))
             begin = stream.place
@@ -143,17 +152,17 @@ class _Flight:
                 lost = 0
             try:
                 if kind == self.kind.EVENT:
-                    event, numbers = self._pass_event(stream)
+                    event, numbers = self._read_event_kind_and_integers(stream)
                     if event == _LOG_END:
                         return
                     if event == _RESUME:
-                        order.resume(numbers)
+                        order.resume_after_pause(numbers)
                     continue
-                values = self._values(stream, kind)
+                values = self._decode_frame(stream, kind)
             except IndexError:
                 values = ()
             size = stream.place - begin
-            if not values or size > _LONGEST_FRAME or not self._is_frame_next(stream.place):
+            if not values or size > _LONGEST_FRAME or not self._is_frame_or_end_at(stream.place):
                 # The decoder may have read beyond the letter of the next frame. Reading begins
                 # again after the letter of this frame.
                 stream.place, order.is_valid = begin, False
@@ -162,7 +171,9 @@ class _Flight:
                 others |= zip((field.name for field in self.fields[kind]), values, strict=True)
                 if kind != self.kind.SLOW:
                     self.context.add_frame(self.frame(kind, values))
-            elif not order.accepts(values[:2], kind == self.kind.INTRA, self._next_iteration()):
+            elif not order.store_frame_if_in_order(
+                values[:2], kind == self.kind.INTRA, self._expected_iteration_of_next_frame()
+            ):
                 self.left_out += 1
             else:
                 self.context.last_iter = values[0]
@@ -170,7 +181,7 @@ class _Flight:
                 fields = dict(zip(self.main, values, strict=True)) | {"time": order.time}
                 yield -1 if kind == self.kind.INTRA else order.groups, others | fields
 
-    def _next_iteration(self) -> int:
+    def _expected_iteration_of_next_frame(self) -> int:
         """Return the number of the iteration of the flight controller's loop that the next frame
         must have.
 
@@ -179,39 +190,39 @@ class _Flight:
         """
         return self.context.last_iter + 1 + self.context.count_skipped_frames()
 
-    def _is_frame_next(self, place: int) -> bool:
-        """Return whether one of three things is at `place`: a frame; a P frame whose first byte
-        (its letter P) is damaged; or the end of the data.
+    def _is_frame_or_end_at(self, index: int) -> bool:
+        """Return whether one of three things is at the byte `index` of the data: a frame; a P frame
+        whose first byte (its letter P) is damaged; or the end of the data.
 
-        Otherwise the frame before `place` is probably damaged, and has too few bytes or too many.
+        Otherwise the frame before this byte is probably damaged, and has too few bytes or too many.
         Erased memory counts as the end of the data.
         """
-        if place == len(self.data) or self.data[place] in self.kinds:
+        if index == len(self.data) or self.data[index] in self.kinds:
             return True
-        if _ERASED.match(self.data, place):
+        if _ERASED.match(self.data, index):
             return True
-        stream = _Bytes(self.data, place + 1)
+        stream = _Bytes(self.data, index + 1)
         try:
-            self._values(stream, self.kind.INTER)
+            self._decode_frame(stream, self.kind.INTER)
         except IndexError:
             return False
         return stream.place == len(self.data) or self.data[stream.place] in self.kinds
 
-    def _header_size(self) -> int:
+    def _header_size_in_bytes(self) -> int:
         """Return the index of the first byte after the header."""
         place = 0
         while self.data.startswith(b"H ", place):
             place = self.data.index(b"\n", place) + 1
         return place
 
-    def _values(self, stream: _Bytes, kind: Any) -> tuple[Any, ...]:
+    def _decode_frame(self, stream: _Bytes, frame_type: Any) -> tuple[Any, ...]:
         """Return the numbers of one frame (a record of the log), decoded from the bytes at the
         present place of `stream`.
 
-        `kind` is the type of the frame, such as INTRA for a frame that holds whole values.
+        `frame_type` is the type of the frame, such as INTRA for a frame that holds whole values.
         """
-        context, fields, values = self.context, self.fields[kind], ()
-        context.frame_type, context.field_index = kind, 0
+        context, fields, values = self.context, self.fields[frame_type], ()
+        context.frame_type, context.field_index = frame_type, 0
         while context.field_index < len(fields):
             context.current_frame = values
             raw = fields[context.field_index].decoderfun(stream, context)
@@ -220,8 +231,12 @@ class _Flight:
                 context.field_index += 1
         return values
 
-    def _pass_event(self, stream: _Bytes) -> tuple[int, list[int]]:
-        """Read one event, and return its kind (-1 for an unknown one) and its integers."""
+    def _read_event_kind_and_integers(self, stream: _Bytes) -> tuple[int, list[int]]:
+        """Read one event from the `stream`, and return its kind and the integers that it holds.
+
+        An event is a record of the log without readings, such as the end of a pause. The kind of an
+        unknown event is -1.
+        """
         event = next(stream)
         if event == _LOG_END:
             is_last = self.data.startswith(_END_MARK, stream.place)
@@ -230,10 +245,10 @@ class _Flight:
             if next(stream) > 127:
                 stream.place += 4
                 return event, []
-            return event, [_read_unsigned(stream)]
+            return event, [_read_variable_length_integer(stream)]
         if event not in _EVENT_NUMBERS:
             return -1, []
-        return event, [_read_unsigned(stream) for _ in range(_EVENT_NUMBERS[event])]
+        return event, [_read_variable_length_integer(stream) for _ in range(_EVENT_NUMBERS[event])]
 
 
 class _Order:
@@ -256,25 +271,31 @@ class _Order:
         self.time, self.key_time = 0, 0
         self.groups, self.incomplete = 0, list[int]()
 
-    def resume(self, numbers: Sequence[int]) -> None:
-        """Set the iteration and the time to the `numbers` of an event that ends a pause."""
-        self.last = self.last_key = tuple(numbers)
+    def resume_after_pause(self, iteration_and_time: Sequence[int]) -> None:
+        """Set the last frame's iteration and time to those of the event that ends a pause."""
+        self.last = self.last_key = tuple(iteration_and_time)
         self.is_resumed = True
 
-    def accepts(self, values: Sequence[int], is_key: bool, expected: int) -> bool:
+    def store_frame_if_in_order(
+        self, iteration_and_time: Sequence[int], is_i_frame: bool, expected_iteration: int
+    ) -> bool:
         """Return whether a frame continues the last frame; if it does, store it as the last frame.
 
-        **Arguments:** `values` the iteration and the time of the frame; `is_key` whether it is an I
-        frame; `expected` the iteration that it should have.
+        - `iteration_and_time`: the iteration of the flight controller's loop at which the frame was
+          written, and the time, µs.
+        - `is_i_frame`: whether it is an I frame, which holds whole values and not differences.
+        - `expected_iteration`: the iteration that the frame has if no frame is missing.
         """
-        if is_key:
-            if self.is_valid and not self.is_resumed and self._lacks_frames(values, expected):
+        values = iteration_and_time
+        if is_i_frame:
+            is_unbroken = self.is_valid and not self.is_resumed
+            if is_unbroken and self._are_frames_missing_before(values, expected_iteration):
                 self.incomplete.append(self.groups)
-            self.is_valid = not self.last_key or _continues(self.last_key, values)
+            self.is_valid = not self.last_key or _closely_follows_frame(self.last_key, values)
         else:
-            self.is_valid = self.is_valid and _continues(self.last, values)
+            self.is_valid = self.is_valid and _closely_follows_frame(self.last, values)
         if self.is_valid:
-            if is_key:
+            if is_i_frame:
                 # Time is measured from the last I frame, since a wrong time of a P frame must not
                 # shift later groups.
                 elapsed = (values[1] - self.key_time) % _WRAP
@@ -282,35 +303,36 @@ class _Order:
                 self.groups += 1
             self.time = self.key_time + (values[1] - self.key_time) % _WRAP
             self.last = values
-        if is_key:
+        if is_i_frame:
             # If two successive I frames do not fit together, either may be damaged. The next I
             # frame is compared with the later of the two.
             self.last_key, self.is_resumed = values, False
         return self.is_valid
 
-    def _lacks_frames(self, key: Sequence[int], expected: int) -> bool:
+    def _are_frames_missing_before(self, i_frame: Sequence[int], expected_iteration: int) -> bool:
         """Return whether frames (records of the log) are missing before an I frame, which is a
         frame that holds whole values and not differences.
 
         The first number of a frame counts the iterations of the flight controller's loop. If it
         jumps by more than `_ITERATION_JUMP`, the logging was paused, and no frames are missing.
 
-        - `key`: the values of the I frame: the iteration, the time in µs, and the readings.
-        - `expected`: the iteration that the I frame has if no frame is missing.
+        - `i_frame`: the iteration of the I frame, and its time, µs.
+        - `expected_iteration`: the iteration that the I frame has if no frame is missing.
         """
-        is_earlier = (key[1] - self.last[1]) % _WRAP >= _WRAP // 2
-        return is_earlier or 0 < (key[0] - expected) % _WRAP < _ITERATION_JUMP
+        is_earlier = (i_frame[1] - self.last[1]) % _WRAP >= _WRAP // 2
+        return is_earlier or 0 < (i_frame[0] - expected_iteration) % _WRAP < _ITERATION_JUMP
 
-    def incomplete_groups(self) -> list[int]:
-        """Return the groups from which frames are missing.
+    def groups_with_missing_frames(self) -> list[int]:
+        """Return the numbers of the groups from which frames are missing.
 
-        If frames are missing from half of all groups or more, it returns no group: the interval
+        A group is an I frame and the P frames after it. If frames are missing from half of all
+        groups or more, the result is empty: the interval
         between frames in the header is then not the interval in the log.
         """
         return self.incomplete if 2 * len(self.incomplete) < self.groups else []
 
 
-def _read_unsigned(stream: _Bytes) -> int:
+def _read_variable_length_integer(stream: _Bytes) -> int:
     """Read an integer of variable length, with seven bits in each byte; the eighth bit is set if
     more bytes follow.
     """
@@ -324,16 +346,21 @@ def _read_unsigned(stream: _Bytes) -> int:
     return 0
 
 
-def _continues(last: Sequence[int], values: Sequence[int]) -> bool:
-    """Return whether the iteration and the time in `values` closely follow those of the `last`
-    frame.
+def _closely_follows_frame(last_frame: Sequence[int], frame: Sequence[int]) -> bool:
+    """Return whether the iteration and the time of a frame closely follow those of the last one.
+
+    Both arguments hold an iteration of the flight controller's loop, and a time, µs.
     """
-    iteration, time = ((new - old) % _WRAP for old, new in zip(last, values, strict=True))
+    iteration, time = ((new - old) % _WRAP for old, new in zip(last_frame, frame, strict=True))
     return iteration < _ITERATION_JUMP and time < _TIME_JUMP
 
 
-def _scales(headers: Mapping[str, Any]) -> dict[str, float]:
-    """Return the factors from the raw integers of rates and accelerations to deg/s and g."""
+def _factors_to_deg_per_s_and_g(headers: Mapping[str, Any]) -> dict[str, float]:
+    """Return the factors from raw integers to units: deg/s for rates, g for accelerations.
+
+    `headers` are the entries of the log's header. The keys of the result are the names of the
+    fields, `gyroADC` and `accSmooth`, without an index.
+    """
     factors = {}
     if "gyro_scale" in headers:
         value = headers["gyro_scale"]

@@ -5,9 +5,9 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from rigidjax.cli.logs.table import BINARY, kind_of
+from rigidjax.cli.logs.table import BINARY, lowercase_file_ending
 from rigidjax.cli.logs.text import open_text, read_header
-from rigidjax.cli.logs.units import TIME_UNITS, unit_in
+from rigidjax.cli.logs.units import TIME_UNITS, unit_in_column_name
 
 
 class ImuColumns(NamedTuple):
@@ -35,10 +35,10 @@ _UNITS = {
 _UNITS[".bfl"] = _UNITS[".bbl"]
 
 
-def usual_unit(path: str | Path, name: str) -> str | None:
+def known_unit_of_column(path: str | Path, column: str) -> str | None:
     """Return the unit that a column of a binary log is known to have, or `None`."""
-    units = _UNITS.get(kind_of(Path(path)), {})
-    return next((units[part] for part in re.split(r"[.\[]", name) if part in units), None)
+    units = _UNITS.get(lowercase_file_ending(Path(path)), {})
+    return next((units[part] for part in re.split(r"[.\[]", column) if part in units), None)
 
 
 def imu_columns_of(path: str | Path) -> ImuColumns:
@@ -51,21 +51,23 @@ def imu_columns_of(path: str | Path) -> ImuColumns:
     # Errors are suppressed here, since the reader of the log raises them later with better
     # messages.
     with contextlib.suppress(Exception):
-        if kind_of(path) in BINARY:
+        if lowercase_file_ending(path) in BINARY:
             return _imu_columns_of_binary(path) or USUAL
         with open_text(path) as file:
-            return _columns_by_name(read_header(file).names) or USUAL
+            return _imu_columns_by_units_in_names(read_header(file).names) or USUAL
     return USUAL
 
 
-def _columns_by_name(names: list[str]) -> ImuColumns | None:
+def _imu_columns_by_units_in_names(column_names: list[str]) -> ImuColumns | None:
     """Return the columns of the time and of the three rates, about x, y and z, whose names contain
     their units.
 
-    It returns `None` unless there is exactly one time and one rate about each axis.
+    The result is `None` unless there is exactly one time and one rate about each axis.
     """
-    times = {name: unit for name in names if (unit := unit_in(name, ())) in TIME_UNITS}
-    rates = {name: unit for name in names if (unit := unit_in(name, ())) in ("rad/s", "deg/s")}
+    times = {n: unit for n in column_names if (unit := unit_in_column_name(n, ())) in TIME_UNITS}
+    rates = {
+        n: unit for n in column_names if (unit := unit_in_column_name(n, ())) in ("rad/s", "deg/s")
+    }
     axes = [[n for n in rates if re.search(rf"\b{axis}\W*[(\[]", n)] for axis in "xyz"]
     if len(times) != 1 or any(len(one) != 1 for one in axes):
         return None
@@ -76,18 +78,20 @@ def _columns_by_name(names: list[str]) -> ImuColumns | None:
 
 def _imu_columns_of_binary(path: Path) -> ImuColumns | None:
     """Return the columns of time and rates of a binary log, or `None` if it has no rates."""
-    columns = _columns_of_binary(path)
+    columns = _time_and_rate_columns_of_binary(path)
     if columns is None:
         return None
     time, x, *_ = columns
-    return ImuColumns(columns, usual_unit(path, x) or "rad/s", usual_unit(path, time) or "s")
+    return ImuColumns(
+        columns, known_unit_of_column(path, x) or "rad/s", known_unit_of_column(path, time) or "s"
+    )
 
 
-def _columns_of_binary(path: Path) -> tuple[str, str, str, str] | None:
+def _time_and_rate_columns_of_binary(path: Path) -> tuple[str, str, str, str] | None:
     """Return the names of the time and of the rates in a binary log, or `None` if it has no
     rates.
     """
-    kind = kind_of(path)
+    kind = lowercase_file_ending(path)
     if kind in (".bbl", ".bfl"):
         return "time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]"
     if kind == ".usd":

@@ -31,7 +31,9 @@ def read_mcap(path: Path, columns: Sequence[str]) -> Columns:
                 # Only names are wanted, and every topic has had a message by now.
                 break
             first = message.log_time if first is None else first
-            fields = {"log_time": 1e-9 * (message.log_time - first)} | dict(_numbers_in(content))
+            fields = {"log_time": 1e-9 * (message.log_time - first)} | dict(
+                _named_numbers_in(content)
+            )
             if {"header.stamp.sec", "header.stamp.nanosec"} <= set(fields):
                 whole = 10**9 * int(fields["header.stamp.sec"]) - first
                 fields["stamp"] = 1e-9 * (whole + int(fields["header.stamp.nanosec"]))
@@ -55,7 +57,7 @@ class _Json:
         return json.loads if encoding == "json" else None
 
 
-def _numbers_in(content: object, name: str = "") -> Iterator[tuple[str, float]]:
+def _named_numbers_in(content: object, name: str = "") -> Iterator[tuple[str, float]]:
     """Yield a pair for each number in a message: the name of its place, such as `.gyro.x`; and it
     as a float.
     """
@@ -63,9 +65,9 @@ def _numbers_in(content: object, name: str = "") -> Iterator[tuple[str, float]]:
         yield name, float(content)
     elif isinstance(content, list | tuple | np.ndarray):
         for index, one in enumerate(content):
-            yield from _numbers_in(one, f"{name}[{index}]")
+            yield from _named_numbers_in(one, f"{name}[{index}]")
     elif not isinstance(content, str | bytes):
         named = isinstance(content, Mapping)
         for part in content if named else getattr(content, "__slots__", ()):
             inside = content[part] if named else getattr(content, part)
-            yield from _numbers_in(inside, f"{name}.{part}" if name else str(part))
+            yield from _named_numbers_in(inside, f"{name}.{part}" if name else str(part))

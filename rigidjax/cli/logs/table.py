@@ -53,8 +53,8 @@ def read_table(
       flight.
 
     **Returns** name → (T,) numbers in the units of the log, NaN for an empty cell. It **warns** of
-    frames of a Blackbox log that are left out: all frames before the first I frame, and all frames
-    from a damaged frame to the next I frame.
+    frames (records) of a Blackbox log that are left out: all frames before the first I frame, which
+    is a frame that can be read alone, and all frames from a damaged frame to the next I frame.
 
     **Raises:** `ValueError`, in one line that names file, line and column, for a file that is
     missing, cut or of another kind; for a column that is missing, there twice, or wanted twice; for
@@ -79,10 +79,10 @@ def read_table(
         raise LogError(f"{path}: no such file")
     if path.is_dir():
         raise LogError(f"{path}: is a folder, not a log")
-    if kind_of(path) in _READERS:
-        return _arrays(path, columns, flight)
-    _require_one_flight(path, flight)
-    if path.suffix.lower() == ".gz" and kind_of(path.with_suffix("")) in _READERS:
+    if lowercase_file_ending(path) in _READERS:
+        return _read_binary_columns(path, columns, flight)
+    _refuse_flight_unless_blackbox(path, flight)
+    if path.suffix.lower() == ".gz" and lowercase_file_ending(path.with_suffix("")) in _READERS:
         raise LogError(f"{path}: only text is read while it is packed; unpack it first: gunzip")
     try:
         # The file is read line by line, so that only the numbers of a large file stay in memory.
@@ -93,7 +93,7 @@ def read_table(
         raise LogError(f"{path}: cannot be read as text ({why})") from None
 
 
-def kind_of(path: Path) -> str:
+def lowercase_file_ending(path: Path) -> str:
     """Return the ending of the name of a log in small letters; `.usd` for a Crazyflie's log without
     an ending.
     """
@@ -103,19 +103,24 @@ def kind_of(path: Path) -> str:
         return ".usd" if file.read(1) == bytes([FIRST_BYTE]) else ""
 
 
-def _require_one_flight(path: Path, flight: int | None) -> None:
+def _refuse_flight_unless_blackbox(path: Path, flight: int | None) -> None:
     """Raise `LogError` if a `flight` is chosen and the log is not a Blackbox log."""
     if flight is not None:
         raise LogError(f"{path}: flight {flight}: only a Blackbox log (.bbl, .bfl) has flights")
 
 
-def _arrays(path: Path, columns: Sequence[str], flight: int | None) -> dict[str, np.ndarray]:
-    """Return the wanted columns of a log that is not text."""
-    read: Any = _READERS[kind_of(path)]
+def _read_binary_columns(
+    path: Path, columns: Sequence[str], flight: int | None
+) -> dict[str, np.ndarray]:
+    """Read the wanted columns of a log that is not text, and return them by name.
+
+    `flight` is the number of the flight in a Blackbox log, from 1, or `None`.
+    """
+    read: Any = _READERS[lowercase_file_ending(path)]
     if read is read_blackbox:
         read = functools.partial(read_blackbox, flight=flight)
     else:
-        _require_one_flight(path, flight)
+        _refuse_flight_unless_blackbox(path, flight)
     # The readers raise many kinds of errors for an empty or a cut file.
     try:
         names, arrays = read(path, columns)
@@ -126,7 +131,8 @@ def _arrays(path: Path, columns: Sequence[str], flight: int | None) -> dict[str,
     except Exception as error:
         why = f"{type(error).__name__}: {error}".splitlines()[0]
         raise LogError(
-            f"{path}: cannot be read; is it whole, and a {kind_of(path)} file? ({why})"
+            f"{path}: cannot be read; is it whole, and a {lowercase_file_ending(path)} file? "
+            f"({why})"
         ) from None
     out = {}
     for name in columns:

@@ -28,24 +28,24 @@ def open_text(path: Path) -> io.TextIOWrapper:
     packed = path.suffix.lower() == ".gz"
     raw: Any = gzip.open(path, "rb") if packed else path.open("rb")
     try:
-        return io.TextIOWrapper(raw, encoding=_encoding(raw.peek(8192)), newline="")
+        return io.TextIOWrapper(raw, encoding=_encoding_of_first_bytes(raw.peek(8192)), newline="")
     except BaseException:
         raw.close()
         raise
 
 
-def _encoding(begin: bytes) -> str:
-    """Return the encoding of a text, found from its first bytes `begin`.
+def _encoding_of_first_bytes(first_bytes: bytes) -> str:
+    """Return the encoding of a text, found from its `first_bytes`.
 
     The encoding is UTF-16 if there is a byte-order mark, or if there are zeros between the letters.
     Otherwise the encoding is UTF-8 if the bytes are valid in UTF-8, else Windows's code page 1252.
     """
-    if begin[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+    if first_bytes[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return "utf-16"
-    if len(begin) > 1 and 0 in begin[:2]:
-        return "utf-16-be" if begin[0] == 0 else "utf-16-le"
+    if len(first_bytes) > 1 and 0 in first_bytes[:2]:
+        return "utf-16-be" if first_bytes[0] == 0 else "utf-16-le"
     try:
-        codecs.getincrementaldecoder("utf-8")().decode(begin)
+        codecs.getincrementaldecoder("utf-8")().decode(first_bytes)
     except UnicodeDecodeError:
         # Bytes that are not a valid character in this code page raise an error when they are read.
         return "cp1252"
@@ -74,9 +74,9 @@ def read_header(file: io.TextIOBase) -> Header:
     while first.startswith("#") or (first and not first.strip()):
         comments = first if first.startswith("#") else comments
         first, line = file.readline(_LONGEST), line + 1
-    names, separator = _split_names(first)
+    names, separator = _split_header_line(first)
     if comments and (not first or any(map(_NUMBER.fullmatch, names))):
-        return Header(*_split_names(comments.lstrip("#")), line - 1, [first])
+        return Header(*_split_header_line(comments.lstrip("#")), line - 1, [first])
     return Header(names, separator, line, [])
 
 
@@ -86,16 +86,21 @@ _LONGEST = 131_072
 _NUMBER = re.compile(r"[-+.\d][-+.\deE]*")
 
 
-def _split_names(first: str) -> tuple[list[str], str]:
-    """Return two things: the names in a line; and their separator, the sign that gives the most
-    names.
+def _split_header_line(line: str) -> tuple[list[str], str]:
+    """Return two things: the names of columns in a header line; and their separator, which is the
+    comma, semicolon or tab that gives the most names.
     """
-    separator = max(SEPARATORS, key=first.count)
-    return [name.strip() for name in next(csv.reader([first], delimiter=separator), [])], separator
+    separator = max(SEPARATORS, key=line.count)
+    return [name.strip() for name in next(csv.reader([line], delimiter=separator), [])], separator
 
 
 def read_columns(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read the wanted columns of a text line by line, where `path` is for error messages."""
+    """Read the wanted columns of a text line by line, and return them by name.
+
+    - `path`: the path of the file, for error messages.
+    - `file`: the text, open at its beginning.
+    - `columns`: the names of the wanted columns.
+    """
     header, separator, top, after = read_header(file)
     if not any(header):
         raise LogError(f"{path}: line 1: wanted a header with the columns {', '.join(columns)}")
@@ -151,7 +156,7 @@ class _NumberReader:
             return math.nan
         plain = cell
         if self.separator != "," and (self.decimal == "," or "," in cell):
-            plain = self._with_point(cell)
+            plain = self._replace_decimal_comma(cell)
         elif "." in cell:
             self.decimal = "."
         # Python accepts more than a log may contain: 1_000, and digits of other alphabets, are
@@ -165,7 +170,7 @@ class _NumberReader:
             raise ValueError(f"{cell} is not a finite number; leave the cell empty for a gap")
         return value
 
-    def _with_point(self, cell: str) -> str:
+    def _replace_decimal_comma(self, cell: str) -> str:
         """Return the cell with a point in place of its decimal comma."""
         if "." in cell or self.decimal == ".":
             raise ValueError(f"{cell!r} is not a number; the decimals above have the other sign")

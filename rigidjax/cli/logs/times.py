@@ -53,13 +53,13 @@ def mask_of_increasing(t: np.ndarray) -> np.ndarray:
 
 
 def rows_to_use(
-    path: str | Path, t: np.ndarray, name: str, window: tuple[float, float] | None
+    path: str | Path, t: np.ndarray, time_column: str, window: tuple[float, float] | None
 ) -> np.ndarray:
     """Return the indices of the rows to use, which are the rows in the window whose times increase.
 
     **Arguments:**
 
-    - `path`, `name`: the path of the file and the name of the time column, for messages.
+    - `path`, `time_column`: the path of the file and the name of the time column, for messages.
     - `t`: (T,) the times since the first time stamp, s.
     - `window`: (from, to), s from the first time stamp, or `None` for all rows.
 
@@ -88,28 +88,33 @@ def rows_to_use(
     if rows.size < _FEWEST:
         raise LogError(f"{path}: wanted at least {_FEWEST} samples, got {rows.size}")
     bad = rows[~keep]
-    _require_one_clock(path, t, name, rows, keep)
+    _refuse_clock_set_back(path, t, time_column, rows, keep)
     if 2 * bad.size >= rows.size or keep.sum() < _FEWEST:
         raise LogError(
-            f"{path}: column {name!r}: the times of {bad.size} of {rows.size} rows are repeated, "
-            f"backward or missing (row {bad[0] + 1} is the first)"
+            f"{path}: column {time_column!r}: the times of {bad.size} of {rows.size} rows are "
+            f"repeated, backward or missing (row {bad[0] + 1} is the first)"
         )
     if bad.size:
         shown = ", ".join(str(row + 1) for row in bad[:5]) + (", …" if bad.size > 5 else "")
         warn(
-            f"{path}: column {name!r}: {bad.size} of {rows.size} rows are left out: their times "
-            f"are repeated, backward or missing (row{'s' if bad.size > 1 else ''} {shown})"
+            f"{path}: column {time_column!r}: {bad.size} of {rows.size} rows are left out: their "
+            f"times are repeated, backward or missing (row{'s' if bad.size > 1 else ''} {shown})"
         )
     return rows[keep]
 
 
-def _require_one_clock(
-    path: str | Path, t: np.ndarray, name: str, rows: np.ndarray, keep: np.ndarray
+def _refuse_clock_set_back(
+    path: str | Path, t: np.ndarray, time_column: str, rows: np.ndarray, is_kept: np.ndarray
 ) -> None:
     """Raise `LogError` if the times of rows that are not kept form a second increasing series,
     since the clock was set back in this case.
+
+    - `path`, `time_column`: the path of the file and the name of the time column, for messages.
+    - `t`: (T,) the times, s.
+    - `rows`: (n,) the indices of the rows in the wanted window.
+    - `is_kept`: (n,) whether each of these rows is kept.
     """
-    bad = np.flatnonzero(~keep)
+    bad = np.flatnonzero(~is_kept)
     for run in np.split(bad, np.flatnonzero(np.diff(bad) > 1) + 1):
         if run.size >= _RESTART and (np.diff(t[rows[run]]) > 0).all():
             # The bad rows are either the end of the first series or the beginning of the second
@@ -117,16 +122,19 @@ def _require_one_clock(
             first, after = run[0], run[-1] + 1
             row = rows[first if first and t[rows[first]] <= t[rows[first - 1]] else after]
             raise LogError(
-                f"{path}: column {name!r}: the clock was set back at row {row + 1}, from "
+                f"{path}: column {time_column!r}: the clock was set back at row {row + 1}, from "
                 f"{t[row - 1]:g} to {t[row]:g} s; make two logs of it, or choose a part by --window"
             )
 
 
-def remark_on_step(path: str | Path, t: np.ndarray, unit: str, rate: float) -> None:
+def warn_of_gap_or_wrong_unit(
+    path: str | Path, t: np.ndarray, time_unit: str, typical_rate: float
+) -> None:
     """Warn of a long gap in the times, and of times that are plainly not in their unit.
 
-    **Arguments:** `path` the path of the file, for the message; `t` (T,) the times, s; `unit` the
-    unit in which the times were read; `rate` a typical body rate, rad/s, or zero without a gyro.
+    **Arguments:** `path` the path of the file, for the message; `t` (T,) the times, s;
+    `time_unit` the unit in which the times were read; `typical_rate` a typical body rate, rad/s, or
+    zero without a gyro.
     """
     steps = np.diff(t)
     step = float(np.median(steps))
@@ -136,11 +144,15 @@ def remark_on_step(path: str | Path, t: np.ndarray, unit: str, rate: float) -> N
             f"{path}: no time between {t[row]:.6g} and {t[row + 1]:.6g} s, other steps are "
             f"{step:.3g} s; choose a part by --window"
         )
-    turns = step * rate / (2 * np.pi)
+    turns = step * typical_rate / (2 * np.pi)
     if _ODD_STEPS[0] <= step <= _ODD_STEPS[1] and turns < 1:
         return
     low, high = _USUAL_STEPS
-    others = [u for u in TIME_UNITS if low <= step * UNITS[u] / UNITS[unit] <= high and u != unit]
+    others = [
+        u
+        for u in TIME_UNITS
+        if low <= step * UNITS[u] / UNITS[time_unit] <= high and u != time_unit
+    ]
     turned = f", in which the body turns {turns:.3g} times" if turns >= 1 else ""
     advice = f"; is it in {' or '.join(others)}? give --time-unit" if others else ""
     warn(f"{path}: the step between two times is {step:.3g} s{turned}{advice}")

@@ -40,70 +40,74 @@ _SIGNS = str.maketrans({
 })  # fmt: skip
 
 
-def unit_in(name: str, allowed: Sequence[str]) -> str | None:
+def unit_in_column_name(column: str, allowed: Sequence[str]) -> str | None:
     """Return the unit at the end of the name of a column, or `None`.
 
     A unit in brackets may be any of `UNITS`. A unit without brackets, after a blank, a comma or an
     underscore, must be one of `allowed`. A power may be written with `^`, `**` or raised digits.
 
-    >>> unit_in("Gyroscope x (°/s)", ["rad/s"]), unit_in("wx_deg/s", ["deg/s"]), unit_in("wx", [])
-    ('deg/s', 'deg/s', None)
+    >>> unit_in_column_name("Gyroscope x (°/s)", ["rad/s"]), unit_in_column_name("wx", [])
+    ('deg/s', None)
+    >>> unit_in_column_name("wx_deg/s", ["deg/s"])
+    'deg/s'
     """
-    brackets = _IN_BRACKETS.search(name)
+    brackets = _IN_BRACKETS.search(column)
     if brackets:
-        return _UNIT_OF.get(_usual_spelling(brackets[1]))
-    endings = (name[match.end() :] for match in re.finditer(r"[\s,_]+", name))
-    units = (_UNIT_OF.get(_usual_spelling(ending)) for ending in endings)
+        return _UNIT_OF.get(_normalise_unit_spelling(brackets[1]))
+    endings = (column[match.end() :] for match in re.finditer(r"[\s,_]+", column))
+    units = (_UNIT_OF.get(_normalise_unit_spelling(ending)) for ending in endings)
     return next((unit for unit in units if unit in allowed), None)
 
 
-def _usual_spelling(word: str) -> str:
+def _normalise_unit_spelling(unit: str) -> str:
     """Return the text of a unit in small letters, with one spelling of each sign, as in the table
-    `_SPELLINGS`: "°/S" gives "°/s", and "m/s²" gives "m/s2".
+    `_SPELLINGS`. For example, "°/S" gives "°/s", and "m/s²" gives "m/s2".
 
     A capital G stays unchanged, since it means gauss, while g is the acceleration of gravity.
     """
-    return word.translate(_SIGNS).lower() if word.strip() != "G" else word
+    return unit.translate(_SIGNS).lower() if unit.strip() != "G" else unit
 
 
-def unit_of(
-    names: Sequence[str],
+def unit_of_columns(
+    columns: Sequence[str],
     stated_unit: str | None,
     usual_unit: str,
     allowed: Sequence[str],
-    place: str,
+    message_start: str,
 ) -> str:
     """Return the unit of columns, which is the unit that the user or the names of the columns
     state, else the usual unit.
 
     **Arguments:**
 
-    - `names`: the names of the columns.
+    - `columns`: the names of the columns.
     - `stated_unit`: the unit that the user states, or `None`.
     - `usual_unit`: the unit of the columns if neither the names nor the user state a unit.
     - `allowed`: the units that such a column may have.
-    - `place`: the first words of messages.
+    - `message_start`: the first words of messages.
 
     **Raises** `LogError` if names and user, or two names, state different units, or if a name
     states a unit that is not allowed. It **warns** of an unknown unit in brackets.
     """
-    in_names = {name: unit for name in names if (unit := unit_in(name, allowed))}
+    in_names = {name: unit for name in columns if (unit := unit_in_column_name(name, allowed))}
     for name, unit in in_names.items():
         if unit not in allowed:
             wanted = " or ".join(allowed)
-            raise LogError(f"{place}: column {name!r} is in {unit}; wanted {wanted}")
+            raise LogError(f"{message_start}: column {name!r} is in {unit}; wanted {wanted}")
         if stated_unit is not None and unit != stated_unit:
             raise LogError(
-                f"{place}: column {name!r} is in {unit} by its name, and {stated_unit} is stated: "
-                "which one? state the same unit, or none"
+                f"{message_start}: column {name!r} is in {unit} by its name, and {stated_unit} is "
+                "stated: which one? state the same unit, or none"
             )
     # One column is kept for each unit, so that the message can name it.
-    columns = {unit: name for name, unit in in_names.items()}
-    if len(columns) > 1:
-        (one, first), (other, second) = list(columns.items())[:2]
-        raise LogError(f"{place}: column {first!r} is in {one}, column {second!r} in {other}")
+    by_unit = {unit: name for name, unit in in_names.items()}
+    if len(by_unit) > 1:
+        (one, first), (other, second) = list(by_unit.items())[:2]
+        raise LogError(
+            f"{message_start}: column {first!r} is in {one}, column {second!r} in {other}"
+        )
     unit = stated_unit or next(iter(in_names.values()), usual_unit)
-    for name in names:
+    for name in columns:
         brackets = _IN_BRACKETS.search(name)
         if (
             stated_unit is None
@@ -111,5 +115,5 @@ def unit_of(
             and name not in in_names
             and _UNKNOWN.search(brackets[1])
         ):
-            warn(f"{place}: column {name!r}: its unit is not known; it is read in {unit}")
+            warn(f"{message_start}: column {name!r}: its unit is not known; it is read in {unit}")
     return unit

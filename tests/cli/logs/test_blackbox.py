@@ -10,7 +10,7 @@ import pytest
 
 from rigidjax.cli.command import main
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.layouts import imu_columns_of, usual_unit
+from rigidjax.cli.logs.layouts import imu_columns_of, known_unit_of_column
 from rigidjax.identify import read_table
 
 
@@ -318,4 +318,4 @@ def test_only_blackbox_has_flights(tmp_path):
 def test_fields_have_their_units(tmp_path):
     path = tmp_path / "flight.bbl"
     units = {"time": "us", "gyroADC[1]": "deg/s", "accSmooth[2]": "g", "motor[0]": None}
-    assert {name: usual_unit(path, name) for name in units} == units
+    assert {name: known_unit_of_column(path, name) for name in units} == units

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.times import mask_of_increasing, remark_on_step, rows_to_use
+from rigidjax.cli.logs.times import mask_of_increasing, rows_to_use, warn_of_gap_or_wrong_unit
 
 NAN = np.nan
 
@@ -127,18 +127,18 @@ def test_a_log_without_times_is_refused():
 )
 def test_times_that_are_plainly_in_another_unit_are_remarked_upon(step, unit, rate, words):
     with pytest.warns(LogWarning, match=re.escape(words)):
-        remark_on_step("log", step * np.arange(50), unit, rate)
+        warn_of_gap_or_wrong_unit("log", step * np.arange(50), unit, rate)
 
 
 @pytest.mark.parametrize(("step", "rate"), [(2e-4, 300.0), (0.02, 20.0), (60.0, 1e-3), (1.0, 2.0)])
 def test_usual_times_are_not_remarked_upon(step, rate):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        remark_on_step("log", step * np.arange(50), "s", rate)
+        warn_of_gap_or_wrong_unit("log", step * np.arange(50), "s", rate)
 
 
 def test_a_clock_that_was_set_forward_is_told():
     with pytest.warns(
         LogWarning, match=r"no time between 14.75 and 1.7e\+09 s, other steps are 0.25"
     ):
-        remark_on_step("log", np.concatenate([T, 1.7e9 + T]), "s", 0.0)
+        warn_of_gap_or_wrong_unit("log", np.concatenate([T, 1.7e9 + T]), "s", 0.0)
