@@ -28,7 +28,7 @@ from rigidjax.solve import equations_of_motion
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.fixed_loop import march_steps, torque_inputs_at_start
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.pieces import piece_length
+from rigidjax.solve.pieces import steps_per_piece
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.steppers import stepper_of
 
@@ -234,10 +234,10 @@ def _take_fixed_steps_of_bodies(
             y = march_steps(stepper, h, t0, first, every, y, inputs)
             if reduce is not None:
                 t = t0 + (first + every).astype(h.dtype) * h
-                carried = reduce(carried, t, stepper.state(y))
-            return (y, carried), stepper.state(y) if keep else None
+                carried = reduce(carried, t, stepper.state_of_numbers(y))
+            return (y, carried), stepper.state_of_numbers(y) if keep else None
 
-        begin = (stepper.start, initial)
+        begin = (stepper.initial_numbers, initial)
         if every == count:
             (y, carried), saved = advance_to_next_saved_state(begin, jnp.zeros((), jnp.int32))
             saved = jax.tree.map(lambda leaf: leaf[None], saved)
@@ -245,11 +245,11 @@ def _take_fixed_steps_of_bodies(
             firsts = jnp.arange(0, count, every, dtype=jnp.int32)
             (y, carried), saved = lax.scan(advance_to_next_saved_state, begin, firsts)
         if reduce is not None:
-            return stepper.state(y), carried
-        return saved if keep else stepper.state(y)
+            return stepper.state_of_numbers(y), carried
+        return saved if keep else stepper.state_of_numbers(y)
 
     size = sum(leaf.size for leaf in jax.tree.leaves(per_body[0])) * h.dtype.itemsize
-    if size * (count // every) * (every // piece_length(every) + 1) > _MOST_KEPT:
+    if size * (count // every) * (every // steps_per_piece(every) + 1) > _MOST_KEPT:
         # With this the reverse pass computes each chunk again, and stores the states of one chunk
         # only.
         step_body = jax.checkpoint(step_body)

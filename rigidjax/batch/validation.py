@@ -103,7 +103,7 @@ def check_batch(
                 f"states0: wanted {count} rows as in omega, got {str(path[-1]).lstrip('.')} of "
                 f"shape {leaf.shape}"
             )
-    dtype = validation.one_dtype(states0, "states0")
+    dtype = validation.common_dtype(states0, "states0")
     _checks.numeric_array(states0.omega, "states0")
     if not isinstance(bodies, Inertia | MassProperties):
         raise TypeError(
@@ -135,8 +135,10 @@ def check_batch(
     # cost as much time as many steps.
     shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
     row = (lambda a: a[0]) if isinstance(bodies, MassProperties) else shape
-    validation.require_fit(*eqx.combine(shared, jax.tree.map(row, per_body), constants))
-    validation.warn_of_scale(bodies, torque)
+    validation.require_compatible_types(
+        *eqx.combine(shared, jax.tree.map(row, per_body), constants)
+    )
+    validation.warn_of_unknown_inertia_scale(bodies, torque)
     batch = BodyBatch(shared, per_body, constants, count, dtype, tuple(checks))
     if all(isinstance(index, np.ndarray | np.integer) for index, _ in checks):
         # Few bodies are checked on the host, so that errors are raised before anything is compiled.

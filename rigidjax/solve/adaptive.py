@@ -196,7 +196,7 @@ def adaptive(
     >>> adaptive(solver, field, ts, start, rtol=1e-9, atol=1e-9).ys.q[1, 3]
     Array(0.47942554, dtype=float64)
     """
-    validation.one_dtype((ts, y0), "ts, y0")
+    validation.common_dtype((ts, y0), "ts, y0")
     declared: Any = [] if jumps is None else jumps
     declared = list(declared) if isinstance(declared, list | tuple) else [declared]
     rtol, atol = (jnp.asarray(a, ts.dtype) for a in (rtol, atol))

@@ -17,7 +17,14 @@ from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
 from rigidjax.solve.batching import Arrays, add_leading_axes
-from rigidjax.solve.runge_kutta import Field, Step, error_estimate, nested, stages, weights
+from rigidjax.solve.runge_kutta import (
+    Field,
+    Step,
+    arrays_of_tableau,
+    change_within_step,
+    error_estimate,
+    stages,
+)
 from rigidjax.solve.tableaus import Tableau
 
 # diffrax inherits this member from optimistix, and type checkers do not find it there.
@@ -655,7 +662,7 @@ def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
     theta = ((t - step.t) / jnp.where(step.h == 0, 1, step.h)).astype(slopes.dtype)
     # The polynomial in θ is evaluated for the weights of the slopes, which are one number for each
     # stage. To evaluate it for the rows F_r of dense output would take n numbers for each row.
-    rows = weights(method.tableau, slopes.dtype).dense
-    shares = nested(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
+    rows = arrays_of_tableau(method.tableau, slopes.dtype).dense
+    shares = change_within_step(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
     rise = jnp.sum(shares[None] * slopes, 1)
     return method.project(step.y + add_leading_axes(step.h.astype(rise.dtype), rise) * rise)

@@ -64,12 +64,12 @@ from rigidjax.solve.momentum import ByMomentum, equations_by_momentum
 from rigidjax.solve.run import (
     ClosedFormRun,
     DiffraxRun,
-    direction as direction_of,
+    convert_to_forward_time,
+    direction_of_times,
     equations_of_motion,
-    in_forward_time,
     solve,
 )
-from rigidjax.solve.stops import constants_of, program_with_stops
+from rigidjax.solve.stops import extract_constants, program_with_stops
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 
@@ -213,13 +213,15 @@ def crossings(
     if _checks.is_known((begin, end)) and float(begin) == float(end):
         raise ValueError(f"t1: wanted another time than t0, got {float(end):g} for both")
     ts = jnp.stack([begin, end])
-    body, state0, times = validation.checked_scene(body, state0, ts, torque, throw=False)
+    body, state0, times = validation.checked_body_state_and_times(
+        body, state0, ts, torque, throw=False
+    )
     state0 = check_condition_and_add_torque_states(event, body, state0, torque, times[0])
     if torque is None and solver is None and body is not None:
         return _crossings_of_run(ClosedFormRun(body, False), event, many, max_steps, state0, times)
     solver = require_explicit(solver)
     rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
-    way = direction_of(times)
+    way = direction_of_times(times)
     setup = DiffraxRun(
         body, torque, solver, rtol, atol, None, None, None, REPLAY, NO_METER, way, max_steps, False
     )
@@ -552,7 +554,9 @@ def condition_and_motion_of_run(
     sign = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
     way = setup.sign if isinstance(setup, DiffraxRun) else sign
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
-    field, asked, along, jumps = in_forward_time(way, field, condition, ts[jnp.array([0, -1])])
+    field, asked, along, jumps = convert_to_forward_time(
+        way, field, condition, ts[jnp.array([0, -1])]
+    )
     whole: Any = lambda s, y, *sides: ravel_pytree(field(s, tree(y), sides or None))[0]  # noqa: E731
     program = program_with_stops(whole, jumps, along[0], along[1], y0)
     longest = length = lax.stop_gradient(along[1] - along[0])
@@ -578,7 +582,7 @@ def condition_and_motion_of_run(
         motion = lambda s, _: ravel_pytree(free(sign.astype(s.dtype) * s - ts[0]))[0]  # noqa: E731
         longest = jnp.minimum(longest, _sampling_interval(setup.body, state0, length))
         rtol, atol, h0 = jnp.zeros((), y0.dtype), jnp.zeros((), y0.dtype), longest
-    (of_motion, of_rates), constants = constants_of([motion, rates], along[0], y0)
+    (of_motion, of_rates), constants = extract_constants([motion, rates], along[0], y0)
     stops = jnp.concatenate([program.stops, along[1:]])
     sizes = [leaf.size for leaf in jax.tree.leaves(state0)]
     crossed = Section(solver, of_motion, of_rates, tree, sizes, sign, form)

@@ -27,7 +27,7 @@ from rigidjax.motion.manifold import leaf_names, minus, parts_by_name
 from rigidjax.solve import difference, validation
 from rigidjax.solve.linear_map import known_with_derivatives_of
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
-from rigidjax.solve.sides import with_constant_pieces
+from rigidjax.solve.sides import hold_piecewise_constant_laws_at
 
 # The tolerance of the second run divided by the tolerance of the run. With this value a method of
 # order 8 takes 1.6 times as many steps.
@@ -336,7 +336,7 @@ def _run_at_larger_tolerance(
     - `search`: two finished runs at larger tolerances: the first is returned if its states are near
       `ys`, else the second. With `None` a new run is made.
     """
-    replayed = isinstance(setup, DiffraxRun) and setup.is_replayed
+    replayed = isinstance(setup, DiffraxRun) and setup.records_steps_for_derivatives
     if not replayed or ts.dtype == jnp.float32:
         return setup, ys, 1.0
     sizes = _error_scales_by_name(ys)
@@ -571,7 +571,7 @@ def _times_of_sudden_torque(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Py
     state0 = jax.tree.map(lambda leaf: leaf[0], ys)
     # Steps end at each jump of a law of constant pieces, so that nothing is missed between them.
     field = equations_of_motion(setup.body, state0, setup.torque)
-    field = with_constant_pieces(field, ts[0])
+    field = hold_piecewise_constant_laws_at(field, ts[0])
     traced = jax.make_jaxpr(lambda t: field(t, state0, None))(ts[0]).jaxpr
     if not any(var is traced.invars[0] for equation in traced.eqns for var in equation.invars):
         return ts[:0]
@@ -627,7 +627,7 @@ def _more_accurate_setup(
         rtol = jnp.asarray(setup.rtol, ts.dtype)
         less = jnp.maximum(_CLOSER * rtol, _DEEPEST * eps)
         cuts = sudden_times
-        if setup.seeks_stops:
+        if setup.ends_steps_at_jumps:
             parts = jnp.arange(1, _CUTS).astype(ts.dtype) / _CUTS
             cuts = jnp.concatenate([ts[0] + (ts[-1] - ts[0]) * parts, sudden_times])
         new = dict(rtol=less, atol=setup.atol * (less / rtol), cuts=cuts if cuts.size else None)

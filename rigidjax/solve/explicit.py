@@ -14,12 +14,14 @@ from rigidjax import _checks
 from rigidjax._types import RealLike
 from rigidjax.motion.equations import project_to_group
 from rigidjax.solve import validation
-from rigidjax.solve.runge_kutta import Step, dense_rows, error_estimate, nested, stages
+from rigidjax.solve.runge_kutta import Step, change_within_step, dense_rows, error_estimate, stages
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
 
 
 class NestedInterpolation(dfx.AbstractLocalInterpolation):
-    """Interpolate the state within a step (dense output) by the polynomial `runge_kutta.nested`.
+    """Interpolate the state within a step (dense output) by a polynomial.
+
+    The polynomial is that of `runge_kutta.change_within_step`.
 
     `coefficients` are the rows F0, F1, … of the polynomial. A quaternion is scaled to length 1.
     """
@@ -37,7 +39,7 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
         safe = jnp.where(length == 0, jnp.ones_like(length), length)
         theta = jnp.where(length == 0, jnp.zeros_like(length), (t0 - self.t0) / safe)
 
-        value = lambda y, rows: y + nested(theta.astype(y.dtype), rows)  # noqa: E731
+        value = lambda y, rows: y + change_within_step(theta.astype(y.dtype), rows)  # noqa: E731
         return project_to_group(jax.tree.map(value, self.y0, self.coefficients))
 
 
@@ -62,11 +64,12 @@ def cubic_coefficients(
 ) -> tuple[Array, Array, Array]:
     """Return the three coefficients of a cubic polynomial that interpolates within a step.
 
-    They are the coefficients F0, F1 and F2 of `runge_kutta.nested`, which evaluates the polynomial.
+    They are the coefficients F0, F1 and F2 of `runge_kutta.change_within_step`, which evaluates the polynomial.
 
-    - `change`: the change of the polynomial over the step, an array of a state.
-    - `h`: the length of the step, s.
-    - `left_slope`, `right_slope`: the slopes of the polynomial at the start and the end of the
+    - `change`
+    over the step, polynomial over the step, an array of a state.
+    - `h`: the length of the step, are
+    `left` and `left_slope`, `right_slope`: the slopes of the polynomial at the start and the end of the
       step, with the shape of `change`.
     """
     return change, h * left_slope - change, 2 * change - h * (left_slope + right_slope)
@@ -102,7 +105,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
         solver_state: PyTree,
         made_jump: Bool[ArrayLike, ""],
     ) -> Any:
-        validation.one_dtype(y0, "state")
+        validation.common_dtype(y0, "state")
         numbers, tree = ravel_pytree(y0)
         way, h = direction_and_length_of_step(terms, t0, t1)
 

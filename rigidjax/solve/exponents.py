@@ -120,7 +120,7 @@ def lyapunov_exponents(
     many = size if number is None else _checks.integer(number, "number", 1)
     if many > size:
         raise ValueError(f"number: wanted at most {size}, one for each direction, got {many}")
-    dtype = validation.one_dtype(state0, "state0")
+    dtype = validation.common_dtype(state0, "state0")
     length = _checks.checked_time(time, "time").astype(dtype)
     length = _checks.error_if(length, ~(length > 0), "time: wanted a positive time, s")
     rtol, atol = validation.checked_tolerances(rtol, atol, dtype)

@@ -18,7 +18,7 @@ from rigidjax.rotation.barrier import platform
 from rigidjax.solve.equal_steps import StepWithLoopedStages
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.pieces import in_pieces, piece_length
+from rigidjax.solve.pieces import steps_per_piece, take_equal_steps_on_gpu
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.steppers import AnyStepper, stepper_of
 
@@ -66,12 +66,12 @@ def fixed(
         return y, y
 
     if last is None:
-        _, rest = lax.scan(span, stepper.start, (ts[:-1], ts[1:]))
+        _, rest = lax.scan(span, stepper.initial_numbers, (ts[:-1], ts[1:]))
     else:
-        start = stepper.start
+        start = stepper.initial_numbers
         still = jax.tree.map(lambda a: jnp.broadcast_to(a, (ts.size - 1, *a.shape)), start)
         rest = fill_first_rows(last, lambda y, i: span(y, (ts[i], ts[i + 1])), start, still)
-    later = jax.vmap(stepper.state)(rest)
+    later = jax.vmap(stepper.state_of_numbers)(rest)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y0, later)
 
 
@@ -220,7 +220,7 @@ def march_steps(
     pieces are stored; the states within a piece are stored for one piece at a time.
     """
     if platform() != "cpu":
-        return in_pieces(
+        return take_equal_steps_on_gpu(
             lambda y, i: take_equal_step(stepper, h, t0, i, y, inputs), first, count, y
         )
 
@@ -232,7 +232,7 @@ def march_steps(
     def some(y: Any, begin: Array, many: int) -> Any:
         return lax.scan(one, y, begin + jnp.arange(many, dtype=jnp.int32))[0]
 
-    length = piece_length(count)
+    length = steps_per_piece(count)
     pieces, left = divmod(count, length)
     if pieces > 1:
         starts = first + length * jnp.arange(pieces, dtype=jnp.int32)

@@ -5,7 +5,7 @@ loop (unrolling), free bodies take three times as many steps a second. In revers
 does not help, because a backward step has so many numbers that the time of a kernel grows in
 proportion to its length. JAX's transpose of a loop is unrolled as the loop itself, so the backward
 loop is written here by hand, with one step in each iteration. It stores states on two levels (see
-`in_pieces`). On a CPU neither the unrolling nor this backward loop saves time.
+`take_equal_steps_on_gpu`). On a CPU neither the unrolling nor this backward loop saves time.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from rigidjax.solve.stops import trace_program
 _LONG, _MOST = 2800, 8
 
 
-def piece_length(count: int) -> int:
+def steps_per_piece(count: int) -> int:
     """Return the number of steps in a piece of a run of `count` steps, about √count.
 
     If `count` has a divisor between √count and 2√count, this divisor is returned: the pieces then
@@ -56,29 +56,31 @@ class _StepsInPieces:
     turn: int  # the number of steps in one iteration of the loop in forward direction
 
     def take_steps(
-        self, constants: Arrays, y: Arrays, first: Array, number: int, keep: bool = False
-    ) -> tuple[Arrays, Any]:
+        self, constants: Arrays, y: Arrays, first: Array, number: int, keep_starts: bool = False
+    ) -> tuple[Arrays, Arrays | None]:
         """Take `number` steps, which begin with step number `first` and the state `y`.
 
         `constants` are the arrays that the function of a step holds. **Returns** two things: the
         state after the steps; and the states at the starts of these steps, along a new first axis,
-        if `keep` is true, else `None`.
+        if `keep_starts` is true, else `None`.
         """
 
         def one(y: Arrays, i: Array) -> tuple[Arrays, Any]:
-            return self.call(constants, y, i), y if keep else None
+            return self.call(constants, y, i), y if keep_starts else None
 
         return lax.scan(one, y, first + jnp.arange(number, dtype=jnp.int32), unroll=self.turn)
 
-    def forward(self, constants: Arrays, first: Array, y: Arrays) -> tuple[Arrays, Any]:
+    def take_all_steps(
+        self, constants: Arrays, first: Array, y: Arrays
+    ) -> tuple[Arrays, tuple[Arrays, Arrays]]:
         """Take all steps from the state `y`, beginning with step number `first`.
 
         `constants` are the arrays that the function of a step holds. **Returns** two things: the
-        state at the end; and the states that `back` needs, a pair of the states at the starts of
-        the pieces (along a new first axis) and of the state at the start of the remaining steps
-        after the last piece.
+        state at the end; and the states that `pull_back_all_steps` needs, a pair of the states at
+        the starts of the pieces (along a new first axis) and of the state at the start of the
+        remaining steps after the last piece.
         """
-        firsts, length, left = self.pieces(first)
+        firsts, length, left = self.divide_into_pieces(first)
 
         def piece(y: Arrays, begin: Array) -> tuple[Arrays, Arrays]:
             return self.take_steps(constants, y, begin, length)[0], y
@@ -89,28 +91,35 @@ class _StepsInPieces:
             end, _ = self.take_steps(constants, end, first + self.count - left, left)
         return end, (starts, last)
 
-    def back(
-        self, constants: Arrays, moving: Sequence[bool], first: Array, starts: Any, bar: Arrays
+    def pull_back_all_steps(
+        self,
+        constants: Arrays,
+        has_derivative: Sequence[bool],
+        first: Array,
+        starts: tuple[Arrays, Arrays],
+        cotangent_of_end: Arrays,
     ) -> tuple[Arrays, Arrays]:
         """Run all steps in reverse mode, and return the cotangents of constants and start.
 
         **Arguments:**
 
         - `constants`: the arrays that the function of a step holds.
-        - `moving`: for each constant, whether it has a derivative.
+        - `has_derivative`: for each constant, whether it has a derivative.
         - `first`: the number of the first step.
-        - `starts`: the states that the method `forward`, which takes the steps, returned as its
-          second result for this purpose.
-        - `bar`: the cotangent of the state at the end.
+        - `starts`: the states that the method `take_all_steps` returned as its second result for
+          this purpose.
+        - `cotangent_of_end`: the cotangent of the state at the end.
 
         **Returns** two lists: the cotangents of the constants with a derivative, and the cotangent
         of the state at the start.
         """
-        firsts, length, left = self.pieces(first)
-        chosen = [c for c, m in zip(constants, moving, strict=True) if m]
+        firsts, length, left = self.divide_into_pieces(first)
+        chosen = [c for c, m in zip(constants, has_derivative, strict=True) if m]
 
         def step_of(i: Array) -> Callable[[Arrays, Arrays], Arrays]:
-            return lambda some, y: self.call(_replace_selected(constants, moving, some), y, i)
+            return lambda some, y: self.call(
+                _replace_selected(constants, has_derivative, some), y, i
+            )
 
         def one(sums: tuple[Arrays, Arrays], at: tuple[Arrays, Array]) -> tuple[Any, None]:
             (total, bar), (y, i) = sums, at
@@ -118,11 +127,11 @@ class _StepsInPieces:
             return ([a + b for a, b in zip(total, more, strict=True)], bar), None
 
         def piece(sums: tuple[Arrays, Arrays], y: Arrays, begin: Array, many: int) -> Any:
-            _, states = self.take_steps(constants, y, begin, many, keep=True)
+            _, states = self.take_steps(constants, y, begin, many, keep_starts=True)
             steps = begin + jnp.arange(many, dtype=jnp.int32)
             return lax.scan(one, sums, (states, steps), reverse=True)[0]
 
-        sums = [jnp.zeros_like(c) for c in chosen], bar
+        sums = [jnp.zeros_like(c) for c in chosen], cotangent_of_end
         rows, last = starts
         if left:
             sums = piece(sums, last, first + self.count - left, left)
@@ -133,19 +142,21 @@ class _StepsInPieces:
 
         return lax.scan(whole, sums, (rows, firsts), reverse=True)[0]
 
-    def pieces(self, first: Array) -> tuple[Array, int, int]:
+    def divide_into_pieces(self, first: Array) -> tuple[Array, int, int]:
         """Return how the steps, the first of which has the number `first`, are divided into pieces.
 
         A piece is a group of steps that follow one another; all pieces have equally many.
         **Returns** three things: the number of the first step of each piece, an array; how many
         steps are in a piece; and how many steps, too few for a piece, remain after the last piece.
         """
-        length = piece_length(self.count)
+        length = steps_per_piece(self.count)
         many, left = divmod(self.count, length)
         return first + length * jnp.arange(many, dtype=jnp.int32), length, left
 
 
-def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: Any) -> Any:
+def take_equal_steps_on_gpu(
+    step: Callable[[Any, Array], Any], first: Array, count: int, y: Any
+) -> Any:
     """Take many equal steps on a GPU, several in one kernel, and return the state after them.
 
     `step(y, i)` returns the state after step number i, which begins with the state `y`. The first
@@ -161,12 +172,12 @@ def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: An
     # The number of steps in an iteration is a power of two, because the length of a piece is often
     # a multiple of a power of two.
     turn = 1 << (turn.bit_length() - 1)
-    program, constants = _StepsInPieces(one.call, count, turn), one.constants
+    program, constants = _StepsInPieces(one.call, count, turn), one.jax_constants
     number = len(constants)
     smooth = [*[eqx.is_inexact_array(c) for c in constants], False, *[True for _ in start]]
 
     def end(args: Arrays) -> Arrays:
-        return program.forward(args[:number], args[number], args[number + 1 :])[0]
+        return program.take_all_steps(args[:number], args[number], args[number + 1 :])[0]
 
     @jax.custom_jvp
     def run(*args: Array) -> Arrays:
@@ -176,7 +187,7 @@ def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: An
         both = zip(smooth, tangents, strict=True)
         moving = [s and not isinstance(t, SymbolicZero) for s, t in both]
         size = len(primals)
-        out, starts = program.forward(
+        out, starts = program.take_all_steps(
             list(primals[:number]), primals[number], list(primals[number + 1 :])
         )
         rows, shape = jax.tree.flatten(starts)
@@ -189,7 +200,7 @@ def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: An
 
         def pull(*args: Array) -> Arrays:
             given, kept, bars = args[:number], args[size : size + len(rows)], args[-len(start) :]
-            total, bar = program.back(
+            total, bar = program.pull_back_all_steps(
                 list(given), moving[:number], args[number], shape.unflatten(kept), list(bars)
             )
             return [*total, *[b for b, m in zip(bar, moving[number + 1 :], strict=True) if m]]

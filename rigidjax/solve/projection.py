@@ -40,13 +40,13 @@ class _MakeGroupInterpolation(eqx.Module):
         return GroupInterpolation(t0, t1, self.inner_cls(t0=t0, t1=t1, **dense_info))
 
 
-def _attribute_of_member(part: str, name: str) -> Any:
+def _make_property_of_member(member: str, attribute: str) -> Any:
     """Define a property that reads an attribute of a member of an object.
 
-    `part` is the name of the member, and `name` that of its attribute: the property of an object x
-    has the value `x.part.name`.
+    `member` is the name of the member, and `attribute` that of its attribute. With the names
+    "solver" and "order", for example, the property of an object x has the value `x.solver.order`.
     """
-    return property(lambda self: getattr(getattr(self, part), name))
+    return property(lambda self: getattr(getattr(self, member), attribute))
 
 
 class Projected(dfx.AbstractWrappedSolver):
@@ -69,13 +69,15 @@ class Projected(dfx.AbstractWrappedSolver):
     def __check_init__(self) -> None:
         _checks.require_instance(self.solver, dfx.AbstractSolver, "solver")
 
-    term_structure = _attribute_of_member("solver", "term_structure")
-    term_compatible_contr_kwargs = _attribute_of_member("solver", "term_compatible_contr_kwargs")
+    term_structure = _make_property_of_member("solver", "term_structure")
+    term_compatible_contr_kwargs = _make_property_of_member(
+        "solver", "term_compatible_contr_kwargs"
+    )
     # Adjoints of diffrax set `scan_kind` on a Runge–Kutta method, and controllers set the members
     # of the root finder on an implicit method; they look for these members on this wrapper.
-    scan_kind = _attribute_of_member("solver", "scan_kind")
-    root_finder = _attribute_of_member("solver", "root_finder")
-    root_find_max_steps = _attribute_of_member("solver", "root_find_max_steps")
+    scan_kind = _make_property_of_member("solver", "scan_kind")
+    root_finder = _make_property_of_member("solver", "root_finder")
+    root_find_max_steps = _make_property_of_member("solver", "root_find_max_steps")
 
     @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -3,6 +3,7 @@
 The run is that of one body or, under `jax.vmap`, that of a batch of bodies.
 """
 
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
+from jax.tree_util import PyTreeDef
 from jaxtyping import Array
 
 from rigidjax.solve import adaptive_loop, adjoint
@@ -21,8 +23,8 @@ from rigidjax.solve.linear_map import linear_map, raise_for_missing_transpose
 SMOOTH = len(Smooth._fields)
 
 
-def states_of_run(
-    method: Method, smooth: list[bool], constants: Arrays, state: Any, run: Run
+def run_with_replayed_derivatives(
+    method: Method, smooth: list[bool], constants: Arrays, controller_states: Any, run: Run
 ) -> tuple[Array, LoopState]:
     """Run one body, with derivatives that repeat the recorded steps of the run.
 
@@ -37,12 +39,13 @@ def states_of_run(
     - `method`, `run`: the parts and the numbers of the run of one body.
     - `smooth`: whether each of the `constants` has derivatives.
     - `constants`: the arrays that the field, the condition and the controller hold.
-    - `state`: the states of controller and progress meter at the start, which bodies may share.
+    - `controller_states`: the states of controller and progress meter at the start, which bodies
+      may share.
     """
-    each, run_tree = jax.tree.flatten(run)
-    first, state_tree = jax.tree.flatten(state)
+    arrays_of_bodies, run_tree = jax.tree.flatten(run)
+    first, state_tree = jax.tree.flatten(controller_states)
     number, smooth = len(constants) + len(first), [*smooth, *(False for _ in first)]
-    like = adaptive_loop.initial_loop_state(run._replace(state=state))
+    like = adaptive_loop.initial_loop_state(run._replace(state=controller_states))
     shapes = jax.eval_shape(adaptive_loop.pack_loop_state, like)
     trees = run_tree, state_tree
     # `recorded` returns a list of arrays: the states at the saved times; the loop state at the end,
@@ -59,27 +62,31 @@ def states_of_run(
     answer: Any = jax.custom_jvp(partial(mapped, partial(_run_bodies, False), 0))
     recorded: Any = jax.custom_jvp(partial(mapped, partial(_run_bodies, True), 0))
 
-    def tangents_of(primals: Any, tangents: Any, pull: Any = None) -> tuple[Arrays, Arrays]:
+    def results_and_tangents(
+        primals: Sequence[Any],
+        tangents: Sequence[Any],
+        cotangents_of_inputs: Callable[..., Arrays] | None = None,
+    ) -> tuple[Arrays, Arrays]:
         """Return the results and the record of a run, and the tangents of those that hold states.
 
         Results and record are one list of arrays. `primals` are the inputs of the run, its
-        constants first, and `tangents` their tangents (symbolic zeros where there is none). `pull`
-        is the function that computes the cotangents of the inputs in reverse mode; if it is `None`,
-        reverse mode raises an error.
+        constants first, and `tangents` their tangents (symbolic zeros where there is none).
+        `cotangents_of_inputs` is the function that computes the cotangents of the inputs in reverse
+        mode; if it is `None`, reverse mode raises an error.
         """
         # A number without a tangent needs no derivative.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
         of_run = [t and i < SMOOTH for i, t in enumerate(there[number:])]
-        moving = [s and t for s, t in zip(smooth, there[:number], strict=True)], of_run
-        along = [t for t, m in zip(tangents, [*moving[0], *moving[1]], strict=True) if m]
+        has_tangent = [s and t for s, t in zip(smooth, there[:number], strict=True)], of_run
+        along = [t for t, m in zip(tangents, [*has_tangent[0], *has_tangent[1]], strict=True) if m]
         found = recorded(*primals)
-        push = partial(mapped, partial(_tangents_of_states, moving), len(along))
+        push = partial(mapped, partial(_tangents_of_states, has_tangent), len(along))
         given = [*primals, *found[head:]]
-        if pull is None:
+        if cotangents_of_inputs is None:
             return found, linear_map(push, raise_for_missing_transpose, given, along)
         # Of the arrays of `recorded`, only the states at the saved times and at the end have a
         # transpose.
-        back = partial(mapped, partial(pull, moving), 2)
+        back = partial(mapped, partial(cotangents_of_inputs, has_tangent), 2)
         return found, linear_map(lambda *args: push(*args)[:2], back, given, along)
 
     def with_zeros(found: Arrays, moved: Arrays) -> tuple[Arrays, Arrays]:
@@ -89,20 +96,24 @@ def states_of_run(
         return found, along
 
     def of_answer(primals: Any, tangents: Any) -> Any:
-        found, moved = tangents_of(primals, tangents, _cotangents_of_inputs)
+        found, moved = results_and_tangents(primals, tangents, _cotangents_of_inputs)
         return with_zeros(found[:head], moved)
 
     def of_record(primals: Any, tangents: Any) -> Any:
-        return with_zeros(*tangents_of(primals, tangents))
+        return with_zeros(*results_and_tangents(primals, tangents))
 
     answer.defjvp(of_answer, symbolic_zeros=True)
     recorded.defjvp(of_record, symbolic_zeros=True)
-    between, *end = answer(*constants, *first, *each)
+    between, *end = answer(*constants, *first, *arrays_of_bodies)
     return between, adaptive_loop.unpack_loop_state(end, like)
 
 
-def _method_over_bodies(
-    method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
+def _batch_method_over_bodies(
+    method: Method,
+    trees: tuple[PyTreeDef, PyTreeDef],
+    layout: Layout,
+    constants: Arrays,
+    arrays_of_bodies: Arrays,
 ) -> tuple[Method, Run, Layout, Arrays]:
     """Convert a method for one body to a method for arrays whose last axis is the bodies.
 
@@ -118,14 +129,14 @@ def _method_over_bodies(
     - `layout`: which arrays have a last axis of bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
-    - `each`: the arrays of the run, with values of each body.
+    - `arrays_of_bodies`: the arrays of the run, with values of each body.
 
     **Returns** four things: the method for bodies, whose `halt` and `control` already hold the
     constants; the run, to which the states of controller and progress meter belong; the layout of
     the constants; and the constants without these states.
     """
     run_tree, state_tree = trees
-    run, count = run_tree.unflatten(each), len(constants) - state_tree.num_leaves
+    run, count = run_tree.unflatten(arrays_of_bodies), len(constants) - state_tree.num_leaves
     state = layout.broadcast_to_bodies(
         constants, [i >= count for i in range(len(constants))], run.t0
     )
@@ -144,27 +155,34 @@ def _method_over_bodies(
 
 
 def _run_bodies(
-    record: bool, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
+    return_record: bool,
+    method: Method,
+    trees: tuple[PyTreeDef, PyTreeDef],
+    layout: Layout,
+    constants: Arrays,
+    arrays_of_bodies: Arrays,
 ) -> Arrays:
     """Run all bodies, and return the arrays of the result as one list.
 
     **Arguments:**
 
-    - `record`: whether the record of the steps is returned, too.
+    - `return_record`: whether the record of the steps is returned, too.
     - `method`: the explicit method of one body, with the field and the step control.
     - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
       progress meter.
     - `layout`: which arrays have a last axis of bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
-    - `each`: the arrays of the run, with values of each body.
+    - `arrays_of_bodies`: the arrays of the run, with values of each body.
 
     **Returns** a list of arrays: the states at the saved times; the state of the loop at the end;
-    and, if `record` is true, the record of the steps.
+    and, if `return_record` is true, the record of the steps.
     """
-    method, run, _, constants = _method_over_bodies(method, trees, layout, constants, each)
+    method, run, _, constants = _batch_method_over_bodies(
+        method, trees, layout, constants, arrays_of_bodies
+    )
     kept = None
-    if record or (run.between.shape[0] and layout.bodies):
+    if return_record or (run.between.shape[0] and layout.bodies):
         between, end, kept = adaptive_loop.record_run(method, constants, run)
     elif run.between.shape[0]:
         between, end = adaptive_loop.run_one_body(method, constants, run)
@@ -173,31 +191,36 @@ def _run_bodies(
     return [
         between,
         *adaptive_loop.pack_loop_state(end),
-        *jax.tree.leaves(kept if record else None),
+        *jax.tree.leaves(kept if return_record else None),
     ]
 
 
 # Two lists of truth values: whether each constant has a tangent, and whether each array of a run
 # has a tangent.
-Moving = tuple[list[bool], list[bool]]
+HasTangent = tuple[list[bool], list[bool]]
 
 
-def _parts_of_recorded_run(
-    moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
+def _unpack_recorded_run(
+    has_tangent: HasTangent,
+    method: Method,
+    trees: tuple[PyTreeDef, PyTreeDef],
+    layout: Layout,
+    constants: Arrays,
+    arrays_of_bodies: Arrays,
 ) -> tuple[Method, Arrays, Run, Record, Arrays]:
     """Return what is needed to differentiate the run of all bodies whose steps were recorded.
 
     **Arguments:**
 
-    - `moving`: which constants, and which arrays of the run, have a tangent.
+    - `has_tangent`: which constants, and which arrays of the run, have a tangent.
     - `method`: the explicit method of one body, with the field and the step control.
     - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
       progress meter.
     - `layout`: which arrays have a last axis of bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
-    - `each`: a list of the arrays of the run, then those of its record, then, in forward mode, the
-      tangents of the inputs or, in reverse mode, the cotangents of the results.
+    - `arrays_of_bodies`: a list of the arrays of the run, then those of its record, then, in
+      forward mode, the tangents of the inputs or, in reverse mode, the cotangents of the results.
 
     **Returns** five things: the method for bodies; the constants; the run; its record; and the
     tangents or cotangents. The returned constants are only the constants that have a tangent, with
@@ -205,14 +228,14 @@ def _parts_of_recorded_run(
     """
     whole = trees[0].num_leaves
     one = method.field
-    method, run, layout, constants = _method_over_bodies(
-        method, trees, layout, constants, each[:whole]
+    method, run, layout, constants = _batch_method_over_bodies(
+        method, trees, layout, constants, arrays_of_bodies[:whole]
     )
     starts = len(
         jax.eval_shape(adaptive_loop.pack_loop_state, adaptive_loop.initial_loop_state(run))
     )
-    *kept, rows, counts = each[whole : whole + starts + 2]
-    there = moving[0][: len(constants)]
+    *kept, rows, counts = arrays_of_bodies[whole : whole + starts + 2]
+    there = has_tangent[0][: len(constants)]
     layout, constants = layout.broadcast_to_bodies(constants, there, run.t0)
     field = layout.vmap_over_bodies(one)
 
@@ -222,33 +245,38 @@ def _parts_of_recorded_run(
         return field(mixed, t, y)
 
     chosen = [c for c, m in zip(constants, there, strict=True) if m]
-    record, bars = Record(kept, rows, counts), each[whole + starts + 2 :]
+    record, bars = Record(kept, rows, counts), arrays_of_bodies[whole + starts + 2 :]
     return method._replace(field=of_moving), chosen, run, record, bars
 
 
 def _tangents_of_states(
-    moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
+    has_tangent: HasTangent,
+    method: Method,
+    trees: tuple[PyTreeDef, PyTreeDef],
+    layout: Layout,
+    constants: Arrays,
+    arrays_of_bodies: Arrays,
 ) -> Arrays:
     """Return the tangents of the states of a run whose steps were recorded, in forward mode.
 
     The states are those at the saved times and the one at the end of the run.
 
-    - `moving`: two lists of truth values: which constants, and which arrays of the run, have a
+    - `has_tangent`: two lists of truth values: which constants, and which arrays of the run, have a
       tangent.
     - `method`: the explicit method of one body, with the field and the step control.
     - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
       progress meter.
     - `layout`: which arrays have a last axis of bodies.
     - `constants`: the arrays that the functions of the method hold.
-    - `each`: the arrays of the run, then those of its record, then the tangents of the constants
-      and arrays that `moving` selects.
+    - `arrays_of_bodies`: the arrays of the run, then those of its record, then the tangents of
+      the constants and arrays that `has_tangent` selects.
     """
-    method, chosen, run, record, along = _parts_of_recorded_run(
-        moving, method, trees, layout, constants, each
+    method, chosen, run, record, along = _unpack_recorded_run(
+        has_tangent, method, trees, layout, constants, arrays_of_bodies
     )
     rest = iter(along[len(chosen) :])
     smooth = adjoint.arrays_with_derivatives(run)
-    still = zip(smooth, moving[1], strict=False)
+    still = zip(smooth, has_tangent[1], strict=False)
     of_run = Smooth(*(next(rest) if moves else jnp.zeros_like(a) for a, moves in still))
 
     def again(chosen: Arrays, smooth: Smooth) -> Any:
@@ -259,24 +287,29 @@ def _tangents_of_states(
 
 
 def _cotangents_of_inputs(
-    moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
+    has_tangent: HasTangent,
+    method: Method,
+    trees: tuple[PyTreeDef, PyTreeDef],
+    layout: Layout,
+    constants: Arrays,
+    arrays_of_bodies: Arrays,
 ) -> Arrays:
     """Return the cotangents of the inputs of a run whose steps were recorded, in reverse mode.
 
     The inputs are the constants and the arrays of the run.
 
-    - `moving`: two lists of truth values: which constants, and which arrays of the run, get a
+    - `has_tangent`: two lists of truth values: which constants, and which arrays of the run, get a
       cotangent.
     - `method`: the explicit method of one body, with the field and the step control.
     - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
       progress meter.
     - `layout`: which arrays have a last axis of bodies.
     - `constants`: the arrays that the functions of the method hold.
-    - `each`: the arrays of the run, then those of its record, then two cotangents: that of the
-      states at the saved times, and that of the state at the end of the run.
+    - `arrays_of_bodies`: the arrays of the run, then those of its record, then two cotangents:
+      that of the states at the saved times, and that of the state at the end of the run.
     """
-    method, chosen, run, record, bars = _parts_of_recorded_run(
-        moving, method, trees, layout, constants, each
+    method, chosen, run, record, bars = _unpack_recorded_run(
+        has_tangent, method, trees, layout, constants, arrays_of_bodies
     )
-    total, of_run = adjoint.cotangents_of_run(method, chosen, run, record, bars, any(moving[1][:3]))
-    return [*total, *(a for a, moves in zip(of_run, moving[1], strict=False) if moves)]
+    total, of_run = adjoint.cotangents_of_run(method, chosen, run, record, bars, any(has_tangent[1][:3]))
+    return [*total, *(a for a, moves in zip(of_run, has_tangent[1], strict=False) if moves)]

@@ -18,7 +18,7 @@ from rigidjax.motion.equations import project_to_group
 from rigidjax.solve.adaptive_loop import LoopState, Method, Run
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.recorded_run import states_of_run
+from rigidjax.solve.recorded_run import run_with_replayed_derivatives
 from rigidjax.solve.step_control import NORM, StandardController, Stopping, Watched
 from rigidjax.solve.stops import trace_program
 
@@ -88,10 +88,10 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         program = trace_program(
             lambda t, y: way * ravel_pytree(terms.vf(t, tree(y), args))[0].astype(y.dtype), t0, y0
         )
-        constants, count, halt = program.constants, len(program.constants), None
+        constants, count, halt = program.jax_constants, len(program.jax_constants), None
         if event is not None:
             condition = trace_program(lambda t, y: event.cond_fn(t, tree(y), args, **how), t0, y0)
-            constants = constants + condition.constants
+            constants = constants + condition.jax_constants
             halt = lambda given, t, y: condition.call(given[count:], t, y)  # noqa: E731
         controlled_by = _nested_controllers(stepsize_controller)
         plain = all(isinstance(c, _WITHOUT_ARGS) for c in controlled_by)
@@ -127,10 +127,10 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         )  # fmt: skip
         # The condition and the controller, which can end a run, have no derivative.
         smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
-        ys, end = states_of_run(method, smooth, constants, state, run)
+        ys, end = run_with_replayed_derivatives(method, smooth, constants, state, run)
         if order is not None:
             ys = jnp.zeros_like(ys).at[order].set(ys)
-        final = _final_state(init_state, saveat, event, args, tree, run, asked, ys, end)
+        final = _final_diffeqsolve_state(init_state, saveat, event, args, tree, run, asked, ys, end)
         return final, {"next_step": end.end - end.t}
 
 
@@ -181,7 +181,13 @@ class _Control(NamedTuple):
         return jax.tree.map(jnp.asarray, (keep, t, following, (control, progress), result))
 
 
-def _can_be_replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: Any) -> bool:
+def _can_be_replayed(
+    solver: dfx.AbstractSolver,
+    saveat: dfx.SaveAt,
+    event: dfx.Event | None,
+    max_steps: int | None,
+    state: Any,
+) -> bool:
     """Return whether `ReplayAdjoint` itself can do a run; if not, its `otherwise` does the run.
 
     It can do a run of an explicit method of this package with a largest number of steps, on a state
@@ -202,7 +208,7 @@ def _can_be_replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state
     return plain and not any(sub.steps for sub in _sub_save_ats(saveat))
 
 
-def _sub_save_ats(saveat: Any) -> list[Any]:
+def _sub_save_ats(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
     """Return a list of the `diffrax.SubSaveAt`s of a `diffrax.SaveAt`.
 
     Each of them says at which times, and which function of the state, is saved.
@@ -211,12 +217,14 @@ def _sub_save_ats(saveat: Any) -> list[Any]:
     return [s for s in jax.tree.leaves(saveat.subs, is_leaf=is_sub) if is_sub(s)]
 
 
-def _nested_controllers(controller: Any) -> list[Any]:
+def _nested_controllers(
+    controller: dfx.AbstractStepSizeController,
+) -> list[dfx.AbstractStepSizeController]:
     """Return a list of a step controller and all the controllers inside it, the outermost first."""
-    found = []
-    while isinstance(controller, dfx.AbstractStepSizeController):
-        found.append(controller)
-        controller = getattr(controller, "controller", None)
+    found, inner = [], controller
+    while isinstance(inner, dfx.AbstractStepSizeController):
+        found.append(inner)
+        inner = getattr(inner, "controller", None)
     return found
 
 
@@ -240,9 +248,9 @@ def _times_where_steps_end(controllers: list[Any], t0: Array, t1: Array) -> Arra
     return jnp.concatenate([*jumps, t1[None]])
 
 
-def _final_state(
-    state: Any, saveat: Any, event: Any, args: Any, tree: Any, run: Run, asked: Array, ys: Array,
-    end: LoopState,
+def _final_diffeqsolve_state(
+    state: Any, saveat: dfx.SaveAt, event: dfx.Event | None, args: Any,
+    make_state: Callable[[Array], Any], run: Run, saved_times: Array, ys: Array, end: LoopState,
 ) -> Any:  # fmt: skip
     """Return the state of `diffrax.diffeqsolve` at the end of a run, with all that it saves.
 
@@ -250,9 +258,9 @@ def _final_state(
 
     - `state`: the state of `diffeqsolve` at the start.
     - `saveat`, `event`, `args`: the arguments of `diffeqsolve` with these names.
-    - `tree`: a function that makes a state of the motion from its n numbers.
+    - `make_state`: a function that makes a state of the motion from its n numbers.
     - `run`: the start of the run, and its stops: the times at which the field jumps, and the end.
-    - `asked`: (K,) s, the K saved times, those of all `diffrax.SubSaveAt`s joined.
+    - `saved_times`: (K,) s, the K saved times, those of all `diffrax.SubSaveAt`s joined.
     - `ys`: (K, n) the states, of n numbers each, at the saved times; NaN at times that the run did
       not reach.
     - `end`: the state of the loop at the end of the run.
@@ -260,7 +268,7 @@ def _final_state(
     t1 = run.stops[-1]
     # Before its first accepted step a run saves nothing, unless the run has no step because t1 is
     # not after t0.
-    reached = (asked <= end.t) & ((end.t > run.t0) | (t1 <= run.t0))
+    reached = (saved_times <= end.t) & ((end.t > run.t0) | (t1 <= run.t0))
     counts = [s.ts.shape[0] for s in _sub_save_ats(saveat) if s.ts is not None]
     parts = [jnp.split(a, np.cumsum(counts)[:-1]) for a in (reached, ys)]
     each = iter(zip(*parts, strict=True))
@@ -280,7 +288,7 @@ def _final_state(
             # At a saved time that the run did not reach, `sub.fn` is called with the state at the
             # start, for which it has a finite value; `masked` removes the result.
             states = jnp.where(there[:, None], states, run.y0)
-        out = jax.vmap(lambda t, y: sub.fn(t, tree(y), args))(ts, states)
+        out = jax.vmap(lambda t, y: sub.fn(t, make_state(y), args))(ts, states)
         if sub.ts is None:
             return dataclasses.replace(old, ts=ts, ys=out, save_index=jnp.asarray(len(ts)))
         masked = lambda a: jnp.where(there.reshape(-1, *[1] * (a.ndim - 1)), a, jnp.inf)  # noqa: E731
@@ -291,7 +299,7 @@ def _final_state(
     short = (end.result == dfx.RESULTS.successful) & (end.t < t1)
     control, progress = end.state
     new = dict(
-        y=tree(lax.stop_gradient(end.y)),
+        y=make_state(lax.stop_gradient(end.y)),
         tprev=end.t,
         tnext=end.end,
         controller_state=control,

@@ -42,11 +42,11 @@ from rigidjax.solve.momentum import (
 )
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.replay_adjoint import ReplayAdjoint
-from rigidjax.solve.sides import declared_jumps, on_sides
+from rigidjax.solve.sides import declared_jumps, evaluate_on_correct_sides
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.step_control import StandardController, Watched
 from rigidjax.solve.stops import trace_program
-from rigidjax.solve.switching import MOST, analysis_of
+from rigidjax.solve.switching import MOST, find_switches
 
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
@@ -84,7 +84,7 @@ class DiffraxRun(eqx.Module):
     cuts: Array | None = None  # more times at which a step ends, besides the jumps of the torque
 
     @property
-    def seeks_stops(self) -> bool:
+    def ends_steps_at_jumps(self) -> bool:
         """Return whether steps end at the times at which the torque jumps or switches.
 
         If so, the run uses the time s = σt, which increases along the run: σ is 1, or −1 in a run
@@ -97,8 +97,8 @@ class DiffraxRun(eqx.Module):
         return self.controller is None and not reads_field
 
     @property
-    def is_replayed(self) -> bool:
-        """Return whether the run keeps a record of its steps, which derivatives repeat.
+    def records_steps_for_derivatives(self) -> bool:
+        """Return whether the run records its steps, which derivatives then repeat.
 
         This is so for an explicit Runge–Kutta method of this package (an `AbstractExplicit`) under
         tolerances and a `ReplayAdjoint`, with a limit to the number of steps.
@@ -106,14 +106,14 @@ class DiffraxRun(eqx.Module):
         explicit = isinstance(self.solver, AbstractExplicit) and self.max_steps is not None
         return explicit and self.controller is None and isinstance(self.adjoint, ReplayAdjoint)
 
-    def step_controller(self) -> Any:
+    def step_controller(self) -> dfx.AbstractStepSizeController:
         """Return the step controller, which also ends a run that cannot continue."""
         control = self.controller
         if control is None:
             control = StandardController(self.rtol, self.atol, self.max_step)
         if isinstance(control, dfx.AbstractAdaptiveStepSizeController):
             control = Watched(control)
-        if self.cuts is not None and not self.seeks_stops:
+        if self.cuts is not None and not self.ends_steps_at_jumps:
             control = dfx.ClipStepSizeController(control, step_ts=jnp.sort(self.cuts))
         return control
 
@@ -150,7 +150,7 @@ def equations_of_motion(
     """
     if isinstance(state0, Coupled):
         return CoupledEquations(equations_of_motion(body, state0.motion, torque), body)
-    validation.require_fit(body, state0, torque)
+    validation.require_compatible_types(body, state0, torque)
     if isinstance(state0, Point):
         return scene_of_force(torque).field
     kind: Any = EulerEquations
@@ -161,7 +161,7 @@ def equations_of_motion(
     return kind(body, torque)
 
 
-def direction(times: Array) -> Int[Array, ""] | None:
+def direction_of_times(times: Array) -> Int[Array, ""] | None:
     """Return the direction of the `times` as an integer: 1 if they increase, −1 if they decrease.
 
     If the direction is known to be 1 before the run, the result is `None`.
@@ -174,9 +174,12 @@ def direction(times: Array) -> Int[Array, ""] | None:
     return jnp.asarray(jnp.sign(change), jnp.int32)
 
 
-def in_forward_time(
-    sign: Array | None, field: Callable[..., Any], condition: Any, ts: Array
-) -> tuple[Callable[..., Any], Any, Array, list[Array]]:
+def convert_to_forward_time(
+    sign: Array | None,
+    field: Callable[..., Any],
+    condition: Callable[..., Any] | None,
+    ts: Array,
+) -> tuple[Callable[..., Any], Callable[..., Any] | None, Array, list[Array]]:
     """Convert a run backwards in time to a run forwards in time, which uses the time s = σt.
 
     **Arguments:**
@@ -195,7 +198,9 @@ def in_forward_time(
     time = partial(_multiply_by_direction, sign)
 
     def directed(s: Array, y: Any, sides: Any = None) -> Any:
-        sided = on_sides(field, sign, None if sides is None else [time(side) for side in sides])
+        sided = evaluate_on_correct_sides(
+            field, sign, None if sides is None else [time(side) for side in sides]
+        )
         return jax.tree.map(time, sided(time(s), y, None))
 
     asked = None if condition is None else lambda s, y: condition(time(s), y)
@@ -252,9 +257,9 @@ def _integrate(
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
     state0 = state0 if form is None else form.replace_rate_by_momentum(ts[0], state0)
     along, jumps, dt0, sign, halt = ts, None, setup.dt0, None, watch
-    if setup.seeks_stops:
+    if setup.ends_steps_at_jumps:
         sign = setup.sign
-        field, halt, along, jumps = in_forward_time(sign, field, watch, ts)
+        field, halt, along, jumps = convert_to_forward_time(sign, field, watch, ts)
         if setup.cuts is not None:
             jumps = [*jumps, _multiply_by_direction(sign, setup.cuts)]
     elif dt0 is not None:
@@ -300,16 +305,16 @@ _NONFINITE_WORDS = (
 )
 
 
-def _shortest_step_words(dtype: Any) -> str:
+def _message_of_too_short_step(time_dtype: Any) -> str:
     """Return the message of the error for a run that wanted a step shorter than time resolves.
 
-    `dtype` is the dtype of the times, which sets the shortest step; the message names it.
+    `time_dtype` is the dtype of the times, which sets the shortest step; the message names it.
     """
-    gap = np.spacing(np.asarray(1e9, dtype))
+    gap = np.spacing(np.asarray(1e9, time_dtype))
     return (
         "simulate: no step is short enough: the minimum step size, some units of round-off of the "
-        f"time, was reached. Does the torque jump or grow without bound? In {np.dtype(dtype)} the "
-        f"times near 1e9 s are {gap:.2g} s apart: {_checks.advice_for_large_times(dtype)}"
+        f"time, was reached. Does the torque jump or grow without bound? In {np.dtype(time_dtype)} "
+        f"the times near 1e9 s are {gap:.2g} s apart: {_checks.advice_for_large_times(time_dtype)}"
     )
 
 
@@ -322,7 +327,7 @@ def raise_unless_complete(ys: Any, result: dfx.RESULTS, torque: Any = None) -> A
     if changing_inertia_of_torque(torque) is not None:
         ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
-    shortest = _shortest_step_words(jax.tree.leaves(ys)[0].dtype)
+    shortest = _message_of_too_short_step(jax.tree.leaves(ys)[0].dtype)
     for why, words in (
         (dfx.RESULTS.max_steps_reached, _MANY_STEPS),
         (NONFINITE, _NONFINITE_WORDS),
@@ -333,7 +338,9 @@ def raise_unless_complete(ys: Any, result: dfx.RESULTS, torque: Any = None) -> A
     return result.error_if(ys, ill)
 
 
-def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) -> None:
+def warn_of_missed_switches(
+    setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array, stats: dict[str, Any]
+) -> None:
     """Warn if a torque switches in time so often that steps do not end at all of its switches.
 
     `setup` holds the body and the torque of the run, `state0` is its state at the start, and `ts`
@@ -345,8 +352,12 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
     state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
     form = equations_by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
-    analysis = analysis_of(trace_program(lambda t, y: field(t, y, None), ts[0], state0).closed)
-    lines = [] if analysis is None else list(dict.fromkeys(s.line for s in analysis.switches))
+    analysis = find_switches(trace_program(lambda t, y: field(t, y, None), ts[0], state0).closed)
+    lines = (
+        []
+        if analysis is None
+        else list(dict.fromkeys(s.primitive_and_line for s in analysis.switches))
+    )
     warnings.warn(
         f"simulate: a law switches by the time more than {MOST} times ({'; '.join(lines)}): steps "
         "end at the first of these times, and the derivative with respect to the other times is "
@@ -357,7 +368,9 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
 
 
 @eqx.filter_jit
-def _end_of_run(setup: DiffraxRun, state0: Any, ts: Array) -> Any:
+def _rerun_and_return_end(
+    setup: DiffraxRun, state0: Any, ts: Array
+) -> tuple[Any, Any, Array, Array]:
     """Run a motion once more, and return the time and the state at which the run ended.
 
     `setup` holds the body, the torque and the solver; the run begins with the state `state0` and
@@ -373,7 +386,9 @@ def _end_of_run(setup: DiffraxRun, state0: Any, ts: Array) -> Any:
 _STUCK = 1e-2
 
 
-def words_of_steps(setup: Any, state0: Any, ts: Array, error: RuntimeError) -> RuntimeError:
+def explain_max_steps_error(
+    setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array, error: RuntimeError
+) -> RuntimeError:
     """Return the error of a failed run, with a better message if the run used up all its steps.
 
     The message then says which time was reached, and why. `setup` holds the body, the torque and
@@ -382,9 +397,11 @@ def words_of_steps(setup: Any, state0: Any, ts: Array, error: RuntimeError) -> R
     """
     if _MANY_STEPS not in str(error) or not isinstance(setup, DiffraxRun):
         return error
-    if not setup.is_replayed or not _checks.is_known((setup, state0, ts)):
+    if not setup.records_steps_for_derivatives or not _checks.is_known((setup, state0, ts)):
         return error
-    t, state, step, count = _end_of_run(dataclasses.replace(setup, throw=False), state0, ts)
+    t, state, step, count = _rerun_and_return_end(
+        dataclasses.replace(setup, throw=False), state0, ts
+    )
     begun, end, t = float(ts[0]), float(ts[-1]), float(t)
     gone, step = abs(t - begun), float(step)
     words = f"simulate: the maximum number of solver steps, {int(count)}, "
@@ -428,7 +445,7 @@ def _solve_in_closed_form(
     return ys, stats, dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
 
 
-def raise_if_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
+def raise_if_scene_ended_run(scene: Any, ys: Any, stats: dict[str, Any], ts: Array) -> Any:
     """Return the states of a particle's run; raise an error if its scene ended the run early.
 
     **Arguments:**

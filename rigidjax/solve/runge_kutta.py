@@ -59,7 +59,7 @@ class Weights(NamedTuple):
     plain: int  # the number of stages of a step without dense output
 
 
-def weights(tableau: Tableau, dtype: Any) -> Weights:
+def arrays_of_tableau(tableau: Tableau, dtype: Any) -> Weights:
     """Return the numbers of a Runge–Kutta method, its `tableau`, as arrays of the `dtype`."""
     c = np.array([0.0, *tableau.c, 1.0, *tableau.extra_c])
     rows = [{}, *tableau.a, tableau.b, *tableau.extra_a, *tableau.dense, *tableau.errors]
@@ -76,14 +76,14 @@ def weights(tableau: Tableau, dtype: Any) -> Weights:
     return Weights(a, b, nodes, jnp.asarray(c == 1.0), dense, errors, plain)
 
 
-def _weighted_sum(row: Array, slopes: Array) -> Array:
+def _weighted_sum_of_slopes(weights: Array, slopes: Array) -> Array:
     """Return the weighted sum Σ w_i k_i of the slopes of a step over its s stages i, (n, …).
 
-    `slopes` (n, s, …) are the slopes k_i = dy/dt, the n values of the field at each stage; `row`
-    holds the weights w_i. If there are fewer slopes than weights, the last weights are left out.
+    `slopes` (n, s, …) are the slopes k_i = dy/dt, the n values of the field at each stage;
+    `weights` are the w_i. If there are fewer slopes than weights, the last weights are left out.
     """
-    row = row[: slopes.shape[1]]
-    return jnp.sum(row.reshape(1, -1, *[1] * (slopes.ndim - 2)) * slopes, 1)
+    weights = weights[: slopes.shape[1]]
+    return jnp.sum(weights.reshape(1, -1, *[1] * (slopes.ndim - 2)) * slopes, 1)
 
 
 def stages(
@@ -102,7 +102,7 @@ def stages(
 
     The quaternion of the state at the end is not scaled to length 1.
     """
-    w = weights(tableau, step.y.dtype)
+    w = arrays_of_tableau(tableau, step.y.dtype)
     count = w.plain if dense is False else w.c.size
     number: Any = np.int32(count)
 
@@ -121,7 +121,7 @@ def stages(
     begun = (times, places, empty)
     times, places, slopes = lax.fori_loop(np.int32(0), number, stage, begun)
     h = add_leading_axes(step.h.astype(step.y.dtype), step.y)
-    return Stages(times, places, slopes, step.y + h * _weighted_sum(w.b, slopes), number)
+    return Stages(times, places, slopes, step.y + h * _weighted_sum_of_slopes(w.b, slopes), number)
 
 
 def _stage(
@@ -139,7 +139,7 @@ def _stage(
     A state has n numbers; `*bodies` is one last axis for the bodies of a batch, or no axis.
     """
     # The dtype of the time may differ from that of the state.
-    y = step.y + add_leading_axes(step.h.astype(step.y.dtype), step.y) * _weighted_sum(
+    y = step.y + add_leading_axes(step.h.astype(step.y.dtype), step.y) * _weighted_sum_of_slopes(
         w.a[i], slopes
     )
     t = jnp.where(w.last[i], step.end, step.t + w.c[i].astype(step.t.dtype) * step.h)
@@ -147,15 +147,18 @@ def _stage(
 
 
 def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
-    """Return the coefficients by which `nested` interpolates within a step of one body, (r, n).
+    """Return the coefficients of dense output within a step of one body, as rows (r, n).
 
-    These r rows F0, F1, … are for dense output, that is for the state of n numbers at any time
-    within the step. `tableau` holds the numbers of the method, `field` is the vector field
-    `(constants, t, y)`, which is called with no constants, and `step` holds the times, the length
-    and the state at the start. `slopes` (n, s) are the slopes at the stages of the step. The length
-    of the step is already multiplied into the rows.
+    Dense output is the state of n numbers at any time within the step; `change_within_step`
+    computes it from these r rows F0, F1, …. The length of the step is already multiplied into the
+    rows.
+
+    - `tableau`: the numbers of the method.
+    - `field`: the vector field `(constants, t, y)`, which is called with no constants.
+    - `step`: the times, the length and the state at the start of the step.
+    - `slopes`: (n, s) the slopes at the stages of the step.
     """
-    w = weights(tableau, slopes.dtype)
+    w = arrays_of_tableau(tableau, slopes.dtype)
     slopes = jnp.pad(slopes, ((0, 0), (0, w.c.size - w.plain)))
 
     def more(i: Array, slopes: Array) -> Array:
@@ -166,7 +169,7 @@ def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Arr
     return step.h.astype(slopes.dtype) * jnp.sum(w.dense[:, None] * slopes[None], 2)
 
 
-def nested(theta: Array, rows: Array) -> Array:
+def change_within_step(theta: Array, rows: Array) -> Array:
     """Return the change of the state since the start of a step, at a time within the step.
 
     It is θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))), where `theta` is θ, the part of the step
@@ -191,7 +194,7 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     dtype, ones = slopes.dtype, [1] * (slopes.ndim - 2)
     # All sums over stages are computed in one operation, because for one body each separate sum
     # would be a kernel of its own.
-    rows = weights(tableau, dtype).errors[:, : slopes.shape[1]]
+    rows = arrays_of_tableau(tableau, dtype).errors[:, : slopes.shape[1]]
     found = jnp.sum(rows.reshape(len(rows), 1, -1, *ones) * slopes[None], 2)
     found = add_leading_axes(h.astype(dtype), found) * found
     if len(rows) == 1:
@@ -206,8 +209,8 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
 
 
 def pull_back(
-    tableau: Tableau, field: Field, constants: Arrays, step: Step, there: Stages,
-    cotangent: Array, of_slopes: Array | None = None,
+    tableau: Tableau, field: Field, constants: Arrays, step: Step, step_stages: Stages,
+    cotangent: Array, cotangents_of_slopes: Array | None = None,
 ) -> tuple[Arrays, Array, Array, Array]:  # fmt: skip
     """Compute a step of a Runge–Kutta method in reverse mode: the cotangents of its inputs.
 
@@ -216,38 +219,41 @@ def pull_back(
     - `tableau`: the numbers of the method.
     - `field`: the vector field `(constants, t, y)`, and `constants` the list of its arrays.
     - `step`: the times, the length and the state (n, *bodies) at the start of the step.
-    - `there`: the s stages of the step.
+    - `step_stages`: the s stages of the step.
     - `cotangent`: (n, *bodies) the cotangent of the state at the end of the step.
-    - `of_slopes`: (n, s, *bodies) the cotangents of all slopes, or `None` if these are 0.
+    - `cotangents_of_slopes`: (n, s, *bodies) the cotangents of all slopes, or `None` if these are
+      0.
 
     **Returns** four cotangents: those of the constants, a list; of the time at the start of the
     step; of the length of the step; and of the state at the start.
     """
-    w, count = weights(tableau, step.y.dtype), there.slopes.shape[1]
+    w, count = arrays_of_tableau(tableau, step.y.dtype), step_stages.slopes.shape[1]
     h, put = step.h.astype(step.y.dtype), lax.dynamic_update_index_in_dim
 
     def stage(i: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
-        m = there.number - 1 - i
+        m = step_stages.number - 1 - i
         below, seeds = both
-        seed = w.b[m] * cotangent + _weighted_sum(w.a[:, m], below)
+        seed = w.b[m] * cotangent + _weighted_sum_of_slopes(w.a[:, m], below)
         bar = add_leading_axes(h, seed) * seed
-        if of_slopes is not None:
-            bar = bar + of_slopes[:, m]
-        pull = jax.vjp(lambda y: field(constants, there.times[m], y), there.places[:, m])[1]
+        if cotangents_of_slopes is not None:
+            bar = bar + cotangents_of_slopes[:, m]
+        pull = jax.vjp(
+            lambda y: field(constants, step_stages.times[m], y), step_stages.places[:, m]
+        )[1]
         return put(below, pull(bar)[0], m, 1), put(seeds, seed, m, 1)
 
-    none = jnp.zeros_like(there.slopes)
-    below, seeds = lax.fori_loop(np.int32(0), there.number, stage, (none, none))
+    none = jnp.zeros_like(step_stages.slopes)
+    below, seeds = lax.fori_loop(np.int32(0), step_stages.number, stage, (none, none))
     # The cotangents of the constants from different stages do not depend on each other, so that all
     # stages are transposed at once. Each stage gets a copy of the constants, and the cotangents of
     # the copies are summed at the end: otherwise XLA makes a kernel for each number.
     every = jax.vmap(lambda c, t, y: field(c, t, y), (0, 0, 1), 1)
     own = [jnp.broadcast_to(c, (count, *c.shape)) for c in constants]
-    pull = jax.vjp(lambda c, t: every(c, t, there.places), own, there.times)[1]
+    pull = jax.vjp(lambda c, t: every(c, t, step_stages.places), own, step_stages.times)[1]
     bars = add_leading_axes(h, seeds) * seeds
-    by_own, by_times = pull(bars if of_slopes is None else bars + of_slopes)
+    by_own, by_times = pull(bars if cotangents_of_slopes is None else bars + cotangents_of_slopes)
     by_constants = [jnp.sum(by, 0) for by in by_own]
-    by_length = jnp.sum(seeds * there.slopes, (0, 1)).astype(by_times.dtype)
+    by_length = jnp.sum(seeds * step_stages.slopes, (0, 1)).astype(by_times.dtype)
     c = w.c[:count].astype(by_times.dtype).reshape(-1, *[1] * (by_times.ndim - 1))
     by_length = by_length + jnp.sum(c * by_times, 0)
     return by_constants, jnp.sum(by_times, 0), by_length, cotangent + jnp.sum(below, 1)

@@ -57,9 +57,9 @@ class Sided(eqx.Module):
     def __call__(self, t: Any, *args: Any) -> Any:
         require_unbatched_torque(self.law)
         with jax.named_scope(DECLARED):
-            return self.law(self.seen(t), *args)
+            return self.law(self.time_on_correct_side(t), *args)
 
-    def seen(self, t: Any) -> Any:
+    def time_on_correct_side(self, t: Any) -> Any:
         """Return the time, s, with which the law is called at the time `t` of the run, s.
 
         It is `t`, or the nearest time on the correct side of a jump.
@@ -101,7 +101,7 @@ class Constant(eqx.Module):
         return self.law(self.time, *args)
 
 
-def with_constant_pieces(field: Any, time: Array) -> Any:
+def hold_piecewise_constant_laws_at(field: Any, time: Array) -> Any:
     """Return the field with each law of constant pieces (`Held`, `Pulses`) constant at its value at
     `time`, s.
 
@@ -136,15 +136,17 @@ def declared_jumps(field: Any) -> list[Array]:
     return [jumps for part in parts if (jumps := jnp.asarray(jump_times_of(part))).shape[0]]
 
 
-def on_sides(field: Any, sign: Any, sides: Any) -> Any:
+def evaluate_on_correct_sides(
+    field: Any, sign: Array | None, stop_times: list[Array] | None
+) -> Any:
     """Return a vector field in which each part is evaluated on the correct side of its jumps.
 
     Each part of `field` that declares jumps in time is wrapped in a `Sided` law. `sign` is the
-    direction of time: 1, −1 in a run backwards, or `None` for 1. `sides` is a list with one array
-    for each part that has jumps, in the order of `declared_jumps`: the times, s, at which steps end
-    for these jumps. `None` says that these times are equal to the jumps.
+    direction of time: 1, −1 in a run backwards, or `None` for 1. `stop_times` is a list with one
+    array for each part that has jumps, in the order of `declared_jumps`: the times, s, at which
+    steps end for these jumps. `None` says that these times are equal to the jumps.
     """
-    stops = iter(sides or ())
+    stops = iter(stop_times or ())
 
     def on_side(part: Any) -> Any:
         if not _declares_jumps(part):

@@ -23,14 +23,14 @@ from rigidjax.solve.projection import Projected
 from rigidjax.solve.run import (
     ClosedFormRun,
     DiffraxRun,
-    direction,
-    raise_if_ended,
+    direction_of_times,
+    explain_max_steps_error,
+    raise_if_scene_ended_run,
     raise_unless_complete,
     solve,
-    warn_of_missed,
-    words_of_steps,
+    warn_of_missed_switches,
 )
-from rigidjax.solve.solution import Solution, State, with_error
+from rigidjax.solve.solution import Solution, State, store_error_and_warn
 from rigidjax.solve.splitting import AbstractSplitting
 
 # A torque must accept the type of the state, so that type checkers refuse gravity on a `Spin`.
@@ -145,7 +145,7 @@ def simulate(
     True
     """
     max_steps = None if max_steps is None else _checks.integer(max_steps, "max_steps", 1)
-    body, state0, times = validation.checked_scene(body, state0, ts, torque, throw)
+    body, state0, times = validation.checked_body_state_and_times(body, state0, ts, torque, throw)
     given = rtol is not None or atol is not None
     if stepsize_controller is not None and (given or accuracy is not None):
         raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
@@ -166,17 +166,17 @@ def simulate(
         rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
         found = _solve_run(ClosedFormRun(body, throw), event, state0, times)
-        return found if accuracy is None else with_error(found, found.error, accuracy)
+        return found if accuracy is None else store_error_and_warn(found, found.error, accuracy)
     # The tolerances are arrays, so that another tolerance does not compile again.
     if stepsize_controller is None:
         rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
     setup = DiffraxRun(
         body, torque, _solver_of_run(solver, adjoint, event, max_steps), rtol, atol,
         stepsize_controller, None if dt0 is None else validation.checked_first_step(dt0, times),
-        max_step, adjoint, progress_meter or NO_METER, direction(times), max_steps, throw,
+        max_step, adjoint, progress_meter or NO_METER, direction_of_times(times), max_steps, throw,
     )  # fmt: skip
     setup = dataclasses.replace(setup, adjoint=_adjoint_of_run(setup))
-    sought = setup.is_replayed and progress_meter is None
+    sought = setup.records_steps_for_derivatives and progress_meter is None
     if accuracy is not None and not sought:
         raise ValueError(
             "simulate: an accuracy is for the closed form and the explicit methods of "
@@ -261,10 +261,16 @@ def _solve_to_accuracy(
     found = dataclasses.replace(found, throw=setup.throw)
     sol = _solve_run(found, event, state0, times, None if event is not None else run)
     error = estimate_error_of_run(found, times, sol._states, sol.stats["num_steps"], search)
-    return with_error(sol, error, accuracy)
+    return store_error_and_warn(sol, error, accuracy)
 
 
-def _solve_run(setup: Any, event: Any, state0: Any, times: Array, run: Any = None) -> Solution:
+def _solve_run(
+    setup: ClosedFormRun | DiffraxRun,
+    event: Event | Callable[..., Any] | None,
+    state0: Any,
+    times: Array,
+    solved_run: tuple[Any, dict[str, Any], dfx.RESULTS] | None = None,
+) -> Solution:
     """Solve a run, and return it as a `Solution`.
 
     **Arguments:**
@@ -274,12 +280,12 @@ def _solve_run(setup: Any, event: Any, state0: Any, times: Array, run: Any = Non
       of one, or `None`.
     - `state0`: the state at the time `times[0]`.
     - `times`: (T,) s, the times at which states are saved.
-    - `run`: what `solve` returned for this run, if it is already known; else `None`.
+    - `solved_run`: what `solve` returned for this run, if it is already known; else `None`.
     """
     event_time = event_state = None
     try:
-        if run is not None:
-            ys, stats, result = run
+        if solved_run is not None:
+            ys, stats, result = solved_run
             ys = raise_unless_complete(ys, result, setup.torque) if setup.throw else ys
         elif event is None:
             ys, stats, result = solve(setup, state0, times)
@@ -292,12 +298,12 @@ def _solve_run(setup: Any, event: Any, state0: Any, times: Array, run: Any = Non
                 setup, event, state0, times
             )
     except RuntimeError as error:
-        raise words_of_steps(
+        raise explain_max_steps_error(
             setup, state0, times, _checks.error_without_equinox_text(error)
         ) from None
-    warn_of_missed(setup, state0, times, stats)
+    warn_of_missed_switches(setup, state0, times, stats)
     if setup.throw and "ended" in stats:
-        ys = raise_if_ended(setup.torque, ys, stats, times)
+        ys = raise_if_scene_ended_run(setup.torque, ys, stats, times)
     motion, own = (ys.motion, ys.own) if isinstance(ys, Coupled) else (ys, None)
     # The set-up is split into its arrays and the rest, so that `jax.jit` and `jax.vmap` can return
     # it.

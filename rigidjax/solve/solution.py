@@ -90,7 +90,7 @@ class Solution(eqx.Module, Generic[State]):
         """
         if "drift" in self.stats:
             return self.stats["drift"]
-        return _drift(self._setup, self.ts, self._states)
+        return _drift_of_conserved_quantities(self._setup, self.ts, self._states)
 
     @property
     def growth(self) -> Float[Array, " times"]:
@@ -107,7 +107,7 @@ class Solution(eqx.Module, Generic[State]):
         Source: the largest finite-time Lyapunov exponent is the logarithm of the growth over t
         (Eckmann and Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
-        found = _growth(self._setup, self.ts, self._states)
+        found = _growth_of_small_errors(self._setup, self.ts, self._states)
         rtol = None
         if isinstance(self._setup, DiffraxRun):
             rtol = getattr(self._setup.step_controller(), "rtol", None)
@@ -148,7 +148,7 @@ class Solution(eqx.Module, Generic[State]):
         if self._error is not None:
             return self._error
         found = estimate_error_of_run(self._setup, self.ts, self._states, self.stats["num_steps"])
-        _warn_of_error(found, 0.5, "error: nothing is known of the states")
+        _warn_if_error_exceeds(found, 0.5, "error: nothing is known of the states")
         return found
 
     def transition_matrix(self) -> Float[Array, "times n n"]:
@@ -185,7 +185,7 @@ class Solution(eqx.Module, Generic[State]):
         return motion_of(jax.tree.map(lambda leaf: leaf[-1], ys))
 
     @property
-    def _setup(self) -> Any:
+    def _setup(self) -> ClosedFormRun | DiffraxRun:
         """Return the set-up of the run: the body, the torque, the solver and its tolerances."""
         return eqx.combine(self._arrays, self._rest)
 
@@ -198,38 +198,40 @@ class Solution(eqx.Module, Generic[State]):
         return self.ys if self.own is None else Coupled(self.ys, self.own)
 
 
-def with_error(sol: Solution, error: Error, accuracy: Any) -> Solution:
+def store_error_and_warn(sol: Solution, error: Error, accuracy: Any) -> Solution:
     """Return a solution that stores its known error; warn if the error exceeds the accuracy.
 
     `accuracy` is the error that the user allows, rad for rotations, else relative.
     """
-    _warn_of_error(error, accuracy, "simulate: the accuracy cannot be had")
+    _warn_if_error_exceeds(error, accuracy, "simulate: the accuracy cannot be had")
     return dataclasses.replace(sol, _error=error)
 
 
-def _warn_of_error(error: Error, most: Any, words: str) -> None:
+def _warn_if_error_exceeds(error: Error, limit: Any, message_start: str) -> None:
     """Warn if the error of a run exceeds a limit, and name the first time at which it does.
 
-    `most` is the limit: rad for rotations, and for any other array of the state a part of its
-    largest length in the run. `words` is the beginning of the message.
+    `limit` is the largest allowed error: rad for rotations, and for any other array of the state a
+    part of its largest length in the run. `message_start` is the beginning of the message.
     """
-    if not _checks.is_known((error, most)) or not np.any(np.asarray(error.relative) > most):
+    if not _checks.is_known((error, limit)) or not np.any(np.asarray(error.relative) > limit):
         return
-    i = int(np.argmax(np.asarray(error.relative) > most))
+    i = int(np.argmax(np.asarray(error.relative) > limit))
     steps, off = (
         max(float(part[name][i] / error.sizes[name]) for name in part)
         for part in (error.steps, error.round_off)
     )
     single = "" if error.ts.dtype == jnp.float64 else ", or take float64"
     warnings.warn(
-        f"{words} from t = {float(error.ts[i]):g} s on: the steps leave {steps:.1e}, round-off "
-        f"{off:.1e} (rad, or relative); end the run earlier{single}",
+        f"{message_start} from t = {float(error.ts[i]):g} s on: the steps leave {steps:.1e}, "
+        f"round-off {off:.1e} (rad, or relative); end the run earlier{single}",
         stacklevel=5,
     )
 
 
 @eqx.filter_jit
-def _drift(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> dict[str, Array]:
+def _drift_of_conserved_quantities(
+    setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any
+) -> dict[str, Array]:
     """Return the relative drift of each quantity that the motion conserves, by its name.
 
     The drift is the largest distance of the quantity, such as the energy of a free body, from its
@@ -252,7 +254,7 @@ def _transition_matrix(
     of them at the start.
     """
     # The run must not raise an error, and it must be differentiable in forward mode.
-    plain = isinstance(setup, DiffraxRun) and not setup.is_replayed
+    plain = isinstance(setup, DiffraxRun) and not setup.records_steps_for_derivatives
     more = dict(adjoint=dfx.ForwardMode()) if plain else {}
     setup = dataclasses.replace(setup, throw=False, **more)
     start = jax.tree.map(lambda leaf: leaf[0], ys)
@@ -264,7 +266,9 @@ def _transition_matrix(
 
 
 @eqx.filter_jit
-def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, " times"]:
+def _growth_of_small_errors(
+    setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any
+) -> Float[Array, " times"]:
     """Return by which factor a small error at the start can have grown at each saved time, (T,).
 
     The factor is the largest singular value of ∂y(t)/∂y(t₀), where t₀ is the start and each array

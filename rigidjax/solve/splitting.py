@@ -100,7 +100,7 @@ SRKN11 = _symmetric_composition(
 )
 
 
-class Frame(NamedTuple):
+class PrincipalFrame(NamedTuple):
     """Hold the principal axes of a body, and the inertia and its inverse along these axes.
 
     In both matrices the off-diagonal entries are zero, but they have tangents that are not zero.
@@ -111,7 +111,7 @@ class Frame(NamedTuple):
     axes: Array  # (3, 3), the axes as columns
 
 
-def frame_of_tensor(tensor: Array) -> Frame:
+def principal_frame_of_tensor(tensor: Array) -> PrincipalFrame:
     """Return the principal axes of a body, with its inertia and the inverse along these axes.
 
     `tensor` (3, 3) is the inertia in body axes, kg m².
@@ -122,11 +122,11 @@ def frame_of_tensor(tensor: Array) -> Frame:
     size = six[0] + six[1] + six[2]
     unit: SymmetricEntries = tuple(i / size for i in six)
     scale = determinant(unit)
-    return Frame(six, tuple(c / scale / size for c in adjugate(unit)), axes)
+    return PrincipalFrame(six, tuple(c / scale / size for c in adjugate(unit)), axes)
 
 
 @jax.custom_jvp
-def rate_of(inverse: SymmetricEntries, momentum: Triple) -> Triple:
+def body_rate_along_axes(inverse: SymmetricEntries, momentum: Triple) -> Triple:
     """Return the body rate Ω = I⁻¹Π along the principal axes, three numbers, rad/s.
 
     `momentum` is Π along these axes, three numbers, N m s. `inverse` has the six entries (11, 22,
@@ -136,10 +136,10 @@ def rate_of(inverse: SymmetricEntries, momentum: Triple) -> Triple:
     return inverse[0] * momentum[0], inverse[1] * momentum[1], inverse[2] * momentum[2]
 
 
-@rate_of.defjvp
-def rate_of_jvp(primals, tangents):
+@body_rate_along_axes.defjvp
+def body_rate_along_axes_jvp(primals, tangents):
     (weights, p), (dw, dp) = primals, tangents
-    return rate_of(weights, p), add(rate_of(weights, dp), matvec(dw, p))
+    return body_rate_along_axes(weights, p), add(body_rate_along_axes(weights, dp), matvec(dw, p))
 
 
 class AbstractSplitting(dfx.AbstractSolver):
@@ -162,8 +162,8 @@ class AbstractSplitting(dfx.AbstractSolver):
         t1: RealLike,
         y0: PyTree,
         args: PyTree,
-    ) -> Frame:
-        return frame_of(field_and_direction(terms)[0], y0)
+    ) -> PrincipalFrame:
+        return principal_frame_of_field(field_and_direction(terms)[0], y0)
 
     def step(
         self,
@@ -172,16 +172,18 @@ class AbstractSplitting(dfx.AbstractSolver):
         t1: RealLike,
         y0: PyTree,
         args: PyTree,
-        solver_state: Frame,
+        solver_state: PrincipalFrame,
         made_jump: Bool[ArrayLike, ""],
     ) -> Any:
         field, way = field_and_direction(terms)
-        state, h = (y0.q, enter(solver_state, y0.omega)), jnp.asarray(t1 - t0) * way
-        dq, dp = compose(self.composition, field, solver_state, jnp.asarray(t0) * way, h, state)
+        state, h = (y0.q, momentum_along_axes(solver_state, y0.omega)), jnp.asarray(t1 - t0) * way
+        dq, dp = change_in_splitting_step(
+            self.composition, field, solver_state, jnp.asarray(t0) * way, h, state
+        )
         # Only the change of the momentum is converted to a change of the body rate Ω. To convert
         # the momentum itself would give I⁻¹(IΩ), which differs from Ω by a rounding error that is
         # the same in each step and would add up.
-        omega = y0.omega + leave(solver_state, dp)
+        omega = y0.omega + body_rate_in_body_axes(solver_state, dp)
         y1 = Attitude(quaternion.normalise(y0.q + dq), omega)
         dense = dict(y0=y0, coefficients=_quintic_coefficients(terms, t0, t1, args, y0, y1))
         return y1, None, dense, solver_state, dfx.RESULTS.successful
@@ -242,7 +244,7 @@ class Splitting6(AbstractSplitting):
     composition: ClassVar[Composition] = SRKN11
 
 
-def frame_of(field: Any, y0: Any) -> Frame:
+def principal_frame_of_field(field: Any, y0: Any) -> PrincipalFrame:
     """Return the principal axes of the body of a vector field, with the inertia along them.
 
     `field` are the equations of an attitude, and `y0` is the `Attitude` at the start, whose dtype
@@ -257,10 +259,10 @@ def frame_of(field: Any, y0: Any) -> Frame:
             "flywheel), or does not say that it does not; only time and attitude may enter a kick: "
             "a law of your own says so by rate_free = True; for others use DormandPrince8"
         )
-    return frame_of_tensor(field.euler.inertia.tensor.astype(y0.omega.dtype))
+    return principal_frame_of_tensor(field.euler.inertia.tensor.astype(y0.omega.dtype))
 
 
-def enter(frame: Frame, omega: Array) -> Triple:
+def momentum_along_axes(frame: PrincipalFrame, omega: Array) -> Triple:
     """Return the momentum Π = IΩ along the principal axes, three numbers, N m s.
 
     `frame` holds the principal axes and the inertia I along them; `omega` (3,) is the body rate Ω
@@ -269,17 +271,22 @@ def enter(frame: Frame, omega: Array) -> Triple:
     return matvec(frame.moments, components_along(frame.axes, omega))
 
 
-def leave(frame: Frame, momentum: Triple) -> Array:
+def body_rate_in_body_axes(frame: PrincipalFrame, momentum: Triple) -> Array:
     """Return the body rate Ω = I⁻¹Π in body axes (3,), rad/s.
 
     `frame` holds the principal axes and the inverse inertia I⁻¹ along them; `momentum` is Π along
     the principal axes, three numbers, N m s.
     """
-    return jnp.stack(combine_columns(frame.axes, rate_of(frame.weights, momentum)))
+    return jnp.stack(combine_columns(frame.axes, body_rate_along_axes(frame.weights, momentum)))
 
 
-def compose(
-    composition: Composition, field: AttitudeEquations, frame: Frame, t: Any, h: Any, state: Any
+def change_in_splitting_step(
+    composition: Composition,
+    field: AttitudeEquations,
+    frame: PrincipalFrame,
+    t: Any,
+    h: Any,
+    state: Any,
 ) -> tuple[Array, Triple]:
     """Take one step of a splitting method: exact free motions and kicks by the torque in turn.
 
@@ -354,7 +361,7 @@ def _quintic_coefficients(
     - `y0`, `y1`: the states at the start and at the end of the step.
 
     **Returns** a tree like the state, whose arrays (5, …) have the five coefficients in the form
-    that `runge_kutta.nested`, which evaluates the polynomial, takes.
+    that `runge_kutta.change_within_step`, which evaluates the polynomial, takes.
     """
     way, length = direction_and_length_of_step(terms, t0, t1)
     h = way * length

@@ -26,9 +26,9 @@ from rigidjax.solve.adaptive_loop import (
 NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
 
 
-def _attribute_of_controller(name: str) -> Any:
-    """Define a property that reads the attribute `name` of the step controller that is wrapped."""
-    return property(lambda self: getattr(self.controller, name))
+def _make_property_of_controller(attribute: str) -> Any:
+    """Define a property that reads an `attribute`, by its name, of the step controller inside."""
+    return property(lambda self: getattr(self.controller, attribute))
 
 
 class StandardController(dfx.AbstractAdaptiveStepSizeController):
@@ -124,9 +124,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     def __init__(self, controller: dfx.AbstractStepSizeController):
         self.controller = controller
 
-    rtol = _attribute_of_controller("rtol")
-    atol = _attribute_of_controller("atol")
-    norm = _attribute_of_controller("norm")
+    rtol = _make_property_of_controller("rtol")
+    atol = _make_property_of_controller("atol")
+    norm = _make_property_of_controller("norm")
 
     def wrap(self, direction: PyTree) -> "Watched":
         return Watched(self.controller.wrap(direction))
@@ -165,7 +165,7 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         # `least`, the round-off of the length of the run.
         least = jnp.finfo(begin.dtype).eps * jnp.abs(end - begin)
         # Steps of length 0 would be accepted without end, but a step of length NaN ends the run.
-        shortest = begin + self._shortest_step(begin, least)
+        shortest = begin + self._shortest_resolvable_step(begin, least)
         first = jnp.where(sound, jnp.maximum(first, shortest), jnp.nan)
         return first.astype(begin.dtype), (inner, least)
 
@@ -185,12 +185,13 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         size, rate = (jnp.asarray(self.norm(of_state(a / scale))) for a in both)
         return starting_step(size, rate, order)
 
-    def _shortest_step(self, t: ArrayLike, least: ArrayLike) -> Array:
+    def _shortest_resolvable_step(self, t: ArrayLike, smallest_time: ArrayLike) -> Array:
         """Return the length of the shortest step that the resolution of the time allows, s.
 
-        It is 8 units of round-off of the time `t`, s, or of `least` if |t| is smaller than `least`.
+        It is 8 units of round-off of the time `t`, s, or of `smallest_time`, s, if |t| is smaller
+        than this.
         """
-        return 8 * jnp.finfo(jnp.result_type(t)).eps * jnp.maximum(jnp.abs(t), least)
+        return 8 * jnp.finfo(jnp.result_type(t)).eps * jnp.maximum(jnp.abs(t), smallest_time)
 
     def adapt_step_size(
         self,
@@ -207,7 +208,7 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
-        unit = self._shortest_step(left, least)
+        unit = self._shortest_resolvable_step(left, least)
         stuck = ~keep & ~(right - left > unit)
         # If even the shortest possible step has NaN, a still shorter step might have none. The
         # reason given is then that no step is short enough.
@@ -243,9 +244,9 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         still = lax.stop_gradient(stops)
         self.following = jnp.searchsorted(still, still, side="right").astype(jnp.int32)
 
-    rtol = _attribute_of_controller("rtol")
-    atol = _attribute_of_controller("atol")
-    norm = _attribute_of_controller("norm")
+    rtol = _make_property_of_controller("rtol")
+    atol = _make_property_of_controller("atol")
+    norm = _make_property_of_controller("norm")
 
     def wrap(self, direction: PyTree) -> "Stopping":
         way = jnp.asarray(direction).astype(self.stops.dtype)
@@ -265,21 +266,21 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
     ) -> tuple[Any, Any]:
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         index = jnp.sum(self.stops <= t0, dtype=jnp.int32)
-        return jnp.minimum(first, self._stop_and_moment_before(index)[1]), (
+        return jnp.minimum(first, self._stop_and_last_time_before(index)[1]), (
             inner,
             first - t0,
             index,
         )
 
-    def _stop_and_moment_before(self, index: Any) -> tuple[Any, Any]:
-        """Return the time of the stop number `index`, and the last floating-point time before it.
+    def _stop_and_last_time_before(self, stop_index: Array) -> tuple[Array, Array]:
+        """Return the time of a stop, s, and the last floating-point time before it, s.
 
-        A stop is a time at which steps end because the field jumps. The last floating-point number
-        before a stop is the time at which the step before the stop ends. If `index` is beyond the
-        last stop, both times are infinite.
+        A stop is a time at which steps end because the field jumps; `stop_index` is its index. The
+        step before the stop ends at the last floating-point number before the stop. If the index is
+        beyond the last stop, both times are infinite.
         """
         none = jnp.full_like(self.stops[:1], jnp.inf)
-        stop = row_of_each_body(jnp.concatenate([self.stops, none]), index)
+        stop = row_of_each_body(jnp.concatenate([self.stops, none]), stop_index)
         still = lax.stop_gradient(stop)
         gap = jnp.where(jnp.isinf(still), 0, previous_float(still) - still)
         return stop, stop + gap
@@ -299,11 +300,11 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
-        stop, end = self._stop_and_moment_before(index)
+        stop, end = self._stop_and_last_time_before(index)
         reached = keep & (t1 >= end)
         length = lax.stop_gradient(right - left)
         length = jnp.where(reached, jnp.maximum(length, kept), length)
         left = jnp.where(reached, stop, left)
         index = jnp.where(reached, row_of_each_body(self.following, index), index)
-        right = jnp.minimum(left + length, self._stop_and_moment_before(index)[1])
+        right = jnp.minimum(left + length, self._stop_and_last_time_before(index)[1])
         return keep, left, right, jumped | reached, (inner, length, index), result

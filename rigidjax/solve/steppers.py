@@ -49,9 +49,9 @@ class Stepper(NamedTuple):
     body rate. `inputs` are the values of the torque's inputs during the step, or `None`.
     """
 
-    start: Any  # the numbers y at the start, which stand for the state there
+    initial_numbers: Any  # the numbers y at the start, which stand for the state there
     change: Callable[[Any, Any, Any, Any, Any], Any]  # (t, end, h, y, inputs of the law or None)
-    state: Callable[[Any], Any]  # the state that the numbers y stand for
+    state_of_numbers: Callable[[Any], Any]  # the state that the numbers y stand for
     delays: tuple[tuple[str, Array], ...] = ()  # name and delay, s, of each delayed input
 
     def step(self, t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:
@@ -70,9 +70,9 @@ class Carrying(NamedTuple):
     of: Stepper
 
     @property
-    def start(self) -> Any:
+    def initial_numbers(self) -> tuple[Any, Any]:
         """Return the numbers of the state at the start, and their rounding errors, which are 0."""
-        return self.of.start, jax.tree.map(jnp.zeros_like, self.of.start)
+        return self.of.initial_numbers, jax.tree.map(jnp.zeros_like, self.of.initial_numbers)
 
     @property
     def delays(self) -> tuple[tuple[str, Array], ...]:
@@ -85,9 +85,12 @@ class Carrying(NamedTuple):
         lost = jax.tree.map(lambda d, a, b: d - (b - a), change, y, after)
         return after, lax.stop_gradient(lost)
 
-    def state(self, y: Any) -> Any:
-        """Return the state for `y`, a pair of its numbers and of their rounding errors."""
-        return self.of.state(y[0])
+    def state_of_numbers(self, numbers_and_errors: tuple[Any, Any]) -> Any:
+        """Return the state that its numbers stand for; their rounding errors are left out.
+
+        `numbers_and_errors` is a pair of the numbers and of their rounding errors.
+        """
+        return self.of.state_of_numbers(numbers_and_errors[0])
 
 
 AnyStepper = Stepper | Carrying
@@ -104,11 +107,11 @@ def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) 
     - `count`: the number of steps. If it is at least 10 000 or is traced, the stepper is a
       `Carrying`, which also carries the rounding errors of the sums along.
     """
-    stepper = _stepper_of(solver, field, y0)._replace(delays=tuple(delays_of(field)))
+    stepper = _stepper_without_delays(solver, field, y0)._replace(delays=tuple(delays_of(field)))
     return Carrying(stepper) if not isinstance(count, int) or count >= _MANY else stepper
 
 
-def cheapest(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
+def cheapest_method_of_order_4(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
     """Return the method of order 4 that takes the least work for a vector field.
 
     It is `Magnus4` for the attitude of a body whose torque does not read the attitude, else
@@ -119,7 +122,7 @@ def cheapest(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
     return Magnus4() if blind else RungeKutta4()
 
 
-def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
+def _stepper_without_delays(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
     """Return the object that takes fixed steps of a vector field by a method, without delays.
 
     The caller adds the inputs of the torque that are delayed. `solver` is a method of
@@ -128,7 +131,7 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
     fixed steps of this field.
     """
     turning = _inertia_and_torque(field, y0)
-    solver = cheapest(field) if solver is None else solver
+    solver = cheapest_method_of_order_4(field) if solver is None else solver
     if isinstance(solver, Magnus4) and isinstance(y0, Attitude) and turning is not None:
         require_independent_of_attitude(turning.torque)
         return (
@@ -152,7 +155,7 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
         return lambda t, y: split_into_scalars(bind(field, inputs)(t, join_scalars(y, y0), None))
 
     start = split_into_scalars(y0)
-    return _stepper_of_slope(solver, slope_under, start, lambda y: join_scalars(y, y0), y0)
+    return _stepper_of_slope_function(solver, slope_under, start, lambda y: join_scalars(y, y0), y0)
 
 
 class _InertiaAndTorque(NamedTuple):
@@ -192,17 +195,17 @@ def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
     when the inertia changes, its entries off the diagonal, which are zero, have tangents that are
     not zero.
     """
-    frame = splitting.frame_of_tensor(body.tensor)
+    frame = splitting.principal_frame_of_tensor(body.tensor)
     weights, axes = frame.weights, frame.axes
     a, b, c, *_ = lax.stop_gradient(weights)
     gaps = (c - b, a - c, b - a)
-    momentum = splitting.enter(frame, state0.omega)
+    momentum = splitting.momentum_along_axes(frame, state0.omega)
     one, none = jnp.ones_like(a), jnp.zeros_like(a)
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         slope = lambda _, p: _free_momentum_derivative(weights, gaps, p)  # noqa: E731
         dp, turn = momentum_change_and_turn(
-            slope, partial(splitting.rate_of, weights), t, end, h, y[4:]
+            slope, partial(splitting.body_rate_along_axes, weights), t, end, h, y[4:]
         )
         return (*quaternion_product(y[:4], turn), *dp)
 
@@ -211,30 +214,30 @@ def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
         # axes; `combine_columns` gives the vector in body axes.
         turn = jnp.stack([y[0], *combine_columns(axes, y[1:4])])
         q = quaternion.normalise(quaternion.multiply(state0.q, turn))
-        return Attitude(q, splitting.leave(frame, y[4:]))
+        return Attitude(q, splitting.body_rate_in_body_axes(frame, y[4:]))
 
     return Stepper((one, none, none, none, *momentum), change, state)
 
 
 @jax.custom_jvp
 def _free_momentum_derivative(
-    inverse: SymmetricEntries, differences: Triple, momentum: Triple
+    inverse: SymmetricEntries, inverse_differences: Triple, momentum: Triple
 ) -> Triple:
     """Return the time derivative of the momentum of a free body, dΠ/dt = Π × Ω, N m.
 
     `momentum` is the angular momentum Π, three numbers along the principal axes, N m s; Ω is the
     body rate. `inverse` has the six entries (11, 22, 33, 12, 13, 23) of the inverse of the inertia
-    along these axes, 1/(kg m²). `differences` (c − b, a − c, b − a) are the differences of its
-    first three entries a, b and c.
+    along these axes, 1/(kg m²). `inverse_differences` (c − b, a − c, b − a) are the
+    differences of its first three entries a, b and c.
     """
-    d, p = differences, momentum
+    d, p = inverse_differences, momentum
     return d[0] * (p[1] * p[2]), d[1] * (p[2] * p[0]), d[2] * (p[0] * p[1])
 
 
 @_free_momentum_derivative.defjvp
 def _free_momentum_derivative_jvp(primals, tangents):
     (weights, gaps, p), (dw, _, dp) = primals, tangents
-    rate, turning = splitting.rate_of_jvp((weights, p), (dw, dp))
+    rate, turning = splitting.body_rate_along_axes_jvp((weights, p), (dw, dp))
     return _free_momentum_derivative(weights, gaps, p), add(cross(dp, rate), cross(p, turning))
 
 
@@ -292,7 +295,7 @@ def _stepper_of_explicit_method(
     start = split_into_scalars(state0)
     many = len(start) - 3
 
-    def slope_under(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
+    def slope_for_inputs(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
         law = bind(torque, inputs)
 
         def slope(t: Any, y: Atoms) -> Atoms:
@@ -312,50 +315,54 @@ def _stepper_of_explicit_method(
         return join_scalars((*y[:many], *matvec(weights, y[many:])), state0)
 
     momentum = matvec(_entries_of_symmetric_matrix(body.tensor), start[many:])
-    return _stepper_of_slope(solver, slope_under, (*start[:many], *momentum), state, state0)
+    return _stepper_of_slope_function(
+        solver, slope_for_inputs, (*start[:many], *momentum), state, state0
+    )
 
 
-def _stepper_of_slope(
+def _stepper_of_slope_function(
     solver: AbstractExplicit | StepWithLoopedStages,
-    slope_under: Callable[[Any], Callable[[Any, Atoms], Atoms]],
-    start: Atoms,
-    state: Callable[[Atoms], Any],
-    like: Any,
+    slope_for_inputs: Callable[[Any], Callable[[Any, Atoms], Atoms]],
+    initial_numbers: Atoms,
+    state_of_numbers: Callable[[Atoms], Any],
+    example_state: Any,
 ) -> Stepper:
     """Return the object that takes fixed steps of an explicit method, for a slope dy/dt.
 
     **Arguments:**
 
     - `solver`: the Runge–Kutta method.
-    - `slope_under`: a function: `slope_under(inputs)` returns, for the values of the inputs that
-      the torque reads in this step, the function of `(t, y)` that gives dy/dt.
-    - `start`: the numbers y at the start, a tuple of scalars that stand for the state.
-    - `state`: a function that returns the state for the numbers y.
-    - `like`: a state with the structure, shapes and dtypes of the state for which the numbers y
-      stand one by one. By it the quaternion among these numbers is found and scaled to length 1.
+    - `slope_for_inputs`: a function: `slope_for_inputs(inputs)` returns, for the values of the
+      inputs that the torque reads in this step, the function of `(t, y)` that gives dy/dt.
+    - `initial_numbers`: the numbers y at the start, a tuple of scalars that stand for the state.
+    - `state_of_numbers`: a function that returns the state for the numbers y.
+    - `example_state`: a state with the structure, shapes and dtypes of the state for which the
+      numbers y stand one by one. By it the quaternion among these numbers is found and scaled to
+      length 1.
     """
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         return _change_to_unit_length(
-            y, change_in_step(solver, slope_under(inputs), t, h, y, end), like
+            y, change_in_step(solver, slope_for_inputs(inputs), t, h, y, end), example_state
         )
 
-    return Stepper(start, change, state)
+    return Stepper(initial_numbers, change, state_of_numbers)
 
 
-def _change_to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
+def _change_to_unit_length(y: Atoms, change: Atoms, example_state: Any) -> Atoms:
     """Return the change of a state in a step, after which the quaternion has the length 1.
 
     `y` are the numbers of the state before the step, a tuple of scalars, and `change` the changes
-    of these numbers, of which those of the quaternion are corrected. `like` is a state whose
-    arrays the numbers form, in order. If it has no quaternion, `change` is returned as it is.
+    of these numbers, of which those of the quaternion are corrected. `example_state` is a state
+    whose arrays the numbers form, in order. If it has no quaternion, `change` is returned as it is.
     """
-    if not isinstance(motion_of(like), HasAttitude):
+    if not isinstance(motion_of(example_state), HasAttitude):
         return change
     # Without the barrier each part of the quaternion computes the whole change again.
     change = barrier(change)
     after, moved = (
-        motion_of(join_scalars(part, like)).q for part in (jax.tree.map(jnp.add, y, change), change)
+        motion_of(join_scalars(part, example_state)).q
+        for part in (jax.tree.map(jnp.add, y, change), change)
     )
     after, moved = components(after), components(moved)
     # A rounding error of the excess |q|² − 1 only changes the length of q and does not turn the
@@ -367,7 +374,7 @@ def _change_to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
     # steps bring the length back to 1.
     less = barrier(excess * (0.5 - excess * (0.375 - 0.3125 * excess)))
     q = jnp.stack([d - less * a for d, a in zip(moved, after, strict=True)])
-    return split_into_scalars(eqx.tree_at(lambda s: motion_of(s).q, join_scalars(change, like), q))
+    return split_into_scalars(eqx.tree_at(lambda s: motion_of(s).q, join_scalars(change, example_state), q))
 
 
 def _stepper_of_splitting(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
@@ -380,12 +387,14 @@ def _stepper_of_splitting(solver: AbstractSplitting, field: Any, state0: Any) ->
     """
     # No step converts the momentum Π to Ω = I⁻¹Π and back, so that |Π| drifts only by the round-off
     # of the free motion.
-    frame = splitting.frame_of(field, state0)
+    frame = splitting.principal_frame_of_field(field, state0)
 
     def change(t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:
-        return splitting.compose(solver.composition, bind(field, inputs), frame, t, h, y)
+        return splitting.change_in_splitting_step(
+            solver.composition, bind(field, inputs), frame, t, h, y
+        )
 
     def state(y: Any) -> Attitude:
-        return Attitude(quaternion.normalise(y[0]), splitting.leave(frame, y[1]))
+        return Attitude(quaternion.normalise(y[0]), splitting.body_rate_in_body_axes(frame, y[1]))
 
-    return Stepper((state0.q, splitting.enter(frame, state0.omega)), change, state)
+    return Stepper((state0.q, splitting.momentum_along_axes(frame, state0.omega)), change, state)

@@ -18,14 +18,18 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax.solve.batching import Arrays
-from rigidjax.solve.switching import MOST, Analysis, analysis_of
-from rigidjax.solve.switching_times import field_with_stops, separate_times, times_of
+from rigidjax.solve.switching import MOST, Analysis, find_switches
+from rigidjax.solve.switching_times import (
+    find_switching_times,
+    replace_comparisons_by_stops,
+    separate_equal_times,
+)
 
 
-def say_unseen(analysis: Analysis) -> None:
-    """Warn for each line of a torque that may jump at times that cannot be found before the run.
+def warn_of_unsearchable_jumps(analysis: Analysis) -> None:
+    """Warn of each line of a law that may jump at times that cannot be found before the run.
 
-    `analysis` is what was found in the traced vector field.
+    `analysis` holds these lines, and the switches that were found in the traced vector field.
     """
     for line in dict.fromkeys(analysis.unseen):
         warnings.warn(
@@ -43,50 +47,50 @@ class TracedProgram(NamedTuple):
     tree: Any  # the structure of its result
 
     @property
-    def constants(self) -> Arrays:
+    def jax_constants(self) -> Arrays:
         """Return the JAX arrays that the function closes over; NumPy arrays stay in its program."""
         return [c for c in self.closed.consts if eqx.is_array(c)]
 
-    def consts(self, constants: Arrays) -> Arrays:
+    def replace_jax_constants(self, jax_arrays: Arrays) -> Arrays:
         """Return all constants of the traced function, after a replacement of its JAX arrays.
 
-        `constants` are the arrays that replace the JAX arrays, in order; its NumPy arrays stay.
+        `jax_arrays` replace the JAX arrays among these constants, in order; NumPy arrays stay.
         """
-        arrays = iter(constants)
+        arrays = iter(jax_arrays)
         return [next(arrays) if eqx.is_array(c) else c for c in self.closed.consts]
 
     def call(self, constants: Arrays, *args: Any) -> Any:
-        closed = ClosedJaxpr(self.closed.jaxpr, self.consts(constants))
+        closed = ClosedJaxpr(self.closed.jaxpr, self.replace_jax_constants(constants))
         return self.tree.unflatten(jaxpr_as_fun(closed)(*jax.tree.leaves(args)))
 
 
-def trace_program(function: Callable[..., Any], *like: Any) -> TracedProgram:
+def trace_program(function: Callable[..., Any], *examples: Any) -> TracedProgram:
     """Return a function after it was traced, with the arrays that it closes over as an argument.
 
-    `like` are examples of its arguments, of which only shapes and dtypes count. The result is
+    `examples` are examples of its arguments, of which only shapes and dtypes count. The result is
     called as `call(constants, *args)`.
     """
-    closed, out = jax.make_jaxpr(function, return_shape=True)(*like)
+    closed, out = jax.make_jaxpr(function, return_shape=True)(*examples)
     return TracedProgram(closed, jax.tree.structure(out))
 
 
-def constants_of(
-    functions: list[Callable[..., Any]], *like: Any
+def extract_constants(
+    functions: list[Callable[..., Any]], *examples: Any
 ) -> tuple[list[Callable[..., Any]], Arrays]:
     """Return several functions, with the arrays that they close over (constants) as an argument.
 
-    `like` are examples of the arguments, which all functions share. **Returns** two lists: the
+    `examples` are examples of the arguments, which all functions share. **Returns** two lists: the
     functions, to be called as `f(constants, *args)`; and the constants of all functions, which each
     of them takes.
     """
-    programs = [trace_program(function, *like) for function in functions]
-    ends = np.cumsum([0, *(len(program.constants) for program in programs)])
+    programs = [trace_program(function, *examples) for function in functions]
+    ends = np.cumsum([0, *(len(program.jax_constants) for program in programs)])
 
     def call(i: int, constants: Arrays, *args: Any) -> Any:
         return programs[i].call(constants[ends[i] : ends[i + 1]], *args)
 
     calls = [partial(call, i) for i in range(len(programs))]
-    return calls, [c for program in programs for c in program.constants]
+    return calls, [c for program in programs for c in program.jax_constants]
 
 
 class ProgramWithStops(NamedTuple):
@@ -100,7 +104,7 @@ class ProgramWithStops(NamedTuple):
 
 
 def program_with_stops(
-    function: Callable[..., Array], declared: list[Array], a: Array, b: Array, y: Array
+    function: Callable[..., Array], declared_jumps: list[Array], t0: Array, t1: Array, y: Array
 ) -> ProgramWithStops:
     """Return a vector field with all times at which steps must end, because the field jumps there.
 
@@ -108,40 +112,41 @@ def program_with_stops(
 
     - `function`: the field `(t, y, *sides)`. If several parts of it declare jumps, it gets as
       `sides` one array for each part: the times, s, at which steps end for the jumps of the part.
-    - `declared`: a list with the jump times, s, of each part of the field that declares jumps.
-    - `a`, `b`: the times between which the run lies, s.
+    - `declared_jumps`: a list with the jump times, s, of each part of the field that declares
+      jumps.
+    - `t0`, `t1`: the start and the end of the run, s.
     - `y`: an example of the state.
     """
-    declared = [times.astype(a.dtype) for times in declared if times.size]
+    declared = [times.astype(t0.dtype) for times in declared_jumps if times.size]
     likes = declared if len(declared) > 1 else []
-    program = trace_program(function, a, y, *likes)
-    analysis, number = analysis_of(program.closed), len(program.constants)
+    program = trace_program(function, t0, y, *likes)
+    analysis, number = find_switches(program.closed), len(program.jax_constants)
     if analysis is not None:
-        say_unseen(analysis)
+        warn_of_unsearchable_jumps(analysis)
     if analysis is None or not analysis.switches:
         if not likes:
-            stops = jnp.clip(jnp.sort(declared[0]), a, b) if declared else jnp.zeros(0, a.dtype)
-            return ProgramWithStops(program.call, program.constants, number, stops, None)
-        stops, each = separate_times(jnp.concatenate(declared), a, b)
+            stops = jnp.clip(jnp.sort(declared[0]), t0, t1) if declared else jnp.zeros(0, t0.dtype)
+            return ProgramWithStops(program.call, program.jax_constants, number, stops, None)
+        stops, each = separate_equal_times(jnp.concatenate(declared), t0, t1)
         sides = _split_like(lax.stop_gradient(each), declared)
         call = lambda given, t, y: program.call(given[:number], t, y, *given[number:])  # noqa: E731
-        return ProgramWithStops(call, [*program.constants, *sides], number, stops, None)
-    found = times_of(analysis, program.closed.consts, a, b)
-    stops, each = separate_times(jnp.concatenate([*declared, found.times]), a, b)
+        return ProgramWithStops(call, [*program.jax_constants, *sides], number, stops, None)
+    found = find_switching_times(analysis, program.closed.consts, t0, t1)
+    stops, each = separate_equal_times(jnp.concatenate([*declared, found.times]), t0, t1)
     *sides, own = _split_like(lax.stop_gradient(each), [*declared, found.times])
     over, most = found.over, MOST + sum(times.shape[0] for times in declared)
     if stops.shape[0] > most:
-        stops, over = stops[:most], over | (stops[most] < b)
+        stops, over = stops[:most], over | (stops[most] < t1)
     # The values at the switches are one array, because a loop that carries many arrays is slower.
     places = lax.stop_gradient((own, found._replace(times=own[:0])))
-    one, unpacked = ravel_pytree(jax.tree.map(lambda leaf: leaf.astype(a.dtype), places))
-    more, field = [*(sides if likes else []), one], field_with_stops(analysis)
+    one, unpacked = ravel_pytree(jax.tree.map(lambda leaf: leaf.astype(t0.dtype), places))
+    more, field = [*(sides if likes else []), one], replace_comparisons_by_stops(analysis)
 
     def call(given: Arrays, t: Array, y: Array) -> Array:
         *sides, one = given[number:]
-        return field(program.consts(given[:number]), t, y, *sides, unpacked(one))
+        return field(program.replace_jax_constants(given[:number]), t, y, *sides, unpacked(one))
 
-    return ProgramWithStops(call, [*program.constants, *more], number, stops, over)
+    return ProgramWithStops(call, [*program.jax_constants, *more], number, stops, over)
 
 
 def _split_like(whole: Array, like: list[Array]) -> list[Array]:

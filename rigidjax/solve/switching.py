@@ -9,13 +9,13 @@ of the run end at these times, called stops. During the run the comparison is no
 result is chosen by the stops that the step has passed. The result therefore does not depend on
 rounding, and two comparisons that change at the same time are treated separately.
 
-The gap of a comparison is the difference of its two operands. It is a function of the time t and of
-the constants p of the field. The equation `gap(p, t) = 0` defines the switching time as an implicit
-function of p, and gives its derivatives.
+The switching function g of a comparison is the difference of its two operands. It is a function of
+the time t and of the constants p of the field. The equation `g(p, t) = 0` defines the switching
+time as an implicit function of p, and gives its derivatives.
 """
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import count
 from typing import Any, NamedTuple
 
@@ -78,11 +78,11 @@ _FEW_KINKS = 3  # steps do not end at the kinks of an operation that has more ki
 NEAR = 16  # the number of places between grid points where a bent switch is searched for
 
 
-class Node(NamedTuple):
+class Equation(NamedTuple):
     """Hold an equation of a flat program, in which each value is identified by an integer.
 
-    A flat program is a traced function as one list of equations. An input of an equation is such an
-    integer or a literal, and an output is such an integer.
+    A flat program is a traced function as one list of equations. An input of an equation is the
+    integer of a value or a literal, and an output is the integer of a value.
     """
 
     primitive: Any
@@ -95,7 +95,7 @@ class Node(NamedTuple):
     declared: bool  # whether it belongs to a part that declares its jumps
 
     @property
-    def name(self) -> str:
+    def primitive_name(self) -> str:
         """Return the primitive's name, or "searchsorted" for a call of `jnp.searchsorted`."""
         return _primitive_name(self)
 
@@ -106,7 +106,7 @@ class Program(NamedTuple):
     Value 0 is the time t, and value 1 is the state y.
     """
 
-    nodes: list[Node]  # the equations, in the order of evaluation
+    equations: list[Equation]  # the equations, in the order of evaluation
     constants: list[int]  # the values that are constants of the traced function
     inner: dict[int, Any]  # the constants of inner calls, by their numbers
     inputs: list[int]  # the values that are arguments of the function
@@ -120,30 +120,40 @@ class Switch(NamedTuple):
     several elements, each of which changes at times of its own.
     """
 
-    node: Node
-    degree: int  # how the operands depend on the time: `STRAIGHT`, …
+    equation: Equation
+    time_dependence: int  # how the operands depend on the time: `STRAIGHT`, …
     size: int  # the number of elements that are compared
     jumps: bool  # whether the result jumps; else it has a kink
 
     @property
-    def most_changes(self) -> int:
-        """Return how often an element can change at most while its operand only rises or falls."""
-        return MOST if self.node.name in _LEVELS else 1
+    def most_changes_if_monotonic(self) -> int:
+        """Return how often an element can change at most while its operand only rises or falls.
+
+        It is 1 for a comparison, and `MOST` for a function such as `floor`.
+        """
+        return MOST if self.equation.primitive_name in _LEVELS else 1
 
     @property
-    def places(self) -> int:
+    def storable_changes(self) -> int:
         """Return the number of changes that the search for the switching times can store."""
-        return MOST + 2 * NEAR if self.degree == BENT else self.size * self.most_changes
+        return (
+            MOST + 2 * NEAR
+            if self.time_dependence == BENT
+            else self.size * self.most_changes_if_monotonic
+        )
 
     @property
-    def exact(self) -> bool:
-        """Return whether no element can change more often than the search can store."""
-        return self.degree < BENT and self.most_changes == 1
+    def stores_all_changes(self) -> bool:
+        """Return whether the search can always store all changes of each element."""
+        return self.time_dependence < BENT and self.most_changes_if_monotonic == 1
 
     @property
-    def line(self) -> str:
-        """Return the primitive's name, and the line of the user's code that wrote the equation."""
-        return f"{self.node.name}, {summarize(self.node.source)}"
+    def primitive_and_line(self) -> str:
+        """Return the name of the equation's primitive, and the line of code that wrote it.
+
+        The line is one of the user's code, given by its file and its number.
+        """
+        return f"{self.equation.primitive_name}, {summarize(self.equation.source)}"
 
 
 class Analysis(NamedTuple):
@@ -162,7 +172,7 @@ class Analysis(NamedTuple):
     unseen: list[str]  # the lines that may switch at times that cannot be searched for
 
 
-def _inner_programs(params: dict[str, Any]) -> Iterator[tuple[Any, Any]]:
+def _inner_programs(params: dict[str, Any]) -> Iterator[tuple[Jaxpr, Sequence[Any]]]:
     """Yield each program (a `Jaxpr`) among the parameters of an equation, and its constants.
 
     - `params`: the parameters of an equation of a `Jaxpr`; a `cond`, for example, has one program
@@ -179,7 +189,7 @@ def _inner_programs(params: dict[str, Any]) -> Iterator[tuple[Any, Any]]:
 def _primitive_name(eqn: Any) -> str:
     """Return the name of an equation's primitive, or "searchsorted" for `jnp.searchsorted`.
 
-    - `eqn`: an equation of a `Jaxpr`, or a `Node`, which holds one.
+    - `eqn`: an equation of a `Jaxpr`, or an `Equation`, which holds one.
     """
     called = eqn.params.get("name")
     return "searchsorted" if called == "searchsorted" else eqn.primitive.name
@@ -214,7 +224,7 @@ def _may_jump(name: str, params: dict[str, Any], dtypes: list[Any]) -> bool:
     return name in COMPARISONS | _LEVELS | _CHOICES | {"sign", "atan2", "searchsorted"}
 
 
-def _may_bend(name: str, dtypes: list[Any]) -> bool:
+def _may_have_kink(name: str, dtypes: list[Any]) -> bool:
     """Return whether the result of an equation may have a kink while its operands have none.
 
     At a kink, such as that of `abs` at 0, the slope jumps and the value does not.
@@ -238,7 +248,7 @@ def _contains_switch(jaxpr: Jaxpr, with_kinks: bool = False) -> bool:
         name, dtypes = _primitive_name(eqn), _dtypes_of_inputs(eqn)
         if (
             _may_jump(name, eqn.params, dtypes)
-            or (with_kinks and _may_bend(name, dtypes))
+            or (with_kinks and _may_have_kink(name, dtypes))
             or name in _OPAQUE
         ):
             return True
@@ -247,15 +257,15 @@ def _contains_switch(jaxpr: Jaxpr, with_kinks: bool = False) -> bool:
     return False
 
 
-def flatten(closed: ClosedJaxpr) -> Program:
+def flatten_traced_function(traced: ClosedJaxpr) -> Program:
     """Return a traced function as one flat list of equations, in which calls are written out.
 
     The bodies of calls that cannot be written out, such as `cond`, are in the list after the call,
     so that switches in them are found.
 
-    - `closed`: the traced function f(t, y, …).
+    - `traced`: the traced function f(t, y, …).
     """
-    numbers, nodes, inner = count(), [], {}
+    numbers, equations, inner = count(), [], {}
 
     def enter(jaxpr: Any, consts: Any, inputs: list[Any], declared: bool) -> list[Any]:
         scope: dict[Any, Any] = dict(zip(jaxpr.invars, inputs, strict=True))
@@ -270,11 +280,11 @@ def flatten(closed: ClosedJaxpr) -> Program:
             else:
                 outputs = [next(numbers) for _ in eqn.outvars]
                 shapes = [variable.aval for variable in eqn.outvars]
-                node = Node(
+                equation = Equation(
                     eqn.primitive, eqn.params, args, outputs, _dtypes_of_inputs(eqn), shapes,
                     eqn.source_info, own,
                 )  # fmt: skip
-                nodes.append(node)
+                equations.append(equation)
                 if name in _WHOLE:
                     for body, held in _inner_programs(eqn.params):
                         enter(body, kept(held), args[len(args) - len(body.invars) :], own)
@@ -286,28 +296,29 @@ def flatten(closed: ClosedJaxpr) -> Program:
         inner.update(zip(names, consts, strict=True))
         return names
 
-    inputs = [next(numbers) for _ in closed.jaxpr.invars]
-    constants = [next(numbers) for _ in closed.consts]
-    outputs = enter(closed.jaxpr, constants, inputs, False)
-    return Program(nodes, constants, inner, inputs, outputs[0])
+    inputs = [next(numbers) for _ in traced.jaxpr.invars]
+    constants = [next(numbers) for _ in traced.consts]
+    outputs = enter(traced.jaxpr, constants, inputs, False)
+    return Program(equations, constants, inner, inputs, outputs[0])
 
 
-def degree_of(node: Node, operands: list[int]) -> int:
+def time_dependence_of(equation: Equation, operand_dependences: list[int]) -> int:
     """Return how the result of an equation depends on the time.
 
     The result is `CONSTANT`, `PIECES` (constant except for jumps), `STRAIGHT` (linear), `MONOTONE`
     (only rising or only falling), or `BENT` (in any other way).
 
-    - `node`: the equation.
-    - `operands`: for each operand one of these values, which says how the operand depends on the
-      time.
+    - `equation`: the equation.
+    - `operand_dependences`: for each operand one of these values, which says how the operand
+      depends on the time.
     """
-    timed, name = [d for d in operands if d != CONSTANT], node.name
+    operands = operand_dependences
+    timed, name = [d for d in operands if d != CONSTANT], equation.primitive_name
     if not timed:
         return CONSTANT
     if max(timed) == PIECES:
         return PIECES
-    if _may_jump(name, node.params, node.dtypes):
+    if _may_jump(name, equation.params, equation.dtypes):
         return BENT if name in _SAWS else PIECES
     if name in ("gather", "dynamic_slice") and max(operands[1:], default=CONSTANT) > CONSTANT:
         return BENT
@@ -325,158 +336,162 @@ def degree_of(node: Node, operands: list[int]) -> int:
     return BENT
 
 
-def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
+def find_switches(traced_field: ClosedJaxpr) -> Analysis | None:
     """Return the switches of a traced field f(t, y, …), or `None` if it has nothing that switches.
 
     A switch is an equation, such as the comparison `t < 1`, whose result jumps or has a kink at
     times that do not depend on the state. Only the equations are looked at: the times are found
     later, in the module `switching_times`.
 
-    - `closed`: the traced field, whose first two arguments are the time and the state.
+    - `traced_field`: the field after tracing, whose first two arguments are the time and the state.
     """
-    if not _contains_switch(closed.jaxpr, with_kinks=True):
+    if not _contains_switch(traced_field.jaxpr, with_kinks=True):
         return None
-    program = flatten(closed)
+    program = flatten_traced_function(traced_field)
     degrees, of_state = {program.inputs[0]: STRAIGHT}, set(program.inputs[1:])
     switches, kinks, by_state, unseen = [], [], [], []
-    for node in program.nodes:
-        inputs = [i for i in node.inputs if not isinstance(i, Literal)]
+    for equation in program.equations:
+        inputs = [i for i in equation.inputs if not isinstance(i, Literal)]
         look = lambda i: CONSTANT if isinstance(i, Literal) else degrees.get(i, CONSTANT)  # noqa: E731
-        operands = [look(i) for i in node.inputs]
+        operands = [look(i) for i in equation.inputs]
         stateful = any(i in of_state for i in inputs)
-        degrees.update(dict.fromkeys(node.outputs, degree_of(node, operands)))
+        degrees.update(dict.fromkeys(equation.outputs, time_dependence_of(equation, operands)))
         if stateful:
-            of_state.update(node.outputs)
+            of_state.update(equation.outputs)
         # A value that is constant between the times of other switches needs no search of its own.
         timed = max(operands, default=CONSTANT) > PIECES
         if (
             not (timed or stateful)
-            or node.declared
-            or not _may_switch(node)
-            or _is_of_this_package(node)
+            or equation.declared
+            or not _may_switch(equation)
+            or _is_of_this_package(equation)
         ):
             continue
-        where = f"{node.name}, {summarize(node.source)}"
-        jumps = _may_jump(node.name, node.params, node.dtypes)
+        where = f"{equation.primitive_name}, {summarize(equation.source)}"
+        jumps = _may_jump(equation.primitive_name, equation.params, equation.dtypes)
         if jumps and stateful:
             by_state.append(where)
-        elif _may_hide_switches(node):
+        elif _may_hide_switches(equation):
             unseen += [where] * timed
         elif timed and not stateful:
-            switch = _switch_of(program, node, operands, jumps)
+            switch = _switch_of(program, equation, operands, jumps)
             if switch.size <= (_FEW if jumps else _FEW_KINKS):
                 switches.append(switch)
             elif switch.size <= _FEW:
                 kinks.append(switch)
-    bent = any(switch.degree == BENT for switch in switches)
+    bent = any(switch.time_dependence == BENT for switch in switches)
     return Analysis(program, switches, kinks if bent else [], by_state, unseen)
 
 
-def _is_of_this_package(node: Node) -> bool:
-    """Return whether this package, and not the user's code, wrote the equation `node`.
+def _is_of_this_package(equation: Equation) -> bool:
+    """Return whether this package, and not the user's code, wrote the equation `equation`.
 
     The torque laws of this package state the times of their jumps themselves, so that these times
     need not be searched for in their equations.
     """
-    return summarize(node.source).startswith(_PACKAGE)
+    return summarize(equation.source).startswith(_PACKAGE)
 
 
-def _may_switch(node: Node) -> bool:
-    """Return whether the result of the equation `node` may jump or have a kink.
+def _may_switch(equation: Equation) -> bool:
+    """Return whether the result of the equation `equation` may jump or have a kink.
 
     At a kink the slope jumps and the value does not. The answer is yes for each equation that
     contains a program, such as `cond`, because there may be a jump inside this program.
     The answer is also yes for an equation whose content cannot be read, such as a callback.
     """
-    name = node.name
-    jumps = _may_jump(name, node.params, node.dtypes) or _may_bend(name, node.dtypes)
-    return jumps or name in _OPAQUE or any(True for _ in _inner_programs(node.params))
+    name = equation.primitive_name
+    jumps = _may_jump(name, equation.params, equation.dtypes) or _may_have_kink(
+        name, equation.dtypes
+    )
+    return jumps or name in _OPAQUE or any(True for _ in _inner_programs(equation.params))
 
 
-def _may_hide_switches(node: Node) -> bool:
-    """Return whether the result of `node` may jump at times that cannot be searched for.
+def _may_hide_switches(equation: Equation) -> bool:
+    """Return whether the result of an equation may jump at times that cannot be searched for.
 
-    `node` is an equation. Examples are `argmax` of an array, a callback, and a loop that contains a
+    Examples of such equations are `argmax` of an array, a callback, and a loop that contains a
     comparison.
     """
-    if node.name in _CHOICES | {"atan2"}:
+    if equation.primitive_name in _CHOICES | {"atan2"}:
         return True
-    if node.name in _WHOLE | {"searchsorted"}:
+    if equation.primitive_name in _WHOLE | {"searchsorted"}:
         return False
-    return node.name in _OPAQUE or any(
-        _contains_switch(body) for body, _ in _inner_programs(node.params)
+    return equation.primitive_name in _OPAQUE or any(
+        _contains_switch(body) for body, _ in _inner_programs(equation.params)
     )
 
 
-def _switch_of(program: Program, node: Node, operands: list[int], jumps: bool) -> Switch:
+def _switch_of(
+    program: Program, equation: Equation, operand_dependences: list[int], jumps: bool
+) -> Switch:
     """Return an equation as a `Switch`, which says how often, and in which way, its result changes.
 
     - `program`: the program that contains the equation.
-    - `node`: the equation, whose result depends on the time but not on the state.
-    - `operands`: how each operand depends on the time: `CONSTANT` (not at all), `PIECES` (constant
-      except for jumps), `STRAIGHT` (linear), `MONOTONE` (only rising or only falling) or `BENT` (in
-      any other way).
+    - `equation`: the equation, whose result depends on the time but not on the state.
+    - `operand_dependences`: how each operand depends on the time: `CONSTANT` (not at all), `PIECES`
+      (constant except for jumps), `STRAIGHT` (linear), `MONOTONE` (only rising or only falling) or
+      `BENT` (in any other way).
     - `jumps`: whether the result jumps; else it has a kink, at which its slope jumps.
     """
-    name = node.name
-    compared = operands[: 1 if name in _LEVELS - {"rem"} else 3]
+    name = equation.primitive_name
+    compared = operand_dependences[: 1 if name in _LEVELS - {"rem"} else 3]
     timed = [d for d in compared if d != CONSTANT]
     steady = len(timed) == 1 or set(timed) == {STRAIGHT}
     steady = steady and not (name == "rem" and compared[1] != CONSTANT)
     steady = steady and not (name == "searchsorted" and compared[0] != CONSTANT)
-    shape = node.shapes[0].shape
+    shape = equation.shapes[0].shape
     size = int(np.prod(shape)) * (2 if name == "clamp" else 1)
     if name == "searchsorted":
         # A search for one time among sorted edges is a switch. A search for many times is treated
         # as a table, which is no switch.
-        size = _number_of_edges(node) if shape == () else _FEW + 1
-    return Switch(node, max(timed) if steady else BENT, size, jumps)
+        size = _number_of_searchsorted_edges(equation) if shape == () else _FEW + 1
+    return Switch(equation, max(timed) if steady else BENT, size, jumps)
 
 
-def _number_of_edges(node: Node) -> int:
+def _number_of_searchsorted_edges(equation: Equation) -> int:
     """Return the length of the sorted array (the edges) in which a call of `searchsorted` searches.
 
-    - `node`: the equation that calls `searchsorted`.
+    - `equation`: the equation that calls `searchsorted`.
     """
-    ((body, _),) = _inner_programs(node.params)
+    ((body, _),) = _inner_programs(equation.params)
     return int(np.prod(body.invars[0].aval.shape))
 
 
 def evaluator(
-    program: Program, wanted: list[Any], replaced: dict[int, Any] | None = None
+    program: Program, wanted: list[int | Literal], replaced: dict[int, Any] | None = None
 ) -> Callable[..., list[Any]]:
     """Return a function that evaluates the `wanted` values of a program, and nothing else.
 
     - `program`: the program, in which each value is identified by an integer.
     - `wanted`: the values to be returned: integers, or literals.
     - `replaced`: a dict whose keys are the integers of outputs whose equations are not evaluated,
-      and whose values are objects with two members: `value(read, inputs)` returns the output, and
-      `reads` lists the inputs of the equation that `value` needs. `None` replaces nothing.
+      and whose values are objects with two members: `result(read, inputs)` returns the output, and
+      `needed_inputs` lists the inputs of the equation that `result` needs. `None` replaces nothing.
 
     **Returns** a function of `(constants, *inputs)`, the constants and the arguments of the
     program, that returns the list of wanted values.
     """
     replaced = replaced or {}
-    needed, nodes = {i for i in wanted if not isinstance(i, Literal)}, []
-    for node in reversed(program.nodes):
-        if any(output in needed for output in node.outputs):
-            nodes.append(node)
-            own = replaced.get(node.outputs[0])
-            inputs = node.inputs if own is None else own.reads
+    needed, equations = {i for i in wanted if not isinstance(i, Literal)}, []
+    for equation in reversed(program.equations):
+        if any(output in needed for output in equation.outputs):
+            equations.append(equation)
+            own = replaced.get(equation.outputs[0])
+            inputs = equation.inputs if own is None else own.needed_inputs
             needed.update(i for i in inputs if not isinstance(i, Literal))
 
     def evaluate(constants: Arrays, *inputs: Any) -> list[Any]:
         known = dict(zip(program.constants, constants, strict=True)) | program.inner
         known |= dict(zip(program.inputs, inputs, strict=False))
         read = lambda i: i.val if isinstance(i, Literal) else known[i]  # noqa: E731
-        for node in reversed(nodes):
-            if node.outputs[0] in replaced:
-                known[node.outputs[0]] = replaced[node.outputs[0]].value(read, inputs)
+        for equation in reversed(equations):
+            if equation.outputs[0] in replaced:
+                known[equation.outputs[0]] = replaced[equation.outputs[0]].result(read, inputs)
                 continue
-            params = node.primitive.get_bind_params(node.params)
-            out = node.primitive.bind(*(read(i) for i in node.inputs), **params)
-            out = out if node.primitive.multiple_results else [out]
-            known.update(zip(node.outputs, out, strict=True))
+            params = equation.primitive.get_bind_params(equation.params)
+            out = equation.primitive.bind(*(read(i) for i in equation.inputs), **params)
+            out = out if equation.primitive.multiple_results else [out]
+            known.update(zip(equation.outputs, out, strict=True))
         return [read(i) for i in wanted]
 
     return evaluate

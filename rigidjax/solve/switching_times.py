@@ -1,13 +1,13 @@
 """Locate the times at which a traced field switches, and evaluate the field between them.
 
-If the gap of a switch (see the module `switching`) only rises or only falls in time, the switch
-changes once, and its time is found by halving the interval from the start to the end of the run.
-Any other switch is called bent. Its changes are searched for on a grid of times, and also between
-grid points where the gap comes closest to zero. The equation `gap(p, t) = 0` defines each time as
-an implicit function of the constants p of the field, and gives its derivatives.
+If the switching function g of a switch (see the module `switching`) only rises or only falls in
+time, the switch changes once, and its time is found by halving the interval from the start to the
+end of the run. Any other switch is called bent. Its changes are searched for on a grid of times,
+and also between grid points where g comes closest to zero. The equation `g(p, t) = 0` defines each
+time as an implicit function of the constants p of the field, and gives its derivatives.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -35,23 +35,26 @@ _HALVINGS = {"float64": 62, "float32": 36}
 _GRID = 4096  # the number of points of the grid on which a bent switch is searched for
 
 
-def _gap_of_operands(switch: Switch, x: Any, *rest: Any) -> Any:
-    """Return the gap of each element of a switch: a number that shows where the element changes.
+def _switching_function_of_operands(
+    switch: Switch, first_operand: Any, *others_and_result: Any
+) -> Array:
+    """Return the switching function of each element of a switch, which shows where it changes.
 
     A switch is an equation, such as the comparison `t < 1`, whose result changes at certain times.
-    The gap is the difference of its two operands, here t − 1, and the result changes where the gap
-    is zero. `clamp` has two gaps, the differences of its number from the two bounds; the gap of
-    `abs` or `sign` is the operand. For functions such as `floor` the gap is the operand (for `rem`
-    the quotient of the two operands), and the result changes where the gap passes a whole number.
+    The switching function is the difference of its two operands, here t − 1, and the result changes
+    where this function is zero. `clamp` has two switching functions, the differences of its number
+    from the two bounds; that of `abs` or `sign` is the operand. For functions such as `floor` it is
+    the operand (for `rem` the quotient of the two operands), and the result changes where it passes
+    a whole number.
 
     - `switch`: the equation.
-    - `x`: its first operand.
-    - `rest`: its other operands, followed by its result.
+    - `first_operand`: its first operand.
+    - `others_and_result`: its other operands, followed by its result.
 
     **Returns** an array (m,), with one number for each of the m elements, such as those of a
     comparison of arrays.
     """
-    name = switch.node.name
+    name, x, rest = switch.equation.primitive_name, first_operand, others_and_result
     if name == "clamp":
         return jnp.concatenate([jnp.ravel(rest[0] - x), jnp.ravel(rest[0] - rest[1])])
     if name == "searchsorted":
@@ -61,26 +64,26 @@ def _gap_of_operands(switch: Switch, x: Any, *rest: Any) -> Any:
     return jnp.ravel(x / rest[0] if name == "rem" else x)
 
 
-def _value_of_operands(switch: Switch, x: Any, *rest: Any) -> Any:
-    """Return the value of each element of a switch, constant except where the element changes.
+def _piecewise_constant_value(switch: Switch, first_operand: Any, *others_and_result: Any) -> Array:
+    """Return a value for each element of a switch that is constant except where it changes.
 
     - `switch`: the equation, such as the comparison `t < 1`.
-    - `x`: its first operand.
-    - `rest`: its other operands, followed by its result.
+    - `first_operand`: its first operand.
+    - `others_and_result`: its other operands, followed by its result.
 
     **Returns** an array (m,), with one value for each of the m elements, such as those of a
     comparison of arrays. The value is the result of the equation, with three exceptions: for `rem`
     it is the whole part of the quotient of the operands; for `searchsorted`, and for operations
-    with a kink, such as `max`, it is whether the gap (the difference of the operands, for `abs` the
-    operand) is positive.
+    with a kink, such as `max`, it is whether the switching function (the difference of the
+    operands, for `abs` the operand) is positive.
     """
-    name = switch.node.name
+    name, x, rest = switch.equation.primitive_name, first_operand, others_and_result
     if name in KINKS | {"searchsorted"}:
-        return _gap_of_operands(switch, x, *rest) > 0
+        return _switching_function_of_operands(switch, x, *rest) > 0
     return jnp.ravel(jnp.trunc(x / rest[0]) if name == "rem" else rest[-1])
 
 
-class Times(NamedTuple):
+class SwitchingTimes(NamedTuple):
     """Hold the times at which the switches of a field may change, in k places.
 
     A switch is an equation, such as the comparison `t < 1`, whose result changes at certain times.
@@ -111,55 +114,59 @@ class _TimedSwitch(NamedTuple):
     constants: Arrays
 
     @property
-    def still(self) -> "_TimedSwitch":
-        """Return this object with its constants held fixed in derivatives."""
+    def with_fixed_constants(self) -> "_TimedSwitch":
+        """Return the same switch with constants that have no derivatives."""
         return self._replace(constants=lax.stop_gradient(self.constants))
 
-    def operands(self, t: Array) -> list[Any]:
+    def operands_and_result(self, t: Array) -> list[Any]:
         """Return the operands of the equation, followed by its result, at the time t (), s."""
-        node = self.switch.node
-        wanted = [*node.inputs, node.outputs[0]]
+        equation = self.switch.equation
+        wanted = [*equation.inputs, equation.outputs[0]]
         return evaluator(self.program, wanted)(self.constants, t)
 
-    def value(self, t: Array) -> Array:
-        """Return the values (m,) of the elements at the time t (), s, as floating-point numbers.
+    def element_values(self, t: Array) -> Array:
+        """Return the values (m,) of all m elements at the time t (), s, as floating-point numbers.
 
         The value of an element, such as 0 or 1 for a comparison, is constant except where the
         element changes.
         """
-        return _value_of_operands(self.switch, *self.operands(t)).astype(t.dtype)
+        return _piecewise_constant_value(self.switch, *self.operands_and_result(t)).astype(t.dtype)
 
-    def gap(self, t: Array) -> Array:
-        """Return the gaps (m,) of the m elements of the equation at the time t (), s.
+    def switching_functions(self, t: Array) -> Array:
+        """Return the switching functions (m,) of all m elements at the time t (), s.
 
-        The gap of a comparison is the difference of its operands; the element changes where the gap
-        is zero. The gap of a function such as `floor` is its operand; there the element changes
-        where the gap passes a whole number.
+        For a comparison the switching function is the difference of the operands, and the element
+        changes where this function is zero. For a function such as `floor` it is the operand, and
+        the element changes where it passes a whole number.
         """
-        return _gap_of_operands(self.switch, *self.operands(t)).astype(t.dtype)
+        return _switching_function_of_operands(self.switch, *self.operands_and_result(t)).astype(
+            t.dtype
+        )
 
-    def values(self, t: Array, element: Any) -> Array:
-        """Return the value of one element at each time: (k,) for the times t (k,), s.
+    def values_of_one_element(self, t: Array, element: Array | np.ndarray) -> Array:
+        """Return the value of one element at each of the times t (k,), s: (k,).
 
         The value of an element, such as 0 or 1 for a comparison, is constant except where the
         element changes.
 
         - `element`: (k,) the index of the element, for each time.
         """
-        return self._at_each_time(self.value, t, element)
+        return self._at_each_time(self.element_values, t, element)
 
-    def gaps(self, t: Array, element: Any) -> Array:
-        """Return the gap of one element at each time: (k,) for the times t (k,), s.
+    def switching_function_of_one_element(self, t: Array, element: Array | np.ndarray) -> Array:
+        """Return the switching function of one element at each of the times t (k,), s: (k,).
 
-        The gap of a comparison is the difference of its operands; the element changes where the gap
-        is zero. The gap of a function such as `floor` is its operand; there the element changes
-        where the gap passes a whole number.
+        For a comparison the switching function is the difference of the operands, and the element
+        changes where this function is zero. For a function such as `floor` it is the operand, and
+        the element changes where it passes a whole number.
 
         - `element`: (k,) the index of the element, for each time.
         """
-        return self._at_each_time(self.gap, t, element)
+        return self._at_each_time(self.switching_functions, t, element)
 
-    def _at_each_time(self, function: Callable[[Array], Array], t: Array, element: Any) -> Array:
+    def _at_each_time(
+        self, function: Callable[[Array], Array], t: Array, element: Array | np.ndarray
+    ) -> Array:
         """Return one number of the array `function(t)` at each time: (k,) for the times t (k,), s.
 
         - `function`: returns one number for each element of the switch at a time ().
@@ -173,10 +180,12 @@ class _TimedSwitch(NamedTuple):
 # Four arrays for one switch, which has k places to store changes: the times (k,) of the changes;
 # the elements (k,) that change; the changes (k,) of their values; and whether there are so many
 # changes that some are missing.
-_Places = tuple[Array, Array, Array, Array]
+_ChangesOfSwitch = tuple[Array, Array, Array, Array]
 
 
-def times_of(analysis: Analysis, constants: Arrays, t0: Array, t1: Array) -> Times:
+def find_switching_times(
+    analysis: Analysis, constants: Arrays, t0: Array, t1: Array
+) -> SwitchingTimes:
     """Return the times after t0 and until t1, s, at which the switches of a field change.
 
     A switch is an equation, such as the comparison `t < 1`, whose result changes at certain times.
@@ -192,34 +201,36 @@ def times_of(analysis: Analysis, constants: Arrays, t0: Array, t1: Array) -> Tim
     start = start + 8 * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end - start))
     timed_switches = [_TimedSwitch(analysis.program, s, constants) for s in analysis.switches]
     others = [_TimedSwitch(analysis.program, s, constants) for s in analysis.kinks]
-    steady = [one for one in timed_switches + others if one.switch.degree <= MONOTONE]
-    found = _switchings_of_monotonic(steady, start, end)
+    steady = [one for one in timed_switches + others if one.switch.time_dependence <= MONOTONE]
+    found = _times_of_monotonic_switches(steady, start, end)
     known = [places[0] for places in found]
-    parts: list[_Places] = []
+    parts: list[_ChangesOfSwitch] = []
     for one in timed_switches:
-        if one.switch.degree == BENT:
-            parts.append(_switchings_of_bent(one, start, end, known))
+        if one.switch.time_dependence == BENT:
+            parts.append(_times_of_nonmonotonic_switch(one, start, end, known))
             known.append(parts[-1][0])
         else:
             parts.append(found.pop(0))
     t, element, change = (jnp.concatenate([part[i] for part in parts]) for i in range(3))
     over = jnp.any(jnp.stack([part[3] for part in parts]))
-    first = [one.still.value(start) for one in timed_switches]
+    first = [one.with_fixed_constants.element_values(start) for one in timed_switches]
     outputs = [
-        one.still.operands(start)[-1] if one.switch.node.name == "searchsorted" else start[None][:0]
+        one.with_fixed_constants.operands_and_result(start)[-1]
+        if one.switch.equation.primitive_name == "searchsorted"
+        else start[None][:0]
         for one in timed_switches
     ]
-    return Times(jnp.where(t < end, t, t1), element, change, first, outputs, over)
+    return SwitchingTimes(jnp.where(t < end, t, t1), element, change, first, outputs, over)
 
 
-def _switchings_of_monotonic(
+def _times_of_monotonic_switches(
     timed_switches: list[_TimedSwitch], start: Array, end: Array
-) -> list[_Places]:
-    """Return the times at which switches change whose gap only rises or only falls in time.
+) -> list[_ChangesOfSwitch]:
+    """Return the times at which switches change whose switching functions only rise or only fall.
 
-    A switch is an equation, such as the comparison `t < 1`, with one or more elements. Its gap,
-    here t − 1, is the function of time that shows where the result changes: where the gap is zero
-    or, for functions such as `floor`, where it passes a whole number.
+    A switch is an equation, such as the comparison `t < 1`, with one or more elements. Its
+    switching function, here t − 1, is the function of time that shows where the result changes:
+    where it is zero or, for functions such as `floor`, where it passes a whole number.
 
     - `timed_switches`: the switches.
     - `start`, `end`: the times between which changes are searched for, s.
@@ -231,9 +242,13 @@ def _switchings_of_monotonic(
     starts, rises, elements, levels = [], [], [], []
     for one in timed_switches:
         element, level = (
-            np.ravel(a) for a in np.mgrid[: one.switch.size, 1 : one.switch.most_changes + 1]
+            np.ravel(a)
+            for a in np.mgrid[: one.switch.size, 1 : one.switch.most_changes_if_monotonic + 1]
         )
-        first, last = one.still.value(start), one.still.value(end)
+        first, last = (
+            one.with_fixed_constants.element_values(start),
+            one.with_fixed_constants.element_values(end),
+        )
         starts, rises = [*starts, first[element]], [*rises, last - first]
         elements, levels = [*elements, element], [*levels, level.astype(start.dtype)]
     edges = [(jnp.full(a.shape, start), jnp.full(a.shape, end)) for a in elements]
@@ -242,7 +257,7 @@ def _switchings_of_monotonic(
     for one, t, element, level, change in zip(
         timed_switches, found, elements, levels, rises, strict=True
     ):
-        rise, most = change[element], one.switch.most_changes
+        rise, most = change[element], one.switch.most_changes_if_monotonic
         there = jnp.abs(rise) >= level
         t, _ = _differentiable_times(one, jnp.where(there, t, end), element, there)
         over = jnp.any(jnp.abs(change) > most) & (most > 1)
@@ -251,35 +266,36 @@ def _switchings_of_monotonic(
     return parts
 
 
-def _switchings_of_bent(
-    timed_switch: _TimedSwitch, start: Array, end: Array, known: list[Array]
-) -> _Places:
-    """Return the times at which a switch changes, found on a grid of times.
+def _times_of_nonmonotonic_switch(
+    timed_switch: _TimedSwitch, start: Array, end: Array, other_times: list[Array]
+) -> _ChangesOfSwitch:
+    """Return the times at which a switch changes whose switching function may rise and fall.
 
-    A switch is an operation of the torque's program whose result jumps, such as the comparison
-    `t < 1`; it may have several elements. Its gap, here t − 1, is the function of time that shows
-    where the result changes: where the gap is zero or, for functions such as `floor`, where it
-    passes a whole number. This function is for a gap that may rise and fall.
+    A switch is an equation, such as the comparison `t < 1`, with one or more elements. Its
+    switching function, here t − 1, is the function of time that shows where the result changes:
+    where it is zero or, for functions such as `floor`, where it passes a whole number. The changes
+    are searched for on a grid of times.
 
     - `timed_switch`: the switch.
     - `start`, `end`: the times between which changes are searched for, s.
-    - `known`: arrays of times, s, at which other switches change. The grid includes these times.
+    - `other_times`: arrays of times, s, at which other switches change. The grid includes these
+      times.
 
     **Returns** four things: k times (k,), s; the elements (k,) that change at them; the changes
     (k,) of their values, 0 at a time at which nothing changes; and whether there are so many
     changes (more than 64 on the grid) that some are missing.
     """
-    before = jnp.concatenate(known) if known else jnp.zeros(0, start.dtype)
+    before = jnp.concatenate(other_times) if other_times else jnp.zeros(0, start.dtype)
     low, high, element, over = _intervals_with_one_change(
-        timed_switch.still, start, end, lax.stop_gradient(before)
+        timed_switch.with_fixed_constants, start, end, lax.stop_gradient(before)
     )
-    base = timed_switch.still.values(low, element)
+    base = timed_switch.with_fixed_constants.values_of_one_element(low, element)
     level = np.full(low.shape, 0.5, start.dtype)
     (t,) = _bisect([timed_switch], [(low, high)], [element], [base], [level])
-    value = timed_switch.still.values(t, element)
+    value = timed_switch.with_fixed_constants.values_of_one_element(t, element)
     there = value != base
     t, moves = _differentiable_times(timed_switch, jnp.where(there, t, end), element, there)
-    if known:
+    if other_times:
         # If the switch changes because an operand jumps, the time of the change is the time of the
         # jump.
         near, still = jnp.argmin(jnp.abs(before[None] - t[:, None]), 1), lax.stop_gradient(t)
@@ -289,13 +305,13 @@ def _switchings_of_bent(
 
 
 def _intervals_with_one_change(
-    timed_switch: _TimedSwitch, start: Array, end: Array, known: Array
+    timed_switch: _TimedSwitch, start: Array, end: Array, other_times: Array
 ) -> tuple[Array, ...]:
     """Return k intervals of time, in each of which one element of a switch changes at most once.
 
     - `timed_switch`: the switch, an equation such as the comparison `t < 1`.
     - `start`, `end`: the times between which changes are searched for on a grid, s.
-    - `known`: (j,) s, times at which other switches change. The grid includes these times.
+    - `other_times`: (j,) s, times at which other switches change. The grid includes these times.
 
     **Returns** four things: the starts (k,) of the intervals, s; their ends (k,), s; the index (k,)
     of the element for each interval; and whether the grid shows more than 64 changes, so that some
@@ -303,12 +319,13 @@ def _intervals_with_one_change(
     """
     size, dtype = timed_switch.switch.size, start.dtype
     grid = start + (end - start) * jnp.linspace(0.0, 1.0, max(256, _GRID // size), dtype=dtype)
-    if known.shape[0]:
-        beside = jnp.nextafter(known, jnp.full_like(known, -jnp.inf))
+    if other_times.shape[0]:
+        beside = jnp.nextafter(other_times, jnp.full_like(other_times, -jnp.inf))
         grid = jnp.sort(
-            jnp.concatenate([grid, jnp.clip(jnp.stack([known, beside]), start, end).ravel()])
+            jnp.concatenate([grid, jnp.clip(jnp.stack([other_times, beside]), start, end).ravel()])
         )
-    value, gap = jax.vmap(timed_switch.value)(grid), jax.vmap(timed_switch.gap)(grid)
+    value = jax.vmap(timed_switch.element_values)(grid)
+    height = jax.vmap(timed_switch.switching_functions)(grid)
     changes = jnp.ravel(value[1:] != value[:-1])
     many = jnp.sum(changes)
     # `top_k` finds the first changes; `nonzero` would take five times as long to compile.
@@ -316,9 +333,9 @@ def _intervals_with_one_change(
     row, element = cell // size, cell % size
     low = grid[row]
     high = jnp.where(jnp.arange(MOST) < many, grid[row + 1], low)
-    # Between two points of the grid an element may change twice, near the time at which its gap
-    # comes closest to zero.
-    middle, sides = jnp.abs(gap[1:-1]), jnp.stack([jnp.abs(gap[:-2]), jnp.abs(gap[2:])])
+    # Between two points of the grid an element may change twice, near the time at which its
+    # switching function comes closest to zero.
+    middle, sides = jnp.abs(height[1:-1]), jnp.stack([jnp.abs(height[:-2]), jnp.abs(height[2:])])
     calm = (
         (value[1:-1] == value[:-2]) & (value[1:-1] == value[2:]) & jnp.all(middle[None] <= sides, 0)
     )
@@ -327,12 +344,15 @@ def _intervals_with_one_change(
     row, which = cell // size, cell % size
     left = grid[row]
     right = jnp.where(jnp.isfinite(nearness), grid[row + 2], left)
-    sign = jnp.sign(gap[row + 1, which])
+    sign = jnp.sign(height[row + 1, which])
 
     def shorter(_: Any, ends: Any) -> Any:
         left, right = ends
         third = (right - left) / 3
-        ends = (timed_switch.gaps(t, which) for t in (left + third, right - third))
+        ends = (
+            timed_switch.switching_function_of_one_element(t, which)
+            for t in (left + third, right - third)
+        )
         falls = sign * next(ends) > sign * next(ends)
         return jnp.where(falls, left + third, left), jnp.where(falls, right, right - third)
 
@@ -343,7 +363,11 @@ def _intervals_with_one_change(
 
 
 def _bisect(
-    timed_switches: list[_TimedSwitch], edges: Any, elements: Any, bases: list[Array], levels: Any
+    timed_switches: list[_TimedSwitch],
+    edges: list[tuple[Array, Array]],
+    elements: Sequence[Array | np.ndarray],
+    bases: list[Array],
+    levels: Sequence[Array | np.ndarray],
 ) -> list[Array]:
     """Return for each switch the times at which its elements change, found by halving intervals.
 
@@ -367,7 +391,10 @@ def _bisect(
             timed_switches, edges, elements, bases, levels, strict=True
         ):
             middle = low + 0.5 * (high - low)
-            new = jnp.abs(one.still.values(middle, element) - base) >= level
+            new = (
+                jnp.abs(one.with_fixed_constants.values_of_one_element(middle, element) - base)
+                >= level
+            )
             halves.append((jnp.where(new, low, middle), jnp.where(new, middle, high)))
         return halves
 
@@ -379,13 +406,13 @@ def _bisect(
 
 
 def _differentiable_times(
-    timed_switch: _TimedSwitch, t: Array, element: Any, has_change: Array
+    timed_switch: _TimedSwitch, t: Array, element: Array | np.ndarray, has_change: Array
 ) -> tuple[Array, Array]:
     """Return the times at which elements of a switch change, with their derivatives.
 
-    A switch is an equation, such as the comparison `t < 1`. Its gap, here t − 1, has a fixed value
-    at these times: zero or, for functions such as `floor`, a whole number. The times are therefore
-    implicit functions of the constants of the field.
+    A switch is an equation, such as the comparison `t < 1`. Its switching function, here t − 1, has
+    a fixed value at these times: zero or, for functions such as `floor`, a whole number. The times
+    are therefore implicit functions of the constants of the field.
 
     - `timed_switch`: the switch.
     - `t`: (k,) s, the times, without derivatives.
@@ -393,9 +420,9 @@ def _differentiable_times(
     - `has_change`: (k,), whether the element does change at each time.
 
     **Returns** two things: the times (k,), s; and for each time whether it has derivatives. It has
-    none if the gap stands still there, or jumps because an operand jumps.
+    none if the switching function stands still there, or jumps because an operand jumps.
     """
-    degree = timed_switch.switch.degree
+    degree = timed_switch.switch.time_dependence
     still, moves, slope, here = (
         lax.stop_gradient(t),
         has_change,
@@ -406,17 +433,17 @@ def _differentiable_times(
     # Each of these steps of Newton's method leaves the values of `t` as they are, and makes
     # derivatives of one more order correct.
     for _ in range(1 if degree == STRAIGHT else 2):
-        gaps = lambda t: timed_switch.gaps(t, element)  # noqa: E731
-        here, slope = jax.jvp(gaps, (t,), (jnp.ones_like(t),))
+        g = lambda t: timed_switch.switching_function_of_one_element(t, element)  # noqa: E731
+        here, slope = jax.jvp(g, (t,), (jnp.ones_like(t),))
         moves = moves & jnp.isfinite(slope) & (slope != 0)
         rise = here - lax.stop_gradient(here)
         t = t - jnp.where(moves, rise / jnp.where(moves, slope, 1), 0)
     if degree == BENT:
-        # If the switch changes because an operand jumps, the gap jumps over zero, and the time is
-        # no implicit function given by the gap.
+        # If the switch changes because an operand jumps, the switching function jumps over zero,
+        # and the time is no implicit function given by it.
         beside = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
         step, eps = jnp.abs(slope) * (still - beside), jnp.finfo(t.dtype).eps
-        jump = jnp.abs(here - timed_switch.gaps(beside, element))
+        jump = jnp.abs(here - timed_switch.switching_function_of_one_element(beside, element))
         moves = moves & (jump <= 64 * (step + eps * (1 + jnp.abs(here))))
     return t, moves
 
@@ -430,48 +457,52 @@ class _ResultFromStops(NamedTuple):
 
     switch: Switch
     number: int  # the index of the switch in the analysis
-    places: slice  # the places of the switch in `Times`
+    places: slice  # the places of the switch in `SwitchingTimes`
 
     @property
-    def reads(self) -> list[Any]:
-        """Return the inputs of the equation that the result still needs."""
-        return [] if self.switch.exact else self.switch.node.inputs
+    def needed_inputs(self) -> list[Any]:
+        """Return the inputs of the equation that the method `result` reads.
 
-    def value(self, read: Callable[[Any], Any], inputs: tuple[Any, ...]) -> Any:
-        """Return the result of the equation at a time.
-
-        - `read`: a function that returns the value of an input of the equation.
-        - `inputs`: the arguments of the field. The first is the time, s; the last is a pair of the
-          stops, s, and the `Times`, which hold by how much the result changes at each stop.
+        There are none if the stops alone give the result.
         """
-        node, (stops, found) = self.switch.node, inputs[-1]
-        past = inputs[0] >= stops[self.places]
+        return [] if self.switch.stores_all_changes else self.switch.equation.inputs
+
+    def result(self, read_input: Callable[[Any], Any], field_arguments: tuple[Any, ...]) -> Array:
+        """Return the result of the equation at a time, which follows from the stops passed by then.
+
+        - `read_input`: a function that returns the value of an input of the equation.
+        - `field_arguments`: the arguments of the field. The first is the time, s; the last is
+          a pair of the stops, s, and the `SwitchingTimes`, which hold by how much the result
+          changes at each stop.
+        """
+        equation, (stops, found) = self.switch.equation, field_arguments[-1]
+        past = field_arguments[0] >= stops[self.places]
         steps, size = jnp.where(past, found.change[self.places], 0), self.switch.size
-        if self.switch.degree < BENT:
+        if self.switch.time_dependence < BENT:
             steps = steps.reshape(size, -1)
         else:
             element = found.element[self.places][None]
             own = element == np.arange(size, dtype=element.dtype)[:, None]
             steps = jnp.where(own, steps[None], 0)
         steps = jnp.sum(steps, 1)
-        here, out = found.first[self.number] + steps, node.shapes[0]
-        if node.name == "searchsorted":
+        here, out = found.first[self.number] + steps, equation.shapes[0]
+        if equation.primitive_name == "searchsorted":
             return (found.outputs[self.number] - jnp.sum(steps)).astype(out.dtype)
-        operands = [read(i) for i in self.reads]
-        if node.name in COMPARISONS:
+        operands = [read_input(i) for i in self.needed_inputs]
+        if equation.primitive_name in COMPARISONS:
             here = here > 0.5
-        if node.name == "rem":
+        if equation.primitive_name == "rem":
             x, y = operands
             here = x - y * here.reshape(out.shape).astype(x.dtype)
         here = here.reshape(out.shape).astype(out.dtype)
-        if self.switch.exact:
+        if self.switch.stores_all_changes:
             return here
-        params = node.primitive.get_bind_params(node.params)
-        return jnp.where(found.over > 0, node.primitive.bind(*operands, **params), here)
+        params = equation.primitive.get_bind_params(equation.params)
+        return jnp.where(found.over > 0, equation.primitive.bind(*operands, **params), here)
 
 
-def field_with_stops(analysis: Analysis) -> Callable[..., Array]:
-    """Return a field whose comparisons with the time are replaced by stops.
+def replace_comparisons_by_stops(analysis: Analysis) -> Callable[..., Array]:
+    """Return a vector field whose comparisons with the time are replaced by stops.
 
     The stops are the times at which the results of these comparisons change; steps end at the
     stops. The result of a comparison depends on whether a step has passed its stop.
@@ -479,19 +510,19 @@ def field_with_stops(analysis: Analysis) -> Callable[..., Array]:
     - `analysis`: the program of the field, and its switches, which are these comparisons.
 
     **Returns** the field as a function `f(constants, t, y, …, (stops, times))`. Its last argument
-    is a pair of the stops, s, and the `Times`.
+    is a pair of the stops, s, and the `SwitchingTimes`.
     """
     replaced, begin = {}, 0
     for number, switch in enumerate(analysis.switches):
         if switch.jumps:
-            places = slice(begin, begin + switch.places)
-            replaced[switch.node.outputs[0]] = _ResultFromStops(switch, number, places)
-        begin += switch.places
+            places = slice(begin, begin + switch.storable_changes)
+            replaced[switch.equation.outputs[0]] = _ResultFromStops(switch, number, places)
+        begin += switch.storable_changes
     evaluate = evaluator(analysis.program, [analysis.program.output], replaced)
     return lambda constants, *inputs: evaluate(constants, *inputs)[0]
 
 
-def separate_times(times: Array, t0: Array, t1: Array) -> tuple[Array, Array]:
+def separate_equal_times(times: Array, t0: Array, t1: Array) -> tuple[Array, Array]:
     """Return the times at which steps end (stops), in order, with equal times moved slightly apart.
 
     Two stops at the same time are moved apart by some units of round-off. Two jumps at the same

@@ -22,7 +22,7 @@ from rigidjax.motion.torques.composite import parts_of
 from rigidjax.rotation.validation import rotation_tolerance
 
 
-def checked_scene(
+def checked_body_state_and_times(
     body: Any, state0: Any, ts: Any, torque: Any, throw: bool
 ) -> tuple[Any, Any, Array]:
     """Check the body, the start and the times of a run, and return the three in one precision.
@@ -45,14 +45,14 @@ def checked_scene(
     ts, state0 = jax.tree.map(
         lambda leaf: leaf if leaf.dtype == dtype else leaf.astype(dtype), (ts, state0)
     )
-    require_fit(body, state0, torque)
-    warn_of_scale(body, torque)
+    require_compatible_types(body, state0, torque)
+    warn_of_unknown_inertia_scale(body, torque)
     if body is not None:
         body = real_or_nan(body, throw)
     return body, state0, ts
 
 
-def require_fit(body: Any, state0: Any, torque: Any) -> None:
+def require_compatible_types(body: Any, state0: Any, torque: Any) -> None:
     """Raise `TypeError` unless the body, the type of the state and the torque fit together.
 
     The arguments are those of `simulate` with the same names.
@@ -71,11 +71,11 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
         scene_of_force(torque)
     if torque is not None and not isinstance(torque, AbstractScene | MovingFrame):
         require_state_type(torque, state0)
-        _require_one_frame(torque)
+        _refuse_inertial_law_in_moving_frame(torque)
     if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
         raise TypeError(
             f"Rigid moves as well as turns: wanted MassProperties, got {type(body).__name__}"
-            + _advice_for_bare_numbers(body, moves=True)
+            + _advice_to_make_body_of_numbers(body, moves=True)
         )
     if not isinstance(state0, Rigid | Point) and not isinstance(body, Inertia):
         raise TypeError(
@@ -83,14 +83,14 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
             + (
                 "; pass body.inertia"
                 if isinstance(body, MassProperties)
-                else _advice_for_bare_numbers(body)
+                else _advice_to_make_body_of_numbers(body)
             )
         )
     if body is not None:
         _checks.require_unbatched_instance(body, type(body), "body")
 
 
-def _require_one_frame(torque: Any) -> None:
+def _refuse_inertial_law_in_moving_frame(torque: Any) -> None:
     """Raise `TypeError` if a torque contains both a law that needs the absolute body rate and the
     law `BodyInFrame`, with which the body is solved in a moving frame.
 
@@ -114,7 +114,7 @@ def _require_one_frame(torque: Any) -> None:
             )
 
 
-def one_dtype(tree: Any, name: str) -> Any:
+def common_dtype(tree: Any, name: str) -> Any:
     """Return the dtype that all arrays of a tree have; raise `TypeError` if they have several.
 
     The message of the error begins with `name`.
@@ -126,7 +126,7 @@ def one_dtype(tree: Any, name: str) -> Any:
     return kinds.pop()
 
 
-def warn_of_scale(body: Any, torque: Any) -> None:
+def warn_of_unknown_inertia_scale(body: Any, torque: Any) -> None:
     """Warn if a torque in N m acts on a body whose inertia is known only up to a factor.
 
     A torque that grows in proportion to the inertia, such as the gravity gradient, needs no
@@ -142,7 +142,7 @@ def warn_of_scale(body: Any, torque: Any) -> None:
         )
 
 
-def _advice_for_bare_numbers(numbers: Any, moves: bool = False) -> str:
+def _advice_to_make_body_of_numbers(numbers: Any, moves: bool = False) -> str:
     """Return the end of an error message, for a user who gave bare numbers in the place of a body.
 
     It says how to make a body of the `numbers`: an `Inertia` or, if `moves` is true because the

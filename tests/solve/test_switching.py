@@ -17,7 +17,7 @@ from once import once
 import rigidjax as rj
 from rigidjax import torques
 from rigidjax.solve.stops import trace_program
-from rigidjax.solve.switching import analysis_of
+from rigidjax.solve.switching import find_switches
 
 AXIS = np.array([0.0, 0.0, 1.0])
 BODY = rj.Inertia.from_principal(1.0, 1.0, 2.0)
@@ -179,7 +179,7 @@ def test_second_derivatives(power):
 )  # fmt: skip
 def test_continuous_laws_have_no_switches(law, ends):
     program = trace_program(lambda t, y: law(t, y[2]) * y, jnp.asarray(0.0), jnp.asarray(AXIS))
-    analysis = analysis_of(program.closed)
+    analysis = find_switches(program.closed)
     assert analysis is None or not analysis.unseen
     assert (0 if analysis is None else len(analysis.switches)) == ends
 

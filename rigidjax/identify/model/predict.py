@@ -30,7 +30,7 @@ from rigidjax.solve.components import split_into_scalars
 from rigidjax.solve.equal_steps import loop_stages_of_low_order, state_after_step
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.fixed_loop import fill_first_rows, take_equal_step, torque_inputs_at_start
-from rigidjax.solve.steppers import cheapest, stepper_of
+from rigidjax.solve.steppers import cheapest_method_of_order_4, stepper_of
 from rigidjax.solve.tableaus import KUTTA4
 
 # If the body turns by TURN_A_STEP rad in each step, a method of order 5 has an error of 1e-9 for
@@ -251,18 +251,18 @@ class HeldSteps(AbstractIntegrator):
             body, state0, bind(torque, torque_inputs_at_start(torque, size, inputs)), 0.0
         )
         field = equations_of_motion(body, start, torque)
-        stepper = stepper_of(loop_stages_of_low_order(cheapest(field)), field, start)
+        stepper = stepper_of(loop_stages_of_low_order(cheapest_method_of_order_4(field)), field, start)
 
         def take_step(y: PyTree, i: Array) -> tuple[PyTree, PyTree]:
             y = take_equal_step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
-            return y, stepper.state(y)
+            return y, stepper.state_of_numbers(y)
 
         def warm_up(y: PyTree, i: Array) -> tuple[PyTree, None]:
             # The torque's own states follow the inputs, while the body keeps its initial state.
             y, _ = take_step(y, i)
-            return split_into_scalars(Coupled(start.motion, stepper.state(y).own)), None
+            return split_into_scalars(Coupled(start.motion, stepper.state_of_numbers(y).own)), None
 
-        y0 = stepper.start
+        y0 = stepper.initial_numbers
         if before and isinstance(start, Coupled):
             y0, _ = lax.scan(warm_up, y0, jnp.arange(-before, 0, dtype=jnp.int32))
         still = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *jnp.shape(a))), start)
