@@ -245,9 +245,7 @@ def _complete_first_kind(m1: Array) -> Array:
 
 
 @_complete_first_kind.defjvp
-def _complete_first_kind_jvp(
-    primals: tuple[Array], tangents: tuple[Tangent]
-) -> tuple[Array, Array]:
+def _complete_first_kind_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     """Return Legendre's complete integral of the first kind K(m) and its tangent (its change) for a
     change of 1 − m: the rule by which JAX differentiates K.
 

@@ -64,12 +64,12 @@ def cubic_coefficients(
 ) -> tuple[Array, Array, Array]:
     """Return the three coefficients of a cubic polynomial that interpolates within a step.
 
-    They are the coefficients F0, F1 and F2 of `runge_kutta.change_within_step`, which evaluates the polynomial.
+    They are the coefficients F0, F1 and F2 of `runge_kutta.change_within_step`, which evaluates the
+    polynomial.
 
-    - `change`
-    over the step, polynomial over the step, an array of a state.
-    - `h`: the length of the step, are
-    `left` and `left_slope`, `right_slope`: the slopes of the polynomial at the start and the end of the
+    - `change`: the change of the polynomial over the step, an array of a state.
+    - `h`: the length of the step, s.
+    - `left_slope`, `right_slope`: the slopes of the polynomial at the start and the end of the
       step, with the shape of `change`.
     """
     return change, h * left_slope - change, 2 * change - h * (left_slope + right_slope)

@@ -127,6 +127,7 @@ class _StepsInPieces:
             return ([a + b for a, b in zip(total, more, strict=True)], bar), None
 
         def piece(sums: tuple[Arrays, Arrays], y: Arrays, begin: Array, many: int) -> Any:
+            states: Any
             _, states = self.take_steps(constants, y, begin, many, keep_starts=True)
             steps = begin + jnp.arange(many, dtype=jnp.int32)
             return lax.scan(one, sums, (states, steps), reverse=True)[0]

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
-from jax.tree_util import PyTreeDef
 from jaxtyping import Array
 
 from rigidjax.solve import adaptive_loop, adjoint
@@ -110,7 +109,7 @@ def run_with_replayed_derivatives(
 
 def _batch_method_over_bodies(
     method: Method,
-    trees: tuple[PyTreeDef, PyTreeDef],
+    trees: tuple[Any, Any],
     layout: Layout,
     constants: Arrays,
     arrays_of_bodies: Arrays,
@@ -157,7 +156,7 @@ def _batch_method_over_bodies(
 def _run_bodies(
     return_record: bool,
     method: Method,
-    trees: tuple[PyTreeDef, PyTreeDef],
+    trees: tuple[Any, Any],
     layout: Layout,
     constants: Arrays,
     arrays_of_bodies: Arrays,
@@ -203,7 +202,7 @@ HasTangent = tuple[list[bool], list[bool]]
 def _unpack_recorded_run(
     has_tangent: HasTangent,
     method: Method,
-    trees: tuple[PyTreeDef, PyTreeDef],
+    trees: tuple[Any, Any],
     layout: Layout,
     constants: Arrays,
     arrays_of_bodies: Arrays,
@@ -252,7 +251,7 @@ def _unpack_recorded_run(
 def _tangents_of_states(
     has_tangent: HasTangent,
     method: Method,
-    trees: tuple[PyTreeDef, PyTreeDef],
+    trees: tuple[Any, Any],
     layout: Layout,
     constants: Arrays,
     arrays_of_bodies: Arrays,
@@ -289,7 +288,7 @@ def _tangents_of_states(
 def _cotangents_of_inputs(
     has_tangent: HasTangent,
     method: Method,
-    trees: tuple[PyTreeDef, PyTreeDef],
+    trees: tuple[Any, Any],
     layout: Layout,
     constants: Arrays,
     arrays_of_bodies: Arrays,
@@ -311,5 +310,7 @@ def _cotangents_of_inputs(
     method, chosen, run, record, bars = _unpack_recorded_run(
         has_tangent, method, trees, layout, constants, arrays_of_bodies
     )
-    total, of_run = adjoint.cotangents_of_run(method, chosen, run, record, bars, any(has_tangent[1][:3]))
+    total, of_run = adjoint.cotangents_of_run(
+        method, chosen, run, record, bars, any(has_tangent[1][:3])
+    )
     return [*total, *(a for a, moves in zip(of_run, has_tangent[1], strict=False) if moves)]

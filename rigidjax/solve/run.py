@@ -179,7 +179,7 @@ def convert_to_forward_time(
     field: Callable[..., Any],
     condition: Callable[..., Any] | None,
     ts: Array,
-) -> tuple[Callable[..., Any], Callable[..., Any] | None, Array, list[Array]]:
+) -> tuple[Callable[..., Any], Any, Array, list[Array]]:
     """Convert a run backwards in time to a run forwards in time, which uses the time s = σt.
 
     **Arguments:**

@@ -374,7 +374,9 @@ def _change_to_unit_length(y: Atoms, change: Atoms, example_state: Any) -> Atoms
     # steps bring the length back to 1.
     less = barrier(excess * (0.5 - excess * (0.375 - 0.3125 * excess)))
     q = jnp.stack([d - less * a for d, a in zip(moved, after, strict=True)])
-    return split_into_scalars(eqx.tree_at(lambda s: motion_of(s).q, join_scalars(change, example_state), q))
+    return split_into_scalars(
+        eqx.tree_at(lambda s: motion_of(s).q, join_scalars(change, example_state), q)
+    )
 
 
 def _stepper_of_splitting(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:

@@ -453,6 +453,7 @@ def _number_of_searchsorted_edges(equation: Equation) -> int:
 
     - `equation`: the equation that calls `searchsorted`.
     """
+    body: Any
     ((body, _),) = _inner_programs(equation.params)
     return int(np.prod(body.invars[0].aval.shape))
 

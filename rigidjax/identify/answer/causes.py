@@ -132,7 +132,9 @@ def _euler_residual_and_tensor_margin(
       permutation or a mirror of the axes, or another unit.
     - `sign`: the factor by which the torque is multiplied.
     """
-    balances = [integrated_euler_equations(recording, torque, correction) for recording in recordings]
+    balances = [
+        integrated_euler_equations(recording, torque, correction) for recording in recordings
+    ]
     matrix, side, momentum = (np.concatenate(part) for part in zip(*balances, strict=True))
     components, margin = inertia_components_and_feasibility_margin(matrix, sign * side)
     left = np.linalg.norm(matrix @ components - sign * side)

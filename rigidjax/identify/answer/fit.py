@@ -182,7 +182,7 @@ def fit(
 _ON_CPU = "computed on the CPU, which is faster than a GPU for so few readings"
 
 
-def _cpu_if_faster(model: Model) -> jax.Device | None:
+def _cpu_if_faster(model: Model) -> Any:
     """Return the CPU if a fit of the `model` is faster there than on the default device, else
     `None`.
 

@@ -251,7 +251,9 @@ class HeldSteps(AbstractIntegrator):
             body, state0, bind(torque, torque_inputs_at_start(torque, size, inputs)), 0.0
         )
         field = equations_of_motion(body, start, torque)
-        stepper = stepper_of(loop_stages_of_low_order(cheapest_method_of_order_4(field)), field, start)
+        stepper = stepper_of(
+            loop_stages_of_low_order(cheapest_method_of_order_4(field)), field, start
+        )
 
         def take_step(y: PyTree, i: Array) -> tuple[PyTree, PyTree]:
             y = take_equal_step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
