@@ -290,5 +290,5 @@ def _checked_wheel_property(
         return None
     numbers = base.scalar_or_one_each(value, count, name)
     return _checks.check_if_known(
-        _checks.require_positive, numbers, name, requirement, zero=requirement == "≥ 0"
+        _checks.require_positive, numbers, name, requirement, allow_zero=requirement == "≥ 0"
     )
