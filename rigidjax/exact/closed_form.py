@@ -46,7 +46,7 @@ def closed_form_constants(moments: Triple, momentum: Triple) -> ClosedFormConsta
     """Return the constants of a free motion, from which its body momentum and its rotation follow
     at any time.
 
-    - `moments`: the principal moments I₁ ≤ I₂ ≤ I₃, any of which may be equal.
+    - `moments`: the principal moments I₁ ≤ I₂ ≤ I₃; two of them, or all three, may be equal.
     - `momentum`: the three components of the body momentum at time 0, in the principal axes.
     """
     (i1, i2, i3), (p1, p2, p3) = moments, momentum
@@ -87,7 +87,8 @@ def reduce_time(u: Scalar, half_period: Scalar, modulus: Modulus) -> ReducedTime
 
     - `half_period`: the length of one half period, which is infinite on the separatrix.
     - `modulus`: the parameters of the functions, which tell whether the motion is on the
-      separatrix, where it comes to rest.
+      separatrix. There the body ends in a steady spin about its middle axis, and the time is
+      clipped to the time before this spin.
     """
     count = jnp.round(u / half_period)
     rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half_period)
@@ -97,15 +98,16 @@ def reduce_time(u: Scalar, half_period: Scalar, modulus: Modulus) -> ReducedTime
 def restore_half_periods(
     constants: ClosedFormConstants, functions: Elliptic, half_time: ReducedTime
 ) -> tuple[Elliptic, Scalar]:
-    """Return two things: the elliptic functions S, C, D at a time, from their values at the reduced
-    time; and that part of the phase ξ (an angle) at this time which `functions` does not contain.
+    """Return two things: the elliptic functions S, C, D at the time t/2, from their values at a
+    reduced time; and the angle by which the phase ξ at t/2 is larger than the phase at the reduced
+    time.
 
     - `constants`: the constants of the motion.
     - `functions`: S, C, D and ξ at the reduced time `half_time.near`.
-    - `half_time`: the reduced time, and the number of half periods that were subtracted.
+    - `half_time`: the reduced time, and the number of half periods that were subtracted from t/2.
 
-    The part of the phase belongs to the half periods that were subtracted and, on the separatrix,
-    to the time in which the momentum rests on the middle axis.
+    The angle belongs to the half periods that were subtracted and, on the separatrix, to the time
+    in which the body spins steadily about its middle axis.
     """
     big = jnp.maximum(constants.modulus.p, constants.modulus.q)
     whole = jnp.where(half_time.halves == 0, 0.0, half_time.halves)
@@ -136,9 +138,10 @@ def restore_elliptic_identity(functions: Elliptic, modulus: Modulus) -> Elliptic
     - `functions`: S, C and D, with errors of round-off from the doublings.
     - `modulus`: the parameters p and q of the functions.
 
-    Near the middle axis the terms of the momentum with C and with SD cancel. An equal error of C
-    and D, from the doublings, then cancels as well; an error of C alone or of D alone does not
-    cancel, and the identity removes this error.
+    If the momentum is near the middle axis, its first component is a small difference of two terms,
+    one with the factor C and one with the factor SD. An equal error of C and D, from the doublings,
+    cancels in this difference; an error of C alone or of D alone does not cancel, and the identity
+    removes this error.
     """
     gs = modulus.gap * functions.S * functions.S
     other = jnp.sqrt(
@@ -156,7 +159,7 @@ def momentum_from_elliptic_functions(constants: ClosedFormConstants, functions: 
 
     - `constants`: the constants of the motion, which also fix the labels 1, 2, 3 of the principal
       axes.
-    - `functions`: the elliptic functions S, C and D at the time that is meant.
+    - `functions`: the elliptic functions S, C and D at the time for which the momentum is computed.
     """
     p1, p2, p3 = constants.P
     functions = restore_elliptic_identity(functions, constants.modulus)

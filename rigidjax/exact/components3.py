@@ -15,8 +15,8 @@ from rigidjax.rotation.linalg3 import cross_components as cross
 Triple = tuple[Scalar, ...]
 QuaternionEntries = tuple[Scalar, ...]
 SymmetricEntries = tuple[Scalar, ...]
-# For two symmetric matrices a and b, ½ a : b is the sum of the products of their entries, weighted
-# by these numbers.
+# For two symmetric matrices a and b, each given by six entries, ½ Σᵢⱼ aᵢⱼ bᵢⱼ is the sum of the six
+# products of their entries, each multiplied by its number in HALF.
 HALF = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
 
 
@@ -103,7 +103,7 @@ def half_product(q: QuaternionEntries, vector: Triple) -> QuaternionEntries:
 
 def change_by_inverse_rotation(q: QuaternionEntries, vector: Triple) -> Triple:
     """Return the three components of R(q)ᵀ v − v, where v = `vector` and R(q) is the rotation by
-    the unit quaternion q; the change is computed without a difference of large numbers.
+    the unit quaternion q; the change is computed without a difference of nearly equal numbers.
     """
     w, *axis = q
     first = cross(vector, tuple(axis))

@@ -16,9 +16,9 @@ E₂ = Π·KΠ is constant:
 
     Π(t)·θ = ½ t δE₂ + ½ δK : ∫₀ᵗ Π Πᵀ dt + E₂ δt.
 
-Both δΠ(t) − δΠ(0) and R − 1 are proportional to the angle of the turn. The division of these
-formulas by h² therefore loses no digits, except near rest, where the derivative comes from a Taylor
-series.
+Here A : B is the sum of AᵢⱼBᵢⱼ over i and j. Both δΠ(t) − δΠ(0) and R − 1 are proportional to the
+angle of the turn. The division of these formulas by h² therefore loses no digits, except near rest,
+where the derivative comes from a Taylor series.
 """
 
 import functools
@@ -385,7 +385,8 @@ class MotionDerivatives(NamedTuple):
     rate: VectorDerivatives
 
 
-# The motion, its derivatives, and the pair from which the derivatives are computed.
+# The motion, its derivatives, and the pair from which these derivatives are computed: the
+# derivatives of Π(t) − Π(0), and the six entries of the matrix ∫ Π Πᵀ dt from 0 to t.
 MotionAndDerivatives = tuple[Motion, MotionDerivatives, tuple[VectorDerivatives, SymmetricEntries]]
 
 
@@ -398,8 +399,9 @@ def motion_and_derivatives(
     from time 0 to t, body rate Ω(t)); the derivatives of the motion; and the pair (rows, G) from
     which the derivatives are computed.
 
-    - `inertia`: the six entries of the inertia tensor in principal axes, as for
-      `free_momentum_and_rotation`.
+    - `inertia`: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes,
+      in ascending order of the moments. The last three entries are zero in value, but their
+      derivatives are not.
     - `momentum`: the three components of the body momentum Π(0).
     - `t`: the time.
 
@@ -423,9 +425,10 @@ def _motion_and_derivatives_jvp(
     primals: tuple[SymmetricEntries, Triple, Scalar],
     tangents: tuple[SymmetricEntries, Triple, Scalar],
 ) -> tuple[MotionAndDerivatives, MotionAndDerivatives]:
-    """Return two things: the motion of a free body and its first derivatives, as
-    `motion_and_derivatives` gives them; and the changes of all these numbers for a change of the
-    inputs. By this rule JAX takes second derivatives of a free motion.
+    """Return two things: the result of `motion_and_derivatives` (the motion of a free body, its
+    first derivatives, and the pair from which these derivatives are computed); and the changes of
+    all numbers in this result for a change of the inputs. By this rule JAX takes second derivatives
+    of a free motion.
 
     - `primals`: the three inputs of `motion_and_derivatives`: the six entries
       (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes, the three components of the
@@ -520,8 +523,9 @@ def derivative_variables(
       a change.
 
     Here kij are the entries of K = I⁻¹, and dij = kii − kjj. The variable k33 is the least diagonal
-    entry. With k33, the thickness of a rod changes d12 alone; with k11 instead, the thickness would
-    change both k11 and d12 by a term of 1/I₁², and the two terms would cancel.
+    entry. It is chosen for the sake of thin rods, where I₁ is small: the thickness of the rod then
+    changes d12 alone. With k11 in the place of k33, the thickness would change both k11 and d12 by
+    a term of 1/I₁², and the two terms would cancel.
     """
     differences, k, _ = inverse_inertia
     return jnp.stack(

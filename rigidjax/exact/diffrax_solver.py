@@ -33,7 +33,8 @@ class FreeInterpolation(dfx.AbstractLocalInterpolation):
         self, t0: RealLike, t1: RealLike | None = None, left: bool = True
     ) -> PyTree[Array]:
         """Return the state at the time `t0`; if `t1` is given, return the state at `t1` minus the
-        state at `t0`. The side `left` of a jump has no meaning here, because there is no jump.
+        state at `t0`. The argument `left`, the side of a jump, is not used, because there is no
+        jump.
         """
         motion = FreeBody(self.inertia, self.y0)
         state = motion(self.direction * (t0 - self.t0))

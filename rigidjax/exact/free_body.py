@@ -31,7 +31,9 @@ class FreeBody(eqx.Module):
     """Hold the motion of a free body for all times: call the object with one time, or its method
     `at` with many times.
 
-    The constants of the motion are computed once. **Arguments:** as for `free_body`.
+    The constants of the motion are computed once. **Arguments:** `inertia` of the body about its
+    centre of mass, kg m², body frame; `state0` the state at time 0, a `Spin` or an `Attitude`.
+    `free_body` has the same two arguments.
 
     >>> motion = FreeBody(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([0.0, 0.0, 1.0]))
     >>> motion(10.0).omega
@@ -54,11 +56,11 @@ class FreeBody(eqx.Module):
         self.state0 = state0
 
     def __call__(self, t: ScalarLike) -> HasSpin:
-        """Return the state at the time `t`, a scalar, s since `state0`."""
+        """Return the state at the time `t`, one number, in seconds since `state0`."""
         return self.at(_checked_time(t, self.state0.omega))
 
     def at(self, ts: Float[Array, "*n"]) -> HasSpin:
-        """Return the states at the times `ts` (n,), s since `state0`.
+        """Return the states at the times `ts` (n,), in seconds since `state0`.
 
         The result is that of `jax.vmap` over the times, but the method compiles sooner.
 
@@ -68,7 +70,8 @@ class FreeBody(eqx.Module):
                [0., 0., 1.]], dtype=float64)
         """
         t = ts.astype(self.tensor.dtype)
-        # Beyond this angle the dtype has no digit within one turn, and the state is unknown.
+        # If the body turns by more than 1/eps rad, the dtype holds no digit of the angle within one
+        # turn: the state is then unknown, and the time becomes NaN.
         turned = jnp.abs(t) * jnp.max(jnp.abs(self.state0.omega))
         t = jnp.where(turned <= 1 / jnp.finfo(t.dtype).eps, t, jnp.nan)
         since = times_power_of_two(t, self.exponent)
@@ -85,8 +88,8 @@ class FreeMotion(eqx.Module):
     """Hold the motion of a free body for any state: a `FreeBody`, and for a `Rigid` also the
     straight path of the centre of mass.
 
-    Call the object with a time, or with times (n,), s since `state0`. A time in which the body
-    turns by more than 1/eps rad gives NaN.
+    Call the object with a time, or with times (n,), in seconds since `state0`. If the body turns by
+    more than 1/eps rad in a time, where eps is the machine epsilon of the dtype, the result is NaN.
     """
 
     state0: Any
@@ -99,7 +102,9 @@ class FreeMotion(eqx.Module):
         self.turning = FreeBody(body if isinstance(body, Inertia) else body.inertia, turning)
 
     def __call__(self, since: Float[Array, "*n"]) -> Any:
-        """Return the states at the times `since`, one or (n,), s since `state0`."""
+        """Return the states at the times `since`, one time or times (n,), in seconds since
+        `state0`.
+        """
         turned: Any = self.turning.at(since)
         if not isinstance(self.state0, Rigid):
             return turned
@@ -137,8 +142,8 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     turns by more than 1/eps rad gives NaN.
 
     Derivatives with respect to all arguments are closed forms, correct to second order at all these
-    points, as functions of the whole tensor. They grow with e^{λt} on an unstable axis, up to λt ≈
-    150 (float32: 40).
+    points, as functions of the whole tensor. For a spin about the unstable middle axis they grow as
+    e^{λt}, where λ is the rate at which a small deviation grows, up to λt ≈ 150 (float32: 40).
 
     **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, a `Rigid`;
     for known values also for NaN, a tensor that no mass has (a traced one gives NaN), a moment of

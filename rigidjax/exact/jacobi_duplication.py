@@ -55,8 +55,10 @@ class Modulus(NamedTuple):
 
 
 class IterationLimits(NamedTuple):
-    """Hold the number of doublings, the number of steps of the arithmetic–geometric mean, and the
-    limits of the motion for one dtype.
+    """Hold the number of doublings, the number of steps of the arithmetic–geometric mean, and two
+    limits of a free motion, all for one dtype.
+
+    Here u is the time, and p and q are the parameters of the elliptic functions of the motion.
     """
 
     doublings: int  # the number of doublings from u/2^doublings to u
@@ -69,9 +71,9 @@ def iteration_limits(dtype: jnp.dtype) -> IterationLimits:
     """Return the numbers of steps and the limits of the elliptic functions for the dtype float32 or
     float64.
 
-    The number of doublings is enough for the longest quarter period, `ln(4/√floor)` in units of
-    1/√max(p, q), where p and q are the parameters of the elliptic functions; and at this time C⁴
-    must not underflow.
+    The number of doublings is enough for the longest quarter period, which is ln(4/√floor)/√max(p,
+    q), where p and q are the parameters of the elliptic functions. The limit `floor` is chosen so
+    that C⁴, where C is one of these functions, does not underflow in the doublings.
     """
     wide = dtype == jnp.float64
     return IterationLimits(9, 11, 1e-64, 75.0) if wide else IterationLimits(7, 9, 1e-33, 20.0)
@@ -87,7 +89,8 @@ def is_aperiodic(modulus: Modulus) -> Bool[Array, ""]:
 
 
 def clip_time_on_separatrix(reduced_time: Scalar, modulus: Modulus) -> Scalar:
-    """Return a time, clipped on the separatrix to the time after which the motion is at rest.
+    """Return a time; on the separatrix it is clipped to the time after which the motion is taken as
+    a steady spin about the middle axis.
 
     - `reduced_time`: the time, from which whole half periods were subtracted.
     - `modulus`: the parameters of the elliptic functions, which tell whether the motion is on the
@@ -111,8 +114,8 @@ def elliptic_functions_at_double_time(
     - `modulus`: the parameters p and q in these equations.
     - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
 
-    The phase is ξ(2u) = 2ξ + arctan(B/A), where A and B are `a` and `b` below; it is computed as a
-    product of complex numbers.
+    The phase is ξ(2u) = 2ξ + arctan(B/A), with A = C² + pS²D² + μS²(C²D² + C² + D²) and B = 2κS³CD,
+    both at the time u; it is computed as a product of complex numbers.
     """
     S, C, D, x, y = functions
     s, cc, dd = S * S, C * C, D * D
@@ -134,9 +137,9 @@ def elliptic_taylor_series(
     time: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar
 ) -> Elliptic:
     """Compute the elliptic functions S, C, D and the phase ξ at a short time by Taylor series,
-    exact to round-off for `√max(p, q) |time| ≤ 0.15`.
+    exact to round-off for √max(p, q) |u| ≤ 0.15 in float64 and ≤ 0.31 in float32.
 
-    - `time`: the time u since S = 0. In float32 the bound is 0.31.
+    - `time`: the short time u.
     - `modulus`: the parameters p and q of S, C and D: S solves dS/du = CD with S(0) = 0, where
       C² = 1 − pS² and D² = 1 − qS².
     - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫ S²/(1 + μS²) du`.
@@ -208,8 +211,11 @@ def elliptic_functions(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Sc
 
 
 class HalfPeriod(NamedTuple):
-    """Hold three numbers of half a period of the elliptic function S: the length in time, the phase
-    ξ at its end, and the mean of S² over it.
+    """Hold three numbers of half a period of the elliptic function S, which solves (dS/du)² = (1 −
+    pS²)(1 − qS²) with S(0) = 0 for two numbers p and q of the motion.
+
+    The phase ξ is the angle κ ∫ S²/(1 + μS²) du from 0, with two more numbers μ and κ of the
+    motion.
     """
 
     time: Scalar  # infinite on the separatrix

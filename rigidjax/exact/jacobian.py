@@ -1,9 +1,10 @@
 """Compute the first derivatives of the free momentum in closed form, in principal axes.
 
-Let E be the one of the functions D and C that has no zero, let f = S/E, and let `Y₂ = ∫ S²` and `Y
-= ∫ f²` be integrals from time 0. The changes δS, δC, δD for changes of t, p and q follow from the
-derivative `∂τ/∂p = ½ ∫ S²/C² …` of the time τ as a function of S, without any division by p, q or p
-− q:
+Let S, C and D be the elliptic functions of a free body, with C² = 1 − pS² and D² = 1 − qS²
+(`jacobi_duplication`). Let E be D if p > q, else C: this function has no zero. Let f = S/E, and let
+`Y₂ = ∫ S²` and `Y = ∫ f²` be integrals from time 0. The changes δS, δC, δD for changes of t, p and
+q follow from the derivative `∂τ/∂p = ½ ∫ S²/C² …` of the time τ as a function of S, without any
+division by p, q or p − q:
 
     θ = δt + ½ δ|p−q| Y + ½ δmax(p,q) Y₂
     δS = C D θ − ½ S³ δmax,   δC = −p S D θ − ½ S² C δmax (+ ½ S² δ|p−q|/C if q > p),   …
@@ -34,9 +35,13 @@ from rigidjax.exact.sigma_form import Differences, motion_invariants
 
 
 class Integrals(NamedTuple):
-    """Hold the elliptic functions S, C and D of a free body at some time u, and the integrals Y₂ =
-    ∫ S² and Y = ∫ S²/E² over the time from 0 to u, where E is the one of the functions D and C that
-    has no zero.
+    """Hold the elliptic functions of a free body at some time u, and two integrals over the time
+    from 0 to u.
+
+    - `f`: the functions S, C and D, with C² = 1 − pS² and D² = 1 − qS² for two numbers p and q of
+      the motion, and their phase.
+    - `y2`: the integral Y₂ = ∫ S² du.
+    - `y`: the integral Y = ∫ S²/E² du, where E is D if p > q, else C: this function has no zero.
     """
 
     f: Elliptic
@@ -63,10 +68,12 @@ def momentum_jacobian_and_integral(
     - `inverse_inertia`: the differences dij, and the off-diagonal entries kij, which must be zero.
     - `momentum`: the three components of Π(0).
     - `t`: the time.
-    - `half_time_integrals`: the elliptic functions and integrals at half of the reduced time. C and
-      D belong to the axes as `inverse_inertia` numbers them.
-    - `halves`: the number of half periods by which the time t was reduced.
-    - `duration_of_halves`: the length of these half periods together.
+    - `half_time_integrals`: the elliptic functions and integrals at the reduced half time, which is
+      t/2 less a whole number of half periods. C² = 1 − pS² and D² = 1 − qS² hold with the p and q
+      that `sigma_form.motion_invariants` gives for the axes in the order of `inverse_inertia`.
+    - `halves`: the number of half periods that were subtracted from t/2.
+    - `duration_of_halves`: the duration of 2 × `halves` half periods, by which the whole time t was
+      thus reduced.
     - `mean_of_s_squared`: the mean of S² over a period, where S is the first elliptic function.
     """
     d12, d13, d23 = inverse_inertia[:3]
@@ -84,8 +91,9 @@ def momentum_jacobian_and_integral(
         halves == 0, 1.0, jnp.abs(gap)
     )
 
-    # The numbers t12, t13 and t23 are the divided differences of T = diag(D, 1, C): the entries 12,
-    # 13 and 23 of T change by them times the changes of k12, k13 and k23.
+    # If k12 changes, the entry 12 of T = diag(D, 1, C) changes by t12 times the change of k12; t13
+    # and t23 are such factors for the entries 13 and 23. The three factors are divided differences
+    # of T.
     s = half_time_integrals.f.S * half_time_integrals.f.S
     cc, dd = (
         half_time_integrals.f.C * half_time_integrals.f.C,
@@ -100,8 +108,8 @@ def momentum_jacobian_and_integral(
     ss, tt = S * S, jnp.where(three, D, C)
     rw = 1.0 / (tt * tt + ss * z)
     m1, m2, m3 = y1 * rw, y2 * rw, y3 * rw
-    # For short times compute C − W, CD − W and D − W from C − 1, D − 1 and W − 1, which are small
-    # and are found without a subtraction.
+    # Let W = 1/rw be the divisor. For short times compute C − W, CD − W and D − W from C − 1, D − 1
+    # and W − 1, which are small and are found without a subtraction.
     w1 = ss * (z - jnp.where(three, q, p))
     short = jnp.abs(w1) < 0.5
     c1 = jnp.where(C > 0, -p * ss / (1.0 + jnp.abs(C)), C - 1.0)
@@ -153,8 +161,8 @@ def momentum_jacobian_and_integral(
 
     rows = jax.vmap(lambda e: tangent(*e))(jnp.eye(10, dtype=t.dtype))
 
-    # The entry 22 of G is computed first, then the entries 11 and 33 by the integrals of A₁ and A₃,
-    # then the off-diagonal entries.
+    # The entry 22 of G is computed first. The entries 11 and 33 follow from it, because A₁ and A₃
+    # are constants of the motion. The off-diagonal entries are computed last.
     g22 = A1 * A3 * grown2 + (S * C * D * p2 * p2 + ss * p2 * u2) * rw
     still = d13 == 0
     rest = (g22 - p2 * p2 * t) / jnp.where(still, 1.0, d13)
@@ -169,12 +177,13 @@ def momentum_jacobian_and_integral(
 def elliptic_functions_and_integrals(
     u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar
 ) -> Integrals:
-    """Return the elliptic functions S, C, D of a free body at the time u, as `elliptic_functions`
-    does, and the integrals of S² and of S²/E² from 0 to u, where E is the one of D and C that has
-    no zero.
+    """Return the elliptic functions S, C, D of a free body and their phase ξ at the time u, and the
+    integrals of S² and of S²/E² from 0 to u. Here E is D if p > q, else C: this function has no
+    zero.
 
     - `u`: a reduced time: |u| is at most a quarter period.
-    - `modulus`: the parameters p and q of S, C and D.
+    - `modulus`: the parameters p and q of S, C and D: S solves dS/du = CD with S(0) = 0, where C² =
+      1 − pS² and D² = 1 − qS².
     - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
     """
     n = iteration_limits(u.dtype).doublings
@@ -197,10 +206,11 @@ def elliptic_functions_and_integrals(
 def functions_and_integrals_at_double_time(
     start: Integrals, modulus: Modulus, mu: Scalar, phase_factor: Scalar
 ) -> Integrals:
-    """Return the elliptic functions of a free body and their integrals at the time 2u, from their
-    values at the time u.
+    """Return the elliptic functions S, C, D of a free body and the integrals of S² and of S²/E²
+    from 0 to 2u, from the functions and integrals at the time u. Here E is D if p > q, else C, with
+    C² = 1 − pS² and D² = 1 − qS².
 
-    - `start`: the values at the time u.
+    - `start`: the functions and integrals at the time u.
     - `modulus`: the parameters p and q of the elliptic functions.
     - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
     """

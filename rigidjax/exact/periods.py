@@ -23,7 +23,8 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
     In this time the angular momentum goes once round the axis of the smallest or largest moment in
     the body frame (5.41 days about the long axis for 4179 Toutatis). For a spin about a stable axis
-    it is the period of small wobbles. It is infinite on the separatrix, for a sphere and at rest.
+    the result is the period of small wobbles. The result is infinite on the separatrix, for a
+    sphere and at rest.
 
     **Arguments:**
 
@@ -32,9 +33,9 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
     **Returns** the period, a scalar, s.
 
-    `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, with the eigenvalues e₁, e₂, e₃ of the matrix E in
-    `rigidjax.exact.sigma_form`, of which e₁ is the largest (DLMF 19.8.5; Landau and Lifshitz,
-    Mechanics, eq 37.11).
+    `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, where agm is the arithmetic–geometric mean, and e₁, e₂, e₃
+    are the eigenvalues of the matrix E in `rigidjax.exact.sigma_form`; e₁ is the largest (DLMF
+    19.8.5; Landau and Lifshitz, Mechanics, eq 37.11).
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
@@ -54,10 +55,12 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     momentum circles no axis (separatrix, sphere) the result is the limit, `2π I₂/|L|`. It is
     infinite at rest.
 
-    **Arguments:** as for `body_period`. **Returns** a scalar, s.
+    **Arguments:** `inertia` of the body about its centre of mass, kg m²; `omega0` (3,) the body
+    rate at any moment, rad/s, body frame. **Returns** a scalar, s.
 
-    In one body period the axis turns by the angle `χ ∓ 2π`, where χ is the angle by which the body
-    turns about its momentum: a complete integral of the third kind (DLMF 19.8.7).
+    In one body period this axis turns by the angle χ + 2π if it has the largest moment, and by χ −
+    2π if it has the smallest. Here χ is the angle by which the body turns about its momentum, a
+    complete integral of the third kind (DLMF 19.8.7).
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
@@ -174,9 +177,10 @@ def _momentum_integral_of_period(
     - `momentum`: the three components of the body momentum.
     - `period`: the period of the body rate, s.
 
-    Over a whole period the products of two components cancel. The squares have the means
-    `A₃(1 − p⟨S²⟩)/d₁₃`, `A₁A₃⟨S²⟩` and `A₁(1 − q⟨S²⟩)/d₁₃`, with the numbers A₁, A₃, p and q of
-    `sigma_form.motion_invariants`, d₁₃ = 1/I₁ − 1/I₃, and the mean ⟨S²⟩ of `half_period`.
+    Over a whole period the products of two components cancel. The squares of the three components
+    have the means `A₃(1 − p⟨S²⟩)/d₁₃`, `A₁A₃⟨S²⟩` and `A₁(1 − q⟨S²⟩)/d₁₃`, with the numbers A₁, A₃,
+    p and q of `sigma_form.motion_invariants`, d₁₃ = 1/I₁ − 1/I₃, and the mean ⟨S²⟩ of
+    `half_period`.
     """
     body, _, _ = inverse_inertia_and_energy(inertia, momentum)
     v = sigma_form.motion_invariants(body, momentum)
@@ -197,15 +201,17 @@ def _momentum_integral_of_period_jvp(
     primals: tuple[SymmetricEntries, Triple, Scalar],
     tangents: tuple[SymmetricEntries, Triple, Scalar],
 ) -> tuple[SymmetricEntries, SymmetricEntries]:
-    """Return two things: the six entries of the matrix G of `_momentum_integral_of_period`, and
-    their change for a change of the inputs. By this rule JAX takes second derivatives of a period.
+    """Return two things: the six entries of the matrix G = ∫ Π Πᵀ dt over one period of the body
+    rate, where Π is the body momentum; and the changes of these entries for a change of the inputs.
+    By this rule JAX takes second derivatives of a period.
 
-    - `primals`: the three inputs of `_momentum_integral_of_period`.
+    - `primals`: the six entries of the inertia tensor in principal axes, the three components of
+      the body momentum, and the period, s.
     - `tangents`: the changes of these three inputs, in the same form.
 
-    The closed form holds for a diagonal inertia tensor alone. Its change with the other entries is
-    that of the integral from 0 to a time, which is known for the whole tensor. The program of this
-    change takes seconds to compile, and first derivatives do not need it.
+    The closed form holds for a diagonal inertia tensor alone. The change is therefore taken from
+    the integral of Π Πᵀ from 0 to a time t, whose derivative is known for the whole tensor. The
+    program of this change takes seconds to compile, and first derivatives do not need it.
     """
     change = jax.jvp(lambda *at: motion_and_derivatives(*at)[2][1], primals, tangents)[1]
     return _momentum_integral_of_period(*primals), change

@@ -20,12 +20,13 @@ _SWEEPS = 6
 
 
 def principal_tensor_and_axes(tensor: Mat3) -> tuple[SymmetricEntries, Mat3]:
-    """Return two things: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in
-    principal axes, with the moments ascending; and the rotation matrix A (3, 3) whose columns are
-    these axes.
+    """Return two things: the inertia tensor in principal axes, as the six entries (11, 22, 33, 12,
+    13, 23), of which the first three are the moments in ascending order; and the rotation matrix A
+    (3, 3) whose columns are these axes.
 
     `tensor` (3, 3) is the inertia tensor in the body frame. The method is Jacobi's, in which small
-    moments keep their digits. A is held fixed in derivatives.
+    moments keep their digits. Derivatives treat A as a constant, because the axes have no
+    derivative where two moments are equal.
     """
     columns, moments = _axes_and_moments(jax.lax.stop_gradient(tensor))
     axes = jnp.stack([jnp.stack(row) for row in columns])
@@ -41,7 +42,8 @@ def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> SymmetricEntrie
     - `axes`: (3, 3) the matrix A whose columns are the principal axes of I.
     - `moments`: the three principal moments.
 
-    The value is the diagonal matrix of `moments`; the derivative is a full symmetric matrix.
+    In value the result is the diagonal matrix of the `moments`. Its change for a change δI of the
+    tensor is AᵀδI A, with A held fixed: this is a full symmetric matrix.
     """
     zero = jnp.zeros_like(tensor[0, 0])
     return match_batch_axes((*moments, zero, zero, zero), (tensor, axes, moments))
@@ -96,8 +98,9 @@ def _axes_and_moments(matrix: Mat3) -> tuple[list[list[Scalar]], Triple]:
     principal axes; and the three moments (the eigenvalues) in ascending order.
     """
     one, zero = jnp.ones_like(matrix[0, 0]), jnp.zeros_like(matrix[0, 0])
-    # Subtract a shift from nearly equal moments: it is exact by Sterbenz' lemma, and so the moments
-    # keep their differences.
+    # If the moments are nearly equal, subtract the least diagonal entry from all three. This
+    # subtraction is exact by Sterbenz' lemma, and so the differences of the moments keep their
+    # digits.
     least = jnp.minimum(jnp.minimum(matrix[0, 0], matrix[1, 1]), matrix[2, 2])
     most = jnp.maximum(jnp.maximum(matrix[0, 0], matrix[1, 1]), matrix[2, 2])
     shift = jnp.where(2.0 * least >= most, least, zero)
@@ -121,7 +124,7 @@ def _axes_and_moments(matrix: Mat3) -> tuple[list[list[Scalar]], Triple]:
 
 def _orthonormalise(matrix: list[list[Scalar]]) -> list[list[Scalar]]:
     """Return the orthonormal matrix nearest to a matrix A that is already orthonormal except for
-    round-off, by one step A(3 − AᵀA)/2 (Higham 1986).
+    round-off, by one step A(3 − AᵀA)/2, where 3 is three times the unit matrix (Higham 1986).
 
     - `matrix`: A, 3×3, as a list of its three rows; the result has the same form.
 
@@ -149,9 +152,9 @@ def _rotate_last_two_axes(
     """Return the three arguments after one rotation of Jacobi's method for eigenvalues: it turns
     the axes 2 and 3 so that the off-diagonal entry (2, 3) of the symmetric matrix becomes zero.
 
-    - `diagonal`: the three diagonal entries of the matrix, along the axes so far.
-    - `off_diagonal`: its entries (23, 13, 12).
-    - `axes`: the three axes so far, each as three components.
+    - `diagonal`: the three diagonal entries of the matrix, in the axes before this rotation.
+    - `off_diagonal`: the entries (23, 13, 12) of the same matrix.
+    - `axes`: the three axes before this rotation, each as three components.
     """
     (first, second, third), (x, y, z), (u, v, w) = diagonal, off_diagonal, axes
     none = x == 0

@@ -9,13 +9,15 @@ Let σ(u) be a scalar and T(u) a matrix that commutes with K, both fixed up to a
 
     T² = w 1 − σ² E,   T(2u) = T⁴ − σ⁴ χ'(E),   σ(2u) = 2 σ det T,   χ the characteristic polynomial
 
-These are Weierstrass's sigma functions: T has the eigenvalues σ₁, σ₂, σ₃. The addition theorem then
-reads
+Here w is a number, 1 the unit matrix, and χ' the derivative of the characteristic polynomial χ of
+E. The number σ and the eigenvalues σ₁, σ₂, σ₃ of T are Weierstrass's four sigma functions. Their
+addition theorem then reads
 
     Π(t) ∝ adj(T) Π + σ T (Π × KΠ),   T and σ at t,   |Π(t)| = h
 
-Let now k = Π(t/2), let T and σ be taken at u = t/2, let W be the divisor of the last formula (see
-`DivisorTerms`), and let `Y = ∫₀ᵘ σ² T⁻² du`, with `Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u)`. Then
+Let now k = Π(t/2), let T and σ be taken at u = t/2, let W be the number by which the right side of
+the last formula must be divided to give Π(t) (see `DivisorTerms`), and let `Y = ∫₀ᵘ σ² T⁻² du`,
+with `Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u)`. Then
 
     G = ∫₀ᵗ Π Πᵀ dt = 2σ/(W det T) (adj(T)k)(adj(T)k)ᵀ − 2 adj(E₂ 1 − h² K) Y.
 
@@ -73,15 +75,16 @@ class Differences(NamedTuple):
 
 
 class Invariants(NamedTuple):
-    """Hold the constants of a free motion that its sigma functions need: the entries of the matrix
-    E − E₂₂ 1, and the numbers from which these entries are computed.
+    """Hold the constants of a free motion from which its sigma functions are computed: the entries
+    of the matrix E − E₂₂ 1, where 1 is the unit matrix, and the numbers from which these entries
+    follow.
 
     Here E = E₂ K + |Π|² adj(K), with the inverse K of the inertia tensor, the body momentum Π and
     E₂ = Π·KΠ, which is twice the energy; E₂₂ is the middle diagonal entry of E.
 
     - `h2`: |Π|².
-    - `a1`, `a2`, `a3`: a₁h² − E₂, a₂h² − E₂ and E₂ − a₃h², where h = |Π| and aᵢ are the diagonal
-      entries of K.
+    - `a1`, `a2`, `a3`: k₁₁h² − E₂, k₂₂h² − E₂ and E₂ − k₃₃h², where h = |Π| and kᵢᵢ are the
+      diagonal entries of K.
     - `q`, `p`: the entries 11 and 33 of E − E₂₂ 1.
     - `gap`: p − q, computed without a subtraction of q from p.
     - `e12`, `e13`, `e23`: the off-diagonal entries of E.
@@ -100,13 +103,14 @@ class Invariants(NamedTuple):
 
 
 class Sigma(NamedTuple):
-    """Hold Weierstrass's sigma functions of a free motion at some time u, in the form of a number σ
-    and of matrices, as the head of this module defines them.
+    """Hold Weierstrass's four sigma functions of a free motion at some time u: one is the number σ,
+    and the other three are the eigenvalues of a symmetric matrix T.
 
-    Each matrix is symmetric and is the tuple of its entries (11, 22, 33, 12, 13, 23).
+    σ and T satisfy T² = w 1 − σ² E, with a number w and the matrix E that `Invariants` describes.
+    Each matrix in this class is symmetric and is the tuple of its entries (11, 22, 33, 12, 13, 23).
 
-    - `s`: the number σ. One factor is common to σ and T, and it is chosen so that T₂₂ = 1.
-    - `t`: the matrix T, which has the other three sigma functions as eigenvalues.
+    - `s`: the number σ. A factor common to σ and T is free; it is chosen so that T₂₂ = 1.
+    - `t`: the matrix T.
     - `adjugate`, `det`: the adjugate and the determinant of T.
     - `y`: the matrix Y = ∫₀ᵘ σ² T⁻² du.
     """
@@ -156,14 +160,15 @@ _MORE = 10
 
 
 def sigma_by_taylor_series(u: Scalar, constants: Invariants) -> Sigma:
-    """Return the sigma functions of a free motion at a tiny time, from their Taylor series.
+    """Return the sigma functions of a free motion (a number σ, and a matrix T whose eigenvalues are
+    the other three functions) at a tiny time, from their Taylor series.
 
     - `u`: the time, so small that two terms of the series are exact to round-off.
-    - `constants`: the invariants of the motion, which contain the matrix E of the head of this
-      module.
+    - `constants`: the invariants of the motion, which contain the matrix E = E₂ K + |Π|² adj(K),
+      with the inverse K of the inertia tensor, the body momentum Π and E₂ = Π·KΠ.
 
     The matrix T = √(1 − X) is taken from its series to second order in the matrix X = σ² (E − E₂₂
-    1), where σ is the first sigma function.
+    1), where 1 is the unit matrix and E₂₂ the middle diagonal entry of E.
     """
     uu, zero = u * u, jnp.zeros_like(u)
     c1 = (constants.p + constants.q) * uu
@@ -181,12 +186,14 @@ def sigma_by_taylor_series(u: Scalar, constants: Invariants) -> Sigma:
 
 
 def sigma_at_double_time(sigma: Sigma, constants: Invariants) -> Sigma:
-    """Return the sigma functions of a free motion at the time 2u, from their values at the time u.
+    """Return the sigma functions of a free motion (a number σ, and a matrix T whose eigenvalues are
+    the other three functions) at the time 2u, from their values at the time u.
 
     - `sigma`: the values at the time u.
     - `constants`: the invariants of the motion.
 
-    The formulas T(2u) = T⁴ − σ⁴ χ'(E) and σ(2u) = 2 σ det T are those of the head of this module.
+    The formulas are T(2u) = T⁴ − σ⁴ χ'(E) and σ(2u) = 2 σ det T, where χ' is the derivative of the
+    characteristic polynomial χ of the matrix E of the motion.
     """
     t1, t2, t3, t12, t13, t23 = sigma.t
     s = sigma.s
@@ -235,14 +242,14 @@ def sigma_at_double_time(sigma: Sigma, constants: Invariants) -> Sigma:
 
 
 class DivisorTerms(NamedTuple):
-    """Hold the terms and factors that do not depend on the body momentum Π in the divisor W of the
-    addition theorem.
+    """Hold the terms and factors of a number W that do not depend on the body momentum Π.
 
-    The divisor is `W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²)`, where σ, T, E, E₂ and K are those of
-    the head of this module. The index i is 1 if `first` is true, else 3: with this choice W is a
-    sum of positive terms. The number `square` is (T²)ᵢᵢ. The factor of σ² is `d Πᵢ² + 2 d13 k Πᵢ Π₂
-    + 2 slant k13 Π₁ Π₃ + |KΠ|² − less`, where K in KΠ is taken without its diagonal; d13 and k13
-    belong to `Differences`, and `d`, `k`, `slant` and `less` to this class.
+    The number W is the divisor in the addition theorem Π(t) = (adj(T) Π + σ T (Π × KΠ))/W. It is `W
+    = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²)`, where σ, T, E, E₂ and K are those of the head of this
+    module. The index i is 1 if `first` is true, else 3: with this choice W is a sum of positive
+    terms. The number `square` is (T²)ᵢᵢ. The factor of σ² is `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13
+    Π₁ Π₃ + |KΠ|² − less`, where K in KΠ is taken without its diagonal; d13 and k13 belong to
+    `Differences`, and `d`, `k`, `slant` and `less` to this class.
     """
 
     first: Array
@@ -256,14 +263,13 @@ class DivisorTerms(NamedTuple):
 def momentum_divisor_terms(
     inverse_inertia: Differences, constants: Invariants, sigma_of_step: Sigma
 ) -> DivisorTerms:
-    """Return the terms and factors that do not depend on the body momentum Π in the divisor W of
-    the addition theorem for Π.
+    """Return the terms and factors of a number W that do not depend on the body momentum Π, where W
+    is the divisor in the addition theorem, the formula for Π after a step of time.
 
     - `inverse_inertia`: the differences and off-diagonal entries of K, the inverse of the inertia
       tensor.
     - `constants`: the invariants of the motion.
-    - `sigma_of_step`: the sigma functions at the duration of the step by which the theorem advances
-      Π.
+    - `sigma_of_step`: the sigma functions at the time u, where u is the duration of the step.
     """
     one, three = (
         (inverse_inertia.d12, inverse_inertia.d12, inverse_inertia.k12),
@@ -285,18 +291,20 @@ def momentum_after_step_and_integral_term(
     sigma_of_step: Sigma,
     momentum: Triple,
 ) -> tuple[Triple, SymmetricEntries]:
-    """Return two things: the body momentum after a step of time u; and the first term of the
-    integral G = ∫ Π Πᵀ dt, as the six entries of a symmetric matrix.
+    """Return two things: the body momentum after a step of time u; and the first of the two terms
+    of the integral G = ∫ Π Πᵀ dt over an interval of length 2u, as the six entries of a symmetric
+    matrix.
 
     - `inverse_inertia`: the differences and off-diagonal entries of K, the inverse of the inertia
       tensor.
-    - `divisor_terms`: the terms of the divisor W that do not depend on Π.
+    - `divisor_terms`: the terms and factors of the divisor W that do not depend on Π; the momentum
+      after the step is a vector divided by W.
     - `sigma_of_step`: the sigma functions σ and T at the time u, the duration of the step.
     - `momentum`: the three components of the body momentum Π before the step.
 
-    The first term is 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ, with Π = `momentum`. It belongs to the
-    interval of length 2u whose mid point has the momentum Π; the head of this module has the other
-    term.
+    The first term is 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ, with Π = `momentum`. The interval has its
+    mid point at the beginning of the step, where the momentum is Π. The head of this module gives
+    the other term.
     """
     p1, p2, p3 = momentum
     d12, d13, d23, k12, k13, k23 = inverse_inertia
@@ -336,8 +344,9 @@ def momentum_and_integral_in_four_parts(
     - `constants`: the invariants of the motion.
     - `duration`: the time, of either sign.
 
-    The time is divided into four equal parts, because the matrix T of the sigma functions has no
-    inverse at a quarter period.
+    The time is divided into four equal parts, so that the sigma functions are needed at short times
+    only: the integral needs the inverse of their matrix T, and T has no inverse at a quarter
+    period.
     """
     sigma, hh = sigma_functions_at(0.125 * duration, constants), constants.h2
     terms = barrier(momentum_divisor_terms(inverse_inertia, constants, sigma))
@@ -365,7 +374,7 @@ def momentum_and_integral_in_four_parts(
 
 def sigma_functions_at(u: Scalar, constants: Invariants) -> Sigma:
     """Return the sigma functions of a free motion at the time u, from their Taylor series at the
-    time u/2ⁿ and n doublings.
+    time u/2ⁿ and n doublings of the time.
 
     `constants` are the invariants of the motion.
     """
@@ -378,12 +387,13 @@ def momentum_period(constants: Invariants) -> Scalar:
     """Return the time after which the body momentum Π of a free motion repeats, from the invariants
     of the motion.
 
-    The period is `2π/agm(√(z − x), √(z − y))`, where agm is the arithmetic–geometric mean, and x,
-    y, z are the eigenvalues of the matrix E of the head of this module, of which z is the largest.
+    The period is `2π/agm(√(z − x), √(z − y))`, where agm is the arithmetic–geometric mean. The
+    numbers x, y and z are the eigenvalues of the matrix E = E₂ K + |Π|² adj(K), with the inverse K
+    of the inertia tensor and E₂ = Π·KΠ; z is the largest eigenvalue.
 
-    One step of Newton's method from the diagonal entry gives the derivatives of z to third order.
-    The other two eigenvalues, x and y, enter only through symmetric functions: the first step of
-    the arithmetic–geometric mean can be written in this way.
+    In value z is the largest diagonal entry of E. One step of Newton's method from this entry gives
+    the derivatives of z up to third order. The other two eigenvalues, x and y, enter only through
+    symmetric functions: the first step of the arithmetic–geometric mean can be written in this way.
     """
     three = constants.gap > 0
     top = jnp.where(three, constants.p, constants.q)
@@ -447,7 +457,8 @@ def momentum_and_outer_product_integral(
     whole = barrier(momentum_period(usual))
     r = 2.0 * clip_time_on_separatrix(0.5 * (t - jnp.where(several, count * whole, 0.0)), m)
 
-    # Compute the reduced time and one whole period in one loop.
+    # Compute the motion over the reduced time and over one whole period in one loop, so that it is
+    # compiled once.
     both = jax.tree.map(lambda *a: jnp.stack(a), (v, r), (usual, whole))
     out, g = jax.lax.map(
         lambda a: momentum_and_integral_in_four_parts(inverse_inertia, momentum, *a), both
