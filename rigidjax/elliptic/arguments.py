@@ -69,8 +69,8 @@ def number_and_complement(
 @jax.custom_jvp
 def value_differentiated_by_complement(value: RealOrArray, complement: RealOrArray) -> RealOrArray:
     """Return `value` as a function of its complement alone, where `complement` is 1 − `value`: the
-    result is `value` itself, but its derivative with respect to `complement` is −1, and its
-    derivative with respect to `value` is 0.
+    result is `value` itself, but the derivative of the result with respect to `complement` is −1,
+    and the derivative with respect to `value` is 0.
     """
     return match_batch_axes(value, complement)
 

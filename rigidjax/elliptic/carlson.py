@@ -23,7 +23,8 @@ from rigidjax.elliptic.carlson_r import (
     r_integral_derivative,
 )
 
-# After this number of steps the series is exact for ratios over the whole range of the dtype.
+# After this number of duplication steps the Taylor series is exact to round-off, for arguments of
+# any ratio in the range of the dtype.
 _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}
 
 
@@ -33,8 +34,8 @@ def rf(x: Real, y: Real, z: Real) -> RealOrArray:
     **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, all in one unit. Two zeros give
     infinity, a negative argument gives NaN.
 
-    **Returns** R_F (DLMF 19.16.1), symmetric in all three arguments, in the power −½ of their unit.
-    Its derivative ∂R_F/∂z = −R_D(x, y, z)/6 (DLMF 19.18.1) is −∞ at z = 0.
+    **Returns** R_F (DLMF 19.16.1), symmetric in all three arguments, in the unit of the arguments
+    to the power −½. Its derivative ∂R_F/∂z = −R_D(x, y, z)/6 (DLMF 19.18.1) is −∞ at z = 0.
 
     >>> float(rf(4.0, 4.0, 4.0))
     0.5
@@ -75,8 +76,8 @@ def rj_(x: Real, y: Real, z: Real, p: Real) -> RealOrArray:
 
 
 def rc(x: Real, y: Real) -> RealOrArray:
-    """Return Carlson's R_C(x, y) = R_F(x, y, y) = ½ ∫₀^∞ dt / ((t+y) √(t+x)), made of arctangents
-    and logarithms.
+    """Return Carlson's R_C(x, y) = R_F(x, y, y) = ½ ∫₀^∞ dt / ((t+y) √(t+x)), which is an
+    elementary function (an arctangent or a logarithm).
 
     **Arguments:** `x` ≥ 0 and `y` ≠ 0 in one unit. y = 0 gives infinity, x < 0 gives NaN.
     **Returns:** R_C (DLMF 19.2.17); for y < 0 the Cauchy principal value (DLMF 19.2.20).
@@ -100,7 +101,8 @@ def _rf_by_duplication(arguments: tuple[Array, ...]) -> Array:
 
     - `arguments`: x, y and z, three arrays of one shape and dtype, ≥ 0, of which at most one is 0.
 
-    If two of them are 0, the result is infinite; if one of them is negative, the result is NaN.
+    If two or three of the arguments are 0, the result is infinite; if an argument is negative, the
+    result is NaN.
     """
     scale = largest_argument_or_one(arguments)
     x, y, z = (a / scale for a in arguments)

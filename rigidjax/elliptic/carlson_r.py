@@ -6,9 +6,9 @@ derivatives.
 R_F, R_D and R_J have this form (DLMF 19.16.1, 19.16.2, 19.16.5), and so have their derivatives:
 ∂H/∂aᵢ = −bᵢ H(b + eᵢ; a), where eᵢ is the i-th unit vector. The integrand is positive, so that
 nothing cancels at any order. As a function of s = ln t it is analytic for |Im s| < π and decays
-exponentially. The trapezoidal rule therefore converges like exp(−2π²/h), h the step in s (Trefethen
-& Weideman 2014, doi 10.1137/130932132), and a fixed number of nodes reaches round-off, also for
-arguments of very different sizes.
+exponentially. The trapezoidal rule with the step h in s therefore converges like exp(−2π²/h)
+(Trefethen & Weideman 2014, doi 10.1137/130932132), and a fixed number of nodes reaches round-off,
+also for arguments of very different sizes.
 """
 
 import functools
@@ -23,11 +23,12 @@ from jaxtyping import Array
 
 from rigidjax.elliptic.arguments import RealOrArray, Tangent
 
-# With these numbers of nodes the step is h < 0.5 (float64) or h < 0.9 (float32) for arguments in
-# ratios of 1e35.
+# The numbers of nodes of the trapezoidal rule. With them the step h in s = ln t is below 0.5
+# (float64) or 0.9 (float32) for arguments whose ratios are up to 1e35.
 _NODES = {np.dtype("float64"): 512, np.dtype("float32"): 160}
-# The largest argument is scaled to this number: float32 has no room below 1e-30 for the tail at t →
-# 0.
+# The largest argument is scaled to this number. In float32 the number is large, because the tail of
+# the integrand at t → 0 needs values of t far below all arguments, and these values must not
+# underflow.
 _UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 
 
@@ -38,8 +39,9 @@ def r_integral(powers: tuple[float, ...], arguments: tuple[RealOrArray, ...]) ->
     - `powers`: numbers bᵢ, multiples of ½, with a sum above 1.
     - `arguments`: arrays aᵢ ≥ 0 of one shape and dtype, one for each power.
 
-    The result is infinite if the integral diverges at 0, NaN for a negative argument, and accurate
-    to round-off for ratios of the aᵢ up to 1e35 (to 1e-13 at 1e60).
+    The result is infinite if the integral diverges at t = 0, and NaN for a negative argument. It is
+    accurate to round-off if the ratios of the aᵢ are up to 1e35; for ratios of 1e60 it is accurate
+    to 1e-13.
     """
     scale = largest_argument_or_one(arguments)
     dtype = np.dtype(arguments[0].dtype)
@@ -133,8 +135,8 @@ def _divide_by_power(value: Array, base: Array, power: float) -> Array:
     - `value`, `base`: two arrays.
     - `power`: a multiple of ½, of either sign.
 
-    The power is taken as repeated factors: 1/`base` for a whole number, else 1/√`base`. If `power`
-    is negative, the factors are `base` and √`base`.
+    The power is taken as repeated factors: 1/`base` if `power` is a whole number, else 1/√`base`.
+    If `power` is negative, the factors are `base` and √`base`.
     """
     whole = math.floor(power)
     if power > whole:

@@ -3,14 +3,15 @@
 For the values, the argument is reduced by the half period 2K. Bulirsch's descending transformation
 (1965, doi 10.1007/BF01397975) then works with 1 − m, and no digit is lost as m → 1.
 
-For the derivatives, let φ = am(u|m) and u = F(φ|m). The derivative at fixed u is ∂φ/∂m = dn X with
+For the derivatives, let φ = am(u|m) be the amplitude, so that u = F(φ|m) with Legendre's integral F
+of the first kind. The derivative at fixed u is ∂φ/∂m = dn X with
 
     X = −∂F/∂m = −½ ∫₀^u sd²(v) dv.
 
-The integrand is positive: X has all its digits at m = 0 and as m → 1, where the textbook formulas
-(Byrd & Friedman 1971, 710.51–53) divide a small difference by m (1 − m). The second derivative with
-respect to m also comes from X for m ≤ 0.9 or |u| ≤ 1, and otherwise from a sum of hyperbolic
-functions, one for each half period (`jacobi_near_one.py`).
+Here sd = sn/dn. The integrand is positive: X has all its digits at m = 0 and as m → 1, where the
+textbook formulas (Byrd & Friedman 1971, 710.51–53) divide a small difference by m (1 − m). The
+second derivative with respect to m also comes from X for m ≤ 0.9 or |u| ≤ 1, and otherwise from a
+sum of hyperbolic functions, one for each half period (`jacobi_near_one.py`).
 """
 
 import math
@@ -34,8 +35,9 @@ from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, sncndn_near_one
 from rigidjax.elliptic.legendre import agm_iterates, complete_integral, incomplete_integral
 from rigidjax.rotation.stumpff import power_of_minus_one, split_half_turns
 
-# If cn and dn are below this number, integrals over sd² depend on the ratio of cn and dn only, with
-# a relative error of about the square of this number.
+# If cn and dn are below this number, the integral of sd² = (sn/dn)² depends, except for a factor,
+# on the ratio of cn and dn only. The relative error of this rule is about the square of this
+# number.
 _FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
 
 
@@ -66,8 +68,9 @@ def sncndn(
 def am(u: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     """Return Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad, which is the inverse of F(φ|m) for m ≤ 1.
 
-    **Arguments:** as `sncndn`. **Returns:** φ (DLMF 22.16.1–3). For m ≤ 1 it grows by π in each
-    half period 2K, without jumps; for m > 1 it oscillates within |φ| ≤ arcsin(1/√m).
+    **Arguments:** `u` real; `m` the parameter k², any real number; `m1` = 1 − m, as for `sncndn`.
+    **Returns:** φ (DLMF 22.16.1–3). For m ≤ 1 the amplitude grows by π in each half period 2K,
+    without jumps; for m > 1 it oscillates within |φ| ≤ arcsin(1/√m).
 
     >>> round(float(am(1.0, 0.5)), 12)
     0.932315079884
@@ -225,15 +228,15 @@ def _derivatives_by_m_from_integral(u: Array, m: Array, m1: Array) -> tuple[Arra
     - `m`, `m1`: the parameter m ≤ 1 (the square of the modulus), and 1 − m.
 
     They follow from ∂φ/∂m = X dn for the amplitude φ (the angle with sin φ = sn and cos φ = cn),
-    where X = −½ ∫₀^u sd²(v) dv and sd = sn/dn. Carlson's integral R_D gives X, after whole half
-    periods are taken off u.
+    where X = −½ ∫₀^u sd²(v) dv and sd = sn/dn. Carlson's integral R_D gives X, after a whole number
+    of half periods is subtracted from u.
     """
     s, c, d = _sncndn_for_m_up_to_one(u, m, m1)
     turns = _reduce_to_half_period(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = power_of_minus_one(turns)
     # X grows as 1/dn² and must not overflow. If cn and dn are tiny, X depends, except for a factor,
-    # only on the ratio of cn and dn (to the square of the floor): multiply cn and dn by the same
-    # large number.
+    # only on the ratio of cn and dn, with a relative error of the square of `_FLOOR`. Therefore
+    # multiply cn and dn by the same large number.
     up = jnp.maximum(1, _FLOOR[np.dtype(u.dtype)] / jax.lax.stop_gradient(d))
     c, d, raised = c * up, d * up, m1 * up * up
     near = turns == 0

@@ -1,15 +1,17 @@
 """Compute sn, cn and dn near m = 1 as sums over images, with one hyperbolic function for each half
 period.
 
-With p = exp(−πK/K') ≈ m1/16 the complementary nome and B = π/2K' (DLMF §22.12, after Jacobi's
-imaginary transformation, §22.6(iv)),
+Let K and K' be the complete integrals of the first kind for m and for m1 = 1 − m, let p =
+exp(−πK/K') ≈ m1/16 be the complementary nome, and let B = π/(2K'). Then (DLMF §22.12, after
+Jacobi's imaginary transformation, §22.6(iv))
 
     dn u = B Σᵢ sech(B(u − 2iK))            cn u = (B/k) Σᵢ (−1)ⁱ sech(B(u − 2iK))
     sn u = (B/k) Σᵢ (−1)ⁱ tanh(B(u − 2iK)),     i = −∞ … ∞,     e^(−2BK) = p.
 
-B, k and p are analytic in m1 at 0. Every derivative in m, at m = 1 and near it, is therefore the
-derivative of an explicit sum. The sums give the second derivatives; ∂F/∂m would lose all digits of
-them as m1 → 0.
+Each term of these sums is called an image; its centre is at u = 2iK. B, k = √m and p are analytic
+in m1 at 0. Every derivative in m, at m = 1 and near it, is therefore the derivative of an explicit
+sum. The sums give the second derivatives. If the second derivatives were computed from ∂F/∂m, where
+F is Legendre's integral of the first kind, they would lose all digits as m1 → 0.
 """
 
 import jax
@@ -23,18 +25,19 @@ from rigidjax.rotation.stumpff import power_of_minus_one
 # For m1 up to this number the nome is below 0.0066: a few images, and two terms of the series of
 # the nome in m1, are enough.
 LARGEST_M1 = 0.1
-# On either side of the nearest image, so many images are summed.
+# The number of images that are summed on either side of the image nearest to u.
 _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 
 
 def sncndn_near_one(
     u: RealOrArray, m: RealOrArray, m1: RealOrArray
 ) -> tuple[RealOrArray, RealOrArray, RealOrArray]:
-    """Return Jacobi's functions sn, cn and dn for 0 ≤ m1 ≤ 0.1, with an absolute error of the
-    round-off of 1.
+    """Return Jacobi's functions sn, cn and dn for 0 ≤ m1 ≤ 0.1, with an absolute error of about the
+    machine epsilon.
 
     - `u`: the argument.
-    - `m`: the parameter 1 − m1. The tangents of m must be minus the tangents of m1.
+    - `m`: the parameter 1 − m1. The tangents of m (its changes in a derivative) must be minus the
+      tangents of m1.
     - `m1`: 1 − m.
     """
     root = jnp.sqrt(m)
@@ -60,7 +63,8 @@ def sncndn_near_one(
     ).astype(u.dtype)
     z = _power_times_exp(nome[..., None], side * y[..., None], side * image)
     hyperbolic = 2 * z / (1 + z * z)
-    # Take tanh without its limits ±1 on either side, which cancel in pairs.
+    # Sum tanh minus its limit 1 or −1 far from the image: the limits of the images on both sides
+    # cancel in pairs.
     tangent = jnp.where(offset == 0, -side * (1 - z * z), side * 2 * z * z) / (1 + z * z)
 
     sine = rate / root * (power_of_minus_one(image) * tangent).sum(-1)

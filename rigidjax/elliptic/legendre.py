@@ -30,8 +30,8 @@ from rigidjax.elliptic.carlson import rd, rf
 from rigidjax.elliptic.carlson_r import r_integral
 from rigidjax.rotation.stumpff import split_half_turns
 
-# After this number of steps the means a and b agree to √eps, for b/a down to the square root of the
-# least number of the dtype.
+# After this number of steps the arithmetic mean a and the geometric mean b agree to √eps, for a
+# first ratio b/a down to the square root of the least number of the dtype.
 _MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
 
 
@@ -57,9 +57,9 @@ def ellipk(m: Real, m1: Real | None = None) -> RealOrArray:
 def ellipe(m: Real, m1: Real | None = None) -> RealOrArray:
     """Return the complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
 
-    **Arguments:** `m` ≤ 1 the parameter k² (a larger one gives NaN); `m1` as for `ellipk`.
+    **Arguments:** `m` ≤ 1 the parameter k² (m > 1 gives NaN); `m1` = 1 − m, as for `ellipk`.
 
-    **Returns** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms.
+    **Returns** E(m), computed by DLMF 19.25.1 from Carlson's integrals as a sum of positive terms.
 
     >>> float(ellipe(1.0))
     1.0
@@ -78,8 +78,8 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
     - `m`: the parameter k², below 1.
     - `m1`, `n1`: 1 − m and 1 − n, as for `ellipk`.
 
-    **Returns** DLMF 19.2.8 as one integral with a positive integrand, accurate to round-off for any
-    n < 1.
+    **Returns** the integral Π(n, m) of DLMF 19.2.8, computed as one integral with a positive
+    integrand, accurate to round-off for any n < 1.
 
     >>> round(float(ellippi(0.5, 0.5)), 12)
     2.701287762095
@@ -94,9 +94,10 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     """Return the incomplete elliptic integral of the first kind, F(φ|m) = ∫₀^φ dθ/√(1 − m sin²θ).
 
     **Arguments:** `phi` the amplitude, rad, of any size; `m` the parameter k² with m sin²φ < 1
-    (else NaN); `m1` as for `ellipk`.
+    (else NaN); `m1` = 1 − m, as for `ellipk`.
 
-    **Returns** DLMF 19.25.5 in Carlson's R_F, after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
+    **Returns** F(φ|m), computed by DLMF 19.25.5 from Carlson's integral R_F, after reduction to |φ|
+    ≤ π/2 (DLMF 19.2.10).
 
     >>> round(float(ellipf(1.0, 0.5)), 12)
     1.083216772845
@@ -108,11 +109,11 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
 def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     """Return the incomplete elliptic integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ.
 
-    **Arguments:** `phi` the amplitude, rad, of any size; `m` ≤ 1 the parameter k² (a larger one
-    gives NaN); `m1` as for `ellipk`.
+    **Arguments:** `phi` the amplitude, rad, of any size; `m` ≤ 1 the parameter k² (m > 1 gives
+    NaN); `m1` = 1 − m, as for `ellipk`.
 
-    **Returns** DLMF 19.25.9 or 19.25.10 in Carlson's integrals, whichever has positive terms, after
-    reduction to |φ| ≤ π/2 (DLMF 19.2.10).
+    **Returns** E(φ|m), computed from Carlson's integrals by DLMF 19.25.9 or 19.25.10, whichever has
+    positive terms, after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
 
     >>> round(float(ellipeinc(1.0, 0.5)), 12)
     0.927329883624
@@ -133,7 +134,8 @@ def ellippiinc(
     - `m`: the parameter k², with m sin²φ < 1 (else NaN).
     - `m1`, `n1`: 1 − m and 1 − n, as for `ellipk`.
 
-    **Returns** DLMF 19.2.7 as one integral, after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
+    **Returns** the integral Π(n, φ|m) of DLMF 19.2.7, computed as one integral, after reduction to
+    |φ| ≤ π/2 (DLMF 19.2.10).
 
     >>> round(float(ellippiinc(0.5, 1.0, 0.5)), 12)
     1.288978174245
@@ -152,7 +154,8 @@ def incomplete_integral(
     sin²θ)^{−l} dθ, with Δ = √(1 − m sin²θ), for an amplitude |φ| ≤ π/2.
 
     - `orders`: the three whole numbers (j, k, l).
-    - `sine`, `cosine`: of φ. They are the arguments, not φ, so that no digit is lost near π/2.
+    - `sine`, `cosine`: sin φ and cos φ, which are given in place of φ, so that no digit is lost
+      near φ = π/2.
     - `m1`, `n1`: 1 − m and 1 − n.
     """
     j, k, last = orders
@@ -298,8 +301,8 @@ def _integral_at_any_amplitude(
     - `m1`: 1 − m.
     - `n1`: 1 − n, or None for n = 0.
 
-    With φ = iπ + r, for a whole number i and |r| ≤ π/2, the integral is 2i times the complete
-    integral (that from 0 to π/2) plus the integral from 0 to r.
+    With φ = Nπ + r, for a whole number N and |r| ≤ π/2, the integral is 2N times the complete
+    integral (from 0 to π/2) plus the integral from 0 to r.
     """
     turns, remainder = split_half_turns(phi)
     n1 = jnp.ones_like(m1) if n1 is None else n1

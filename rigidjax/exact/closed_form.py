@@ -32,12 +32,12 @@ class ClosedFormConstants(NamedTuple):
     d12: Scalar  # 1/I₁ − 1/I₂
     d13: Scalar  # 1/I₁ − 1/I₃
     d23: Scalar  # 1/I₂ − 1/I₃
-    P: Triple  # the initial momentum
+    P: Triple  # the three components of the initial momentum
     h: Scalar  # the length of the momentum
-    modulus: Modulus
-    mu: Scalar  # the number μ of the phase ξ (see `elliptic_functions`)
-    phase_factor: Scalar  # the factor of the phase ξ (see `elliptic_functions`)
-    half: HalfPeriod
+    modulus: Modulus  # the parameters p and q of the elliptic function S
+    mu: Scalar  # the number μ in the phase ξ, the angle κ ∫ S²/(1 + μS²) du
+    phase_factor: Scalar  # the number κ in the phase ξ
+    half: HalfPeriod  # the length of half a period of S, and the phase and the mean of S² in it
     swapped: Float[Array, ""]  # whether axis 1 has the largest moment
 
 
@@ -79,7 +79,7 @@ class ReducedTime(NamedTuple):
 
     halves: Scalar  # the number of half periods that were subtracted
     rest: Scalar  # the time that is left
-    near: Scalar  # equal to `rest`, but clipped on the separatrix where the motion is at rest
+    near: Scalar  # `rest`; on the separatrix clipped to the beginning of the steady spin
 
 
 def reduce_time(u: Scalar, half_period: Scalar, modulus: Modulus) -> ReducedTime:
@@ -88,7 +88,7 @@ def reduce_time(u: Scalar, half_period: Scalar, modulus: Modulus) -> ReducedTime
     - `half_period`: the length of one half period, which is infinite on the separatrix.
     - `modulus`: the parameters of the functions, which tell whether the motion is on the
       separatrix. There the body ends in a steady spin about its middle axis, and the time is
-      clipped to the time before this spin.
+      clipped to the beginning of this spin.
     """
     count = jnp.round(u / half_period)
     rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half_period)

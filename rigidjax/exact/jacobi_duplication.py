@@ -63,8 +63,8 @@ class IterationLimits(NamedTuple):
 
     doublings: int  # the number of doublings from u/2^doublings to u
     agm: int  # steps of the arithmetic–geometric mean
-    floor: float  # if |p − q|/max(p, q) is not above it, the motion is on the separatrix
-    rest: float  # the value of √max(p, q) |u| beyond which a separatrix motion rests
+    floor: float  # a motion with |p − q|/max(p, q) ≤ floor is taken as on the separatrix
+    rest: float  # beyond this √max(p, q) |u|, a motion on the separatrix is taken as steady
 
 
 def iteration_limits(dtype: jnp.dtype) -> IterationLimits:
@@ -218,9 +218,9 @@ class HalfPeriod(NamedTuple):
     motion.
     """
 
-    time: Scalar  # infinite on the separatrix
+    time: Scalar  # the least time T > 0 with S(T) = 0; infinite on the separatrix
     phase: Scalar  # the phase ξ at the end of the half period
-    mean: Scalar  # the mean of S²
+    mean: Scalar  # the mean of S² over the half period
 
 
 def half_period(modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> HalfPeriod:

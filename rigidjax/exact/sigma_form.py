@@ -7,7 +7,7 @@ momentum, `E₂ = Π·KΠ` and `h = |Π|`, let
 
 Let σ(u) be a scalar and T(u) a matrix that commutes with K, both fixed up to a common factor, with
 
-    T² = w 1 − σ² E,   T(2u) = T⁴ − σ⁴ χ'(E),   σ(2u) = 2 σ det T,   χ the characteristic polynomial
+    T² = w 1 − σ² E,   T(2u) = T⁴ − σ⁴ χ'(E),   σ(2u) = 2 σ det T
 
 Here w is a number, 1 the unit matrix, and χ' the derivative of the characteristic polynomial χ of
 E. The number σ and the eigenvalues σ₁, σ₂, σ₃ of T are Weierstrass's four sigma functions. Their

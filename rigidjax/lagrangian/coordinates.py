@@ -74,7 +74,7 @@ class LagrangeEquations(eqx.Module):
     def energy(self, y: Coordinates) -> Scalar:
         """Return Jacobi's integral `q̇·∂L/∂q̇ − L`, J, of the state `y`.
 
-        It is conserved without a `force`, if L does not depend on the time.
+        The integral is conserved if there is no `force` and L does not depend on the time.
         """
         momentum = jax.grad(self._lagrangian_value, argnums=1)(y.q, y.rate)
         return jnp.sum(y.rate * momentum) - self._lagrangian_value(y.q, y.rate)
@@ -103,8 +103,8 @@ def equations_of_motion(
     **Arguments:**
 
     - `lagrangian`: a callable `(q, q̇) → L`, J, with `q`, `q̇` (n,), best a Module: motions can be
-      differentiated with respect to the numbers of a Module, and other numbers need no new
-      compilation.
+      differentiated with respect to the numbers in a Module, and nothing is compiled again when
+      these numbers change.
     - `force`: a callable `(t, q, q̇) → Q` (n,), the generalised forces without a potential, or
       `None`.
 
@@ -136,7 +136,7 @@ class EulerAngleTop(eqx.Module):
       `None`.
 
     The object is called with the angles (φ, θ, ψ), sequence 3-1-3, rad, and the time derivatives of
-    these angles, rad/s, and returns L, J; Ω is the body rate. Lagrange's equations of L are
+    these angles, rad/s, and returns L in joules; Ω is the body rate. Lagrange's equations of L are
     singular at sin θ = 0. Source: notes, eqs 33, 75, 81–83.
 
     **Raises:** `TypeError` for a torque without a potential.

@@ -167,10 +167,13 @@ class HeavyTopHamiltonian(eqx.Module):
     **Arguments:**
 
     - `inertia`: the inertia I about the fixed point, kg m².
-    - `top`: a `HeavyTop`, which gives the mass m, kg, and the centre of mass c, m.
+    - `top`: a `HeavyTop`, which gives the mass m in kilograms and the centre of mass c in metres,
+      body frame.
 
-    The object is a function of the angular momentum Π (3,), N m s, and of gravity γ = Rᵀ g (3,),
-    m/s², both in the body frame. `start` makes the state of the vector field.
+    The object is a function of the angular momentum Π (3,), in N m s, and of gravity γ = Rᵀ g (3,),
+    both in the body frame. Here g is the acceleration of gravity in world axes, in metres per
+    second squared, and R is the attitude, body → world. `start` makes the state of the vector
+    field.
 
     **Raises:** `ValueError` for a moment known to be zero.
 
@@ -212,8 +215,8 @@ class HeavyTopHamiltonian(eqx.Module):
 def _require_scalar_energy(value: Any) -> Scalar:
     """Return the value of a Hamiltonian, J, as a scalar array.
 
-    - `value`: what the user's function of the Hamiltonian returned.
+    - `value`: what the user's Hamiltonian, a function, returned.
 
-    An error is raised unless it is one number.
+    An error is raised unless the value is one number.
     """
     return _checks.array_of_shape(value, (), "hamiltonian", hint="one number, J")

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from rigidjax import _checks
 from rigidjax.workprecision.record import Measurement, require_measurements
 
+# The errors, in rad for an attitude and else relative, for which methods are compared by default.
 WANTED = (1e-4, 1e-7, 1e-10)
 
 

@@ -22,6 +22,7 @@ from rigidjax.workprecision.scene import BenchmarkScene, stored_reference
 ARENSTORF = (0.012277471, 0.994, -2.00158510637908252240, 17.0652165601579625588917)
 # The initial attitude of the bodies: the quaternion of a turn by 0.3 rad about x.
 TILTED = np.array([np.cos(0.15), np.sin(0.15), 0.0, 0.0])
+# The acceleration of gravity in the scenes of heavy tops, m/s², in world axes.
 WEIGHT = (0.0, 0.0, -2.0)
 # The distance of the planet in the scene `gravity-gradient`.
 RADIUS = 7.0
