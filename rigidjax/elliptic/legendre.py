@@ -40,8 +40,8 @@ def ellipk(m: Real, m1: Real | None = None) -> RealOrArray:
 
     **Arguments:**
 
-    - `m`: the parameter k² (not the modulus k), below 1 and possibly negative; 1 gives infinity, a
-      larger m NaN.
+    - `m`: the parameter k² (not the modulus k), below 1 and possibly negative; m = 1 gives
+      infinity, m > 1 gives NaN.
     - `m1`: 1 − m. Give it if m is so near 1 that 1 − m loses digits: value and derivative then
       depend on m1 alone.
 
@@ -73,7 +73,7 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
 
     **Arguments**, in the order of Wolfram and mpmath:
 
-    - `n`: the characteristic (DLMF's α²), below 1; 1 gives infinity, a larger n NaN (not the
+    - `n`: the characteristic (DLMF's α²), below 1; n = 1 gives infinity, n > 1 gives NaN (not the
       principal value).
     - `m`: the parameter k², below 1.
     - `m1`, `n1`: 1 − m and 1 − n, as for `ellipk`.

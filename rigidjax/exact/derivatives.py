@@ -63,9 +63,10 @@ from rigidjax.exact.sigma_form import Differences
 from rigidjax.rotation.barrier import compiled_as_one_kernel
 from rigidjax.rotation.linalg3 import components
 
-# Below this angle of the turn, rad, the derivative of the turn comes from a series of third order
-# in time. The second derivatives of the series have an error of about the square of the angle; the
-# second derivatives of the closed form have an error of about the round-off divided by the angle.
+# If the body turns by less than this angle, rad, from time 0 to t, the derivative of the turn comes
+# from a series of third order in time. The second derivatives of the series have an error of about
+# the square of the angle; the second derivatives of the closed form have an error of about the
+# round-off divided by the angle.
 _STILL = {jnp.dtype("float32"): 5e-3, jnp.dtype("float64"): 5e-6}
 
 
@@ -206,8 +207,9 @@ def body_rate_and_rotation(
 
     - `tensor`: (3, 3) the inertia tensor.
     - `omega`: (3,) the body rate Ω(0).
-    - `constants`: the result of `free_motion_constants` for `tensor` and `omega`. The value comes
-      from `constants` alone, and the derivative goes to `tensor`, `omega` and `t`.
+    - `constants`: the result of `free_motion_constants` for `tensor` and `omega`. The value is
+      computed from `constants` and `t` alone; derivatives are taken with respect to `tensor`,
+      `omega` and `t`.
     - `t`: one time, or an array (n,) of times; the results then are (n, 3) and (n, 4).
     """
     del tensor, omega
@@ -230,9 +232,9 @@ def _rate_and_rotation_jvp(
     """
     tensor, omega, constants, t = primals
     d_tensor, d_omega, _, d_t = tangents
-    # The derivative is a product of two matrices, of which only the left one depends on time. The
-    # part that is transposed for reverse mode is therefore short, and the right matrix is compiled
-    # once.
+    # The derivative is a product of two matrices. The left matrix depends on time. The right
+    # matrix, `first`, does not: it is computed once for all times. The part that JAX transposes in
+    # reverse mode is therefore short.
     first = _variable_derivatives_by_body(jnp.concatenate([tensor.ravel(), omega]), constants)
     out, (rates, thetas) = _evaluate_at_each_time(
         lambda time: _rate_and_rotation_with_derivatives(tensor, omega, constants, time), t
@@ -326,8 +328,8 @@ def _variable_derivatives_by_body(
     tensor, omega, axes = tensor_and_rate[:9].reshape(3, 3), tensor_and_rate[9:], constants.axes
     moments, momentum = _tensor_and_momentum_in_axes(tensor, omega, constants)
     # In principal axes, δK = −K δI K is −BᵀδI B with B = A K, where the columns of A are the axes.
-    # The products are written as sums of products of entries, for the reason given in
-    # `_rate_and_rotation_jvp`.
+    # The products are written as sums of products of entries, because on a GPU a product of
+    # matrices is rounded to ten bits in float32.
     k = jnp.stack(symmetric_rows(inverse_inertia_and_energy(moments, momentum)[1]))
     b = jnp.sum(axes[:, :, None] * k[None], axis=1)
     d_k = lambda i, j: -(b[:, None, i] * b[None, :, j]).ravel()  # noqa: E731

@@ -146,8 +146,9 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     e^{λt}, where λ is the rate at which a small deviation grows, up to λt ≈ 150 (float32: 40).
 
     **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, a `Rigid`;
-    for known values also for NaN, a tensor that no mass has (a traced one gives NaN), a moment of
-    zero, a quaternion that is not unit, and a time in which the body turns by more than 1/eps rad.
+    for values that JAX does not trace, also for NaN, a tensor that no real body has (a traced one
+    gives NaN), a moment of zero, a quaternion that is not unit, and a time in which the body turns
+    by more than 1/eps rad.
 
     >>> state0 = rj.Attitude([1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1e-4])
     >>> free_body(rj.Inertia.from_principal(1.0, 2.0, 3.0), state0, 20.0).omega

@@ -37,7 +37,8 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     are the eigenvalues of the matrix E in `rigidjax.exact.sigma_form`; e₁ is the largest (DLMF
     19.8.5; Landau and Lifshitz, Mechanics, eq 37.11).
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or for a principal moment that
+    is zero and not traced by JAX.
 
     >>> top = rj.Inertia.from_principal(1.0, 2.0, 2.0)
     >>> bool(abs(body_period(top, jnp.array([1.0, 0.5, 0.0])) - 4 * jnp.pi) < 1e-14)
@@ -62,7 +63,8 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     2π if it has the smallest. Here χ is the angle by which the body turns about its momentum, a
     complete integral of the third kind (DLMF 19.8.7).
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or for a principal moment that
+    is zero and not traced by JAX.
 
     >>> top = rj.Inertia.from_principal(1.0, 2.0, 2.0)
     >>> precession_period(top, jnp.array([1.0, 0.5, 0.0]))  # 2π I₂/|L|

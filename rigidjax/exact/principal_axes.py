@@ -61,7 +61,7 @@ def _tensor_in_axes_jvp(
       the three principal moments.
     - `tangents`: the changes of these three inputs, of which the first one is used.
     """
-    # Take the change of a symmetric matrix, so that a gradient is symmetric.
+    # Take the symmetric part of the change of the tensor, so that a gradient is a symmetric matrix.
     axes, change = primals[1], 0.5 * (tangents[0] + tangents[0].T)
     # Sum products of entries: on a GPU a product of matrices is rounded to ten bits in float32.
     turned = jnp.sum(axes[:, :, None] * change[:, None], axis=0)

@@ -26,12 +26,13 @@ Jacobi's solution with T = diag(D, 1, C), σ = S, by `E₃₃ − E₂₂ = (a�
 E₂₂ = q`; and both sides of the formula turn with the axes. All terms but the length |Π(t)| are
 polynomial in K: a sphere or a symmetric top is an ordinary point. Proof of the formula for G:
 differentiate it in principal axes, where T = diag(τ₁, τ₂, τ₃) and g = σ/τᵢ has the derivative g' =
-τⱼτₖ/τᵢ²; the choice of the mid point k removes the even terms.
+τⱼτₗ/τᵢ², with the three indices i, j and l; the choice of k, the momentum at the mid point, removes
+the even terms.
 
 The functions are evaluated in principal axes of K. The off-diagonal entries of K are therefore zero
 in value, and only their tangents (the changes in a derivative) are not. The differences of the
 diagonal entries are arguments, and so they are accurate. If an entry of a matrix can be written in
-several equal forms, the form that does not cancel is used.
+several equal forms, the form without cancellation is used.
 """
 
 from typing import NamedTuple

@@ -74,12 +74,12 @@ class LiePoisson(eqx.Module):
 
 
 class LiePoissonWithDirection(eqx.Module):
-    """Evaluate the Lie–Poisson equations of a Hamiltonian H(Π, γ), the field `hamiltonian`, as a
-    vector field.
+    """Evaluate the Lie–Poisson equations of a Hamiltonian H(Π, γ) as a vector field.
 
     Π (3,) is the angular momentum, N m s, and γ (3,) a vector fixed in the world, both in body
-    axes; the state is a `MomentumAndDirection`. The equations are dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ and
-    dγ/dt = γ × ∂H/∂Π. `lie_poisson_with_direction` makes this Module.
+    axes; `hamiltonian` is the function `(Π, γ) → H`, J. The state is a `MomentumAndDirection`. The
+    equations are dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ and dγ/dt = γ × ∂H/∂Π. `lie_poisson_with_direction`
+    makes this Module.
     """
 
     hamiltonian: Callable[[Any, Any], Any]
@@ -114,8 +114,8 @@ def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
 def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoissonWithDirection:
     """Return the heavy-top vector field of any Hamiltonian H(Π, γ).
 
-    `dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ` and `dγ/dt = γ × ∂H/∂Π`, with the angular momentum Π (3,), N m
-    s, and a world-fixed vector γ (3,), both in the body frame; the state is a
+    The equations are `dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ` and `dγ/dt = γ × ∂H/∂Π`, with the angular
+    momentum Π (3,), N m s, and a world-fixed vector γ (3,), both in the body frame; the state is a
     `MomentumAndDirection`.
 
     **Arguments:** `hamiltonian` a callable, best a Module, `(Π, γ) → H`, J; for a heavy top
@@ -145,7 +145,7 @@ class RotationalHamiltonian(eqx.Module):
 
     **Arguments:** `inertia` is the inertia I about the centre of mass or a fixed point, kg m².
 
-    **Raises:** `ValueError` for a moment known to be zero.
+    **Raises:** `ValueError` for a principal moment that is zero and not traced by JAX.
 
     >>> RotationalHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0))([0.0, 0.0, 2.0])
     Array(1., dtype=float64)
@@ -175,7 +175,7 @@ class HeavyTopHamiltonian(eqx.Module):
     second squared, and R is the attitude, body → world. `start` makes the state of the vector
     field.
 
-    **Raises:** `ValueError` for a moment known to be zero.
+    **Raises:** `ValueError` for a principal moment that is zero and not traced by JAX.
 
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0, 0.5], [0.0, 0, -9.81])
     >>> H = HeavyTopHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0), top)

@@ -145,7 +145,8 @@ def _measure_scenes(options: argparse.Namespace) -> list[Measurement]:
 
 
 def summary(records: Iterable[Measurement]) -> str:
-    """Return a text with the time, µs, in which each method reaches each wanted error, by scene.
+    """Return a text that shows, for each scene, the time in microseconds in which each method
+    reaches each wanted error.
 
     A * marks the methods on the Pareto front of error and time; a + marks the methods on the front
     of the methods in JAX alone.
@@ -175,8 +176,8 @@ def summary(records: Iterable[Measurement]) -> str:
 
 
 def _text_lines_of_drifts(scene: str, records: list[Measurement]) -> list[str]:
-    """Return the lines of text that show the largest drifts, in a long run, of the energy and of
-    the momentum along gravity for each method.
+    """Return lines of text that show, for each method, the largest drift of the energy and the
+    largest drift of the momentum along gravity in a long run.
 
     - `scene`: the name of the long run, for the heading.
     - `records`: the measurements of this run, one for each method.

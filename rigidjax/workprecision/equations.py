@@ -19,8 +19,8 @@ def heavy_top_torque(
     cos: Callable[[Number], Number],
     to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
-    """Return the torque of the weight in body axes, `τ = m c × Rᵀg`, as a function of the time, of
-    the quaternion of the attitude R and of the body rate.
+    """Return a function that gives the torque of the weight in body axes, `τ = m c × Rᵀg`, for a
+    time, the quaternion of the attitude R, and a body rate.
 
     - `constants`: six numbers, the mass m times the centre of mass c (3), body axes, and gravity g
       (3), world axes.
@@ -44,10 +44,11 @@ def gravity_gradient_torque(
     cos: Callable[[Number], Number],
     to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
-    """Return the torque of gravity on a body on a circular orbit about a planet, `τ = 3n² r × I r`,
-    as a function of the time, of the quaternion of the attitude and of the body rate.
+    """Return a function that gives the torque of gravity on a body on a circular orbit about a
+    planet, `τ = 3n² r × I r`, for a time, the quaternion of the attitude, and a body rate.
 
-    Here r is the unit vector along the line to the planet, and τ and r are in body axes.
+    Here n is the orbital rate, I the inertia tensor, and r the unit vector along the line between
+    the planet and the body; τ and r are in body axes.
 
     - `inertia`: the entries Ixx, Iyy, Izz, Ixy, Ixz, Iyz of the inertia tensor I.
     - `constants`: one number, the orbital rate n, rad/s.
@@ -76,8 +77,8 @@ def gyrostat_torque(
     cos: Callable[[Number], Number],
     to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
-    """Return the torque of a wheel at constant speed and of damping, `τ = h × Ω − c Ω`, in body
-    axes, as a function of the time, of the quaternion of the attitude and of the body rate Ω.
+    """Return a function that gives the torque of a wheel at constant speed and of damping, `τ = h ×
+    Ω − c Ω`, in body axes, for a time, the quaternion of the attitude, and the body rate Ω.
 
     - `constants`: six numbers, the angular momentum h (3) of the wheel and the damping coefficients
       c (3), one for each body axis.

@@ -19,8 +19,9 @@ from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.workprecision.scene import BenchmarkScene, PreparedMethod, TimedMethod
 
 # TOLERANCES are the settings of adaptive methods. EIGHT and FOUR are numbers of equal steps, for a
-# turn of 50 rad: FOUR for Runge–Kutta of order 4, which needs more steps than the other methods.
-# MOST is the largest number of steps of an adaptive run. MODES has the two ways to take a gradient.
+# turn of 50 rad. FOUR is for the Runge–Kutta method of order 4, which needs more steps; EIGHT is
+# for all other methods with equal steps. MOST is the largest number of steps of an adaptive run.
+# MODES has the two ways to take a gradient.
 TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 EIGHT = (40, 60, 80, 120, 170, 240, 340, 480, 680, 1000)
 FOUR = (200, 500, 1200, 3000, 8000, 20000, 60000)
@@ -62,7 +63,11 @@ def compile_flow(scene: BenchmarkScene, flow: Flow) -> PreparedMethod:
 def flow_from_run(
     scene: BenchmarkScene, run: Callable[[Any, PyTree, Array, Array], tuple[PyTree, Any]]
 ) -> Flow:
-    """Return the flow of `run` on a scene: a function of the scene's numbers and the setting.
+    """Return the flow of a scene (a motion to run) that calls `run`.
+
+    A flow is a function of the scene's numbers (inertia, initial rate and attitude; or position and
+    velocity of a point) and of a setting (a tolerance or a number of steps); it returns two things:
+    the last state as a vector; and the number of steps.
 
     `run(body, state0, ts, setting)` returns two things: the states at `ts`, which are the first and
     the last time, s; and the number of steps.
@@ -134,8 +139,9 @@ def flow_with_equal_steps(
 ) -> Flow:
     """Return the flow of `solver` with equal steps.
 
-    A flow is a function of the numbers of the `scene` and of a setting, here the number of steps;
-    it returns two things: the last state as a vector; and the number of steps.
+    A flow is a function of the numbers of the `scene` (inertia, initial rate and attitude; or
+    position and velocity of a point) and of a setting, here the number of steps; it returns two
+    things: the last state as a vector; and the number of steps.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -237,8 +243,8 @@ def _compile_value_or_gradient(
       scene's numbers and of a setting that returns the last state and the number of steps), or
       `None` if the method cannot do the scene.
     - `differentiate`: `jax.grad` or `jax.jacfwd` for the gradient of `scene.loss`, a scalar
-      function of the last state, with respect to the scene's numbers; `None` for the value, which
-      is the last state.
+      function of the last state, with respect to the scene's numbers; or `None` for the value,
+      which is the last state.
     - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     """
     flow = make_flow(scene)
@@ -256,7 +262,8 @@ def _compile_value_or_gradient(
     try:
         return compile_flow(scene, flow if differentiate is None else slopes)
     except TypeError as refused:
-        # A splitting method refuses a torque that depends on the rate: such a scene is left out.
+        # A splitting method refuses a torque that depends on the rate: the method is left out for
+        # such a scene.
         if "Splitting" in str(refused):
             return None
         raise
@@ -268,8 +275,8 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Ti
     The solver runs on the handwritten equations of the scene (`plain`), or on our vector field for
     a scene without such equations.
 
-    **Arguments:** `solver` with an error estimate; `gradients` whether gradients are measured, too,
-    by the adjoints `forward`, `checkpointed` and `backsolve` of diffrax.
+    **Arguments:** `solver` a solver with an error estimate; `gradients` whether gradients are
+    measured, too, by the adjoints `forward`, `checkpointed` and `backsolve` of diffrax.
 
     >>> diffrax_method(dfx.Heun()).name
     'diffrax Heun'
@@ -331,7 +338,9 @@ def _own_timed_method(
 
 
 def methods_in_jax() -> list[TimedMethod]:
-    """Return our methods and those of diffrax, in the order of the charts."""
+    """Return the methods of this library and those of diffrax, in the order in which charts show
+    them.
+    """
     eight = solvers.DormandPrince8()
     equal = ((EIGHT, eight), (FOUR, solvers.RungeKutta4()))
     equal += ((EIGHT, solvers.Splitting4()), (EIGHT, solvers.Splitting6()))

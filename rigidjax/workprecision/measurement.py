@@ -31,15 +31,16 @@ from rigidjax.workprecision.scene import (
     state_errors,
 )
 
-# Runs longer than LONG, s, are timed three times; runs shorter than SHORT, s, are timed three times
-# as often as runs between SHORT and LONG.
+# Runs that take more than LONG seconds are timed three times. Runs that take less than SHORT
+# seconds are timed three times as often as runs between SHORT and LONG.
 LONG, SHORT = 0.5, 0.02
 # One timing of a short run repeats the run for about BURST seconds, and takes the mean.
 BURST = 3e-3
 # Runs with an error of WRONG or more, rad or relative, are left out.
 WRONG = 0.5
 # The run of `long_drift`: STEPS is the number of steps, BODY the principal moments, LOOKS the
-# number of states that are saved, and RUNS has, by name, the length of a step, s, and the solver.
+# number of states that are saved, and RUNS has, by the name of a method, the length of a step in
+# seconds and the solver.
 STEPS = 1_000_000
 BODY = (0.7, 1.2, 1.6)
 LOOKS = 101
@@ -84,8 +85,9 @@ def measure(
     more (rad, or relative).
 
     **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more methods;
-    `gradients` whether gradients are measured, too; `thin` a number k to use every k-th setting;
-    `rounds` the least number of timings of each run; `progress` is called with a line of text.
+    `gradients` whether gradients are measured, too; `thin` a number k to use every k-th setting
+    (for gradients every 2k-th); `rounds` the least number of timings of each run; `progress` is
+    called with a line of text.
 
     **Raises:** `TypeError` for a `scene` that is no `BenchmarkScene`, or a method that is no
     `TimedMethod`.
@@ -146,7 +148,7 @@ def compute_reference(scene: BenchmarkScene, gradients: bool = True) -> Referenc
 
 
 def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
-    """Return the scene in single precision.
+    """Return the scene in single precision, without its handwritten equations.
 
     The reference is computed in double precision from the numbers rounded to single precision.
     """
@@ -171,7 +173,7 @@ def _estimated_turning_angle(scene: BenchmarkScene) -> float:
     50.
 
     For a point, which has no attitude, the result is 50: methods state their numbers of equal steps
-    for a turn of 50 rad, so that these numbers are then used unchanged.
+    for a turn of 50 rad, and with this result the numbers are used unchanged.
     """
     return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
 
@@ -203,8 +205,9 @@ def _run_once_for_errors(
     prepared: PreparedMethod,
     reference: Reference,
 ) -> list[_TimedRun]:
-    """Run a prepared method once for its errors. Return a list with the run, or an empty list if
-    its error is 0.5 (`WRONG`) or more, in rad or relative, or NaN, so that the run is not timed.
+    """Run a prepared method once to find its errors, and return a list that holds this run. If the
+    error of the run is NaN, or 0.5 (`WRONG`) or more, in rad or relative, the list is empty, and
+    the run is not timed.
 
     - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `method`: the method, for its name and group.
@@ -271,9 +274,11 @@ def _gradient_errors(
 def energy_and_momentum_drifts(
     scene: BenchmarkScene, final_state: np.ndarray | Array
 ) -> tuple[float, float]:
-    """Return two numbers: the relative drift of the energy; and the largest drift of a momentum.
+    """Return two numbers for the change from the initial to the last state: the relative drift of
+    the energy; and the largest drift of a conserved momentum.
 
-    For a point the two are the relative drift of its first conserved quantity, and NaN.
+    For a point the two numbers are the relative drift of the first conserved quantity of its
+    motion, and NaN.
     """
     if scene.body is None:
         law: Any = scene_of_force(scene.torque)
@@ -296,8 +301,8 @@ def energy_and_momentum_drifts(
 def _append_measured_times(runs: list[_TimedRun], rounds: int) -> None:
     """Measure the times, s, of the runs in turn, and append them to the field `times` of each run.
 
-    A run is timed in `rounds` rounds; a run shorter than `SHORT`, s, in three times as many rounds,
-    and a run longer than `LONG`, s, in three rounds.
+    A run is timed in `rounds` rounds. A run that takes less than `SHORT` = 0.02 seconds is timed in
+    three times as many rounds, and a run that takes more than `LONG` = 0.5 seconds in three rounds.
     """
     for turn in range(3 * rounds):
         for job in runs:
@@ -326,8 +331,9 @@ def long_drift(
     Each method has two records: one for the first hundredth of the run, one for the whole run. The
     drift is bounded if both drifts are about equal, and grows with time if the drift of the whole
     run is a hundred times that of the first hundredth. In a record `setting` is the length of a
-    step, s, and `error` is the drift of the energy, since the motion forgets its start long before
-    the end, where no reference is possible.
+    step in seconds. The field `error` is the drift of the energy, because there is no reference for
+    the last state: small errors grow so much in this long run that the last state cannot be
+    predicted.
     """
     body = Inertia.from_principal(*BODY)
     start = Attitude([0.955336489125606, 0.29552020666133955, 0.0, 0.0], [0.4, 0.3, 1.2])

@@ -16,8 +16,9 @@ WANTED = (1e-4, 1e-7, 1e-10)
 def pareto_front(records: Iterable[Measurement]) -> list[Measurement]:
     """Return the records on the Pareto front of error and time, by falling error.
 
-    All `records` are of one scene and one kind. A record is on the front if no method reaches its
-    error in less time; the time of a method is interpolated log–log between its settings.
+    All `records` are of one scene and one kind. A record is on the front if no method reaches the
+    error of the record in less time than the record; the time of a method is interpolated log–log
+    between its settings.
     """
     records = [r for r in require_measurements(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
@@ -48,9 +49,8 @@ def first_answers(records: Iterable[Measurement]) -> list[Measurement]:
 def time_to(records: Iterable[Measurement], error: float) -> float:
     """Return the time, s, in which a method reaches an error, from its `records`.
 
-    The time is interpolated log–log between the settings of the method. It is the time of the
-    quickest setting if the error of this setting is already smaller, and NaN if no setting reaches
-    the error.
+    The time is interpolated log–log between the settings of the method. The result is the time of
+    the quickest setting if even this setting reaches the error, and NaN if no setting reaches it.
     """
     error = _checks.positive_float(error, "error")
     rungs = sorted(
@@ -77,11 +77,11 @@ def time_to(records: Iterable[Measurement], error: float) -> float:
 class Choice(NamedTuple):
     """Hold the quickest methods for one scene and one wanted error, a line of `table`.
 
-    **Fields:** `scene`; `wanted` the error; `method` the quickest of our methods and `time`, s;
-    `gradient` our quickest method for a gradient with that relative error, and `gradient_time`, s;
-    `default` and `default_gradient`, the times of `simulate` with its defaults, s; `peer`,
-    `peer_time` a method outside rigidjax that is quicker than `method`, empty and NaN if there is
-    none.
+    **Fields:** `scene` the name of the scene; `wanted` the wanted error; `method` the quickest of
+    our methods, and `time`, s; `gradient` our quickest method for a gradient with the relative
+    error `wanted`, and `gradient_time`, s; `default` and `default_gradient`, the times of
+    `simulate` with its defaults, s; `peer` the quickest method outside rigidjax if it is quicker
+    than `method`, and `peer_time`, s (an empty text and NaN if there is none).
 
     >>> Choice._fields[:2]
     ('scene', 'wanted')
@@ -103,7 +103,8 @@ def choose(records: Iterable[Measurement], wanted: Sequence[float] = WANTED) -> 
     """Return, for each scene and wanted error, our quickest method and any quicker method of
     others.
 
-    **Arguments:** `records` of any scenes, as `measure` returns them; `wanted` errors, rad.
+    **Arguments:** `records` of any scenes, as `measure` returns them; `wanted` the wanted errors,
+    rad for an attitude, else relative.
 
     >>> choose([])
     []
@@ -147,8 +148,12 @@ def _choose_for_scene(records: list[Measurement], scene: str, error: float) -> C
 def times_to_error_by_method(
     records: Iterable[Measurement], kind: str, error: float
 ) -> dict[str, float]:
-    """Return, by label, the time, s, of each method that reaches `error`, the quickest method
-    first.
+    """Return the times, s, in which methods reach an error, by label (method and adjoint), the
+    quickest method first. Methods that do not reach the error are left out.
+
+    - `records`: measurements on one scene.
+    - `kind`: `value` or `gradient`.
+    - `error`: the error to reach, rad for an attitude, else relative.
     """
     of = [r for r in records if r.kind == kind]
     times = {

@@ -25,13 +25,14 @@ TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
 TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
 
-# A run is a function of a setting (a tolerance or a step) that returns two things: the last state,
-# or the gradient, as one vector; and the number of steps.
+# A run is a function of a setting (a tolerance or the length of a step) that returns two things:
+# the last state, or the gradient, as one vector; and the number of steps.
 RunAtSetting = Callable[[float], tuple[Any, Any]]
 # A function of a scene, of its numbers, of its initial state and of an imported package that
 # returns a run.
 MakeRun = Callable[[BenchmarkScene, np.ndarray, np.ndarray, Any], RunAtSetting]
-# A function of a scene that returns a method compiled for it, or `None` if it cannot do the scene.
+# A function of a scene that returns a method compiled for the scene, or `None` if the method cannot
+# do the scene.
 PrepareMethod = Callable[[BenchmarkScene], PreparedMethod | None]
 
 
@@ -66,8 +67,8 @@ def _has_data_for_mujoco(scene: BenchmarkScene) -> bool:
 
 
 def _has_plain_equations_in_double(scene: BenchmarkScene) -> bool:
-    """Return whether the `scene` (a motion to run) has handwritten equations and is in double
-    precision.
+    """Return whether the `scene` (a motion to run) has handwritten equations without JAX and has
+    numbers in double precision.
     """
     # Importing gradsolve sets JAX to float64: gradsolve is not used for scenes of another
     # precision.
@@ -172,8 +173,8 @@ def _prepare_numba(
 def _prepare_mujoco(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, mujoco: ModuleType
 ) -> RunAtSetting:
-    """Return a function of the step, s, that runs a body on a ball joint by MuJoCo's own
-    Runge–Kutta 4, and returns the last state and the number of steps.
+    """Return a function of the length of a step, in seconds, that runs a body on a ball joint by
+    MuJoCo's own Runge–Kutta method of order 4, and returns the last state and the number of steps.
 
     The scene needs `notes` of mass, centre of mass and gravity, which only heavy tops and free
     bodies have.
@@ -237,7 +238,8 @@ def _make_heyoka_run(
     """Return a function of the tolerance that runs heyoka's Taylor method, and returns the last
     state and the number of steps.
 
-    heyoka's order and code depend on the tolerance, so that each tolerance is compiled once.
+    The order of heyoka's method and its code depend on the tolerance: each tolerance is compiled
+    once, when it is first used.
 
     - `heyoka`: the module heyoka.
     - `end`: the last time, s; the first is 0.
@@ -320,8 +322,8 @@ def _prepare_heyoka_gradient(
 
 
 class _GradsolveEnsemble:
-    """Present a scene (a motion to run) to the package gradsolve, which solves ensembles of
-    equations, as an ensemble of one member.
+    """Present a scene (a motion to run) as an ensemble of one member, because the package gradsolve
+    solves ensembles of equations.
 
     The parameters of the member are the numbers of the scene (inertia, initial rate and attitude;
     or position and velocity of a point).
@@ -367,8 +369,9 @@ def _prepare_gradsolve(
         try:
             solution = ensemble.call("solve", setting)
         except RuntimeError:
-            # gradsolve raises this if its 50 000 steps do not reach the end, as with a fast top. A
-            # state of NaN is left out of the records, and the other methods go on.
+            # gradsolve raises this error if its 50 000 steps do not reach the end of the run, as
+            # with a fast top. A run with a last state of NaN is left out of the records, and the
+            # other methods go on.
             return np.full_like(start, np.nan), 0
         return solution.y_final[0], int(solution.accepted_steps[0])
 

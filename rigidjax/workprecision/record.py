@@ -14,8 +14,8 @@ from rigidjax import _checks
 # Errors of the size of round-off vary between machines: an error below FLOOR is compared as FLOOR.
 FLOOR = 1e-13
 # A change is reported if an error changes by more than the factor WORSE, a number of steps by more
-# than the share STEPS, or a time by more than the factor SLOWER. Times are divided by those of the
-# method BASE on the same machine, since they differ between machines.
+# than the fraction STEPS of itself, or a time by more than the factor SLOWER. Each time is divided
+# by the time of the method BASE on the same machine, since times differ between machines.
 WORSE, STEPS, SLOWER = 3.0, 0.02, 2.0
 BASE = "diffrax Dopri8"
 
@@ -27,14 +27,15 @@ class Measurement:
     **Fields:** `scene`, `method` names; `group` `ours`, `jax` or `peer`; `kind` `value` or
     `gradient`; `adjoint` the way a gradient is computed; `setting` the tolerance, or the number of
     equal steps; `error` of the attitude, an angle in rad (for a point the relative error of its
-    position), and for a gradient the relative error |g − g*|/|g*|; `error_rate` the error of Ω
-    relative to |Ω0| (for a point the relative error of the velocity); `energy`, `momentum` the
-    relative drift of the energy, and the larger drift of the conserved momenta; `by_inertia`,
-    `by_rate`, `by_attitude` the relative errors of the gradient with respect to the inertia, the
-    initial rate and the initial attitude (for a point `by_rate` is for the velocity and
-    `by_attitude` for the position); `steps`; `time`, `time_low`, `time_high` median and quartiles,
-    s; `compile` s; `memory` bytes of the compiled run's temporaries. A field that does not apply is
-    NaN.
+    position), and for a gradient g the relative error |g − g*|/|g*|, where g* is the correct
+    gradient; `error_rate` the error of Ω relative to |Ω0| (for a point the relative error of the
+    velocity); `energy` the relative drift of the energy; `momentum` the largest drift of the
+    conserved momenta; `by_inertia`, `by_rate`, `by_attitude` the relative errors of the gradient
+    with respect to the inertia, the initial rate and the initial attitude (for a point `by_rate` is
+    for the velocity and `by_attitude` for the position); `steps` the number of steps; `time` the
+    median time of a run, and `time_low`, `time_high` the quartiles, s; `compile` the time of
+    compilation, s; `memory` the bytes of temporary arrays in the compiled run. A field that does
+    not apply is NaN.
 
     >>> Measurement("free-top", "closed form", "ours", "value", "", 0.0, error=1e-15).time
     nan
@@ -72,7 +73,9 @@ _WORDS = ("scene", "method", "group", "kind", "adjoint")
 def require_measurements(
     records: Iterable[Measurement], name: str = "records"
 ) -> list[Measurement]:
-    """Return the records as a list. **Raises:** `TypeError` for anything else."""
+    """Return the records, which must be `Measurement` objects, as a list. **Raises:** `TypeError`
+    for anything else.
+    """
     _checks.require_instance(records, Iterable, name, requirement="records")
     items = list(records)
     for record in items:
@@ -118,10 +121,11 @@ def sentences_about_changes(
     Two tables of measurements are compared, a new one (`records`) and an old one (`stored`);
     measurements of other packages are left out.
 
-    A change is reported if an error is more than three times as large or as small; if the number of
-    steps differs by more than 2 %; if a line of `stored` is missing; or if the ratio of a method's
-    median time to that of `diffrax Dopri8`, on the same scene at common settings, has changed by
-    more than a factor of 2.
+    A change is reported if an error has become more than three times as large, or less than a
+    third; if the number of steps differs by more than 2 %; if a measurement in `stored` with an
+    error below 0.1 is missing in `records`, although `records` has others of its scene; or if the
+    ratio of a method's median time to that of `diffrax Dopri8`, on the same scene at common
+    settings, has changed by more than a factor of 2.
     """
     records, stored = require_measurements(records), require_measurements(stored, "stored")
     now = {_run_key(r): r for r in records if r.group != "peer"}
@@ -148,8 +152,9 @@ def sentences_about_changes(
 
 
 def records_in_units_of_base_time(records: Iterable[Measurement]) -> list[Measurement]:
-    """Return the records without those of other packages, with times as multiples of the median
-    time in which the method `BASE` (Dopri8 of diffrax) computes the value on the same scene.
+    """Return the records with each time divided by the median time in which the method `BASE`
+    (Dopri8 of diffrax) computes the value on the same scene. Records of other packages are left
+    out.
 
     Compile times and memory become NaN.
     """
@@ -167,7 +172,8 @@ def records_in_units_of_base_time(records: Iterable[Measurement]) -> list[Measur
 
 def _run_key(record: Measurement) -> tuple[str, ...]:
     """Return the scene, the kind (`value` or `gradient`), the label (method and adjoint) and the
-    setting of a measurement, by which it is found in another table of measurements.
+    setting of a measurement. By these four texts the same run is found in another table of
+    measurements.
     """
     return (record.scene, record.kind, record.label, f"{record.setting:.6g}")
 

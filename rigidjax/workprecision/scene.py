@@ -20,8 +20,9 @@ from rigidjax.frames import Point
 from rigidjax.motion import Attitude
 from rigidjax.rotation import quaternion
 
-# A, B and C are the directions a, b and c of the scalar a·R b + c·Ω/|Ω0| at the end, whose gradient
-# is compared. The directions are generic.
+# A, B and C are the vectors a, b and c in the scalar a·R b + c·Ω/|Ω0|, whose gradient is compared.
+# Here R is the attitude and Ω the body rate at the end, and Ω0 is the body rate at the beginning.
+# The three directions are generic.
 A, B, C = (0.6, -0.48, 0.64), (0.36, 0.8, -0.48), (0.28, -0.5, 0.82)
 
 
@@ -46,10 +47,11 @@ class Reference(NamedTuple):
 
 @functools.cache
 def stored_reference(name: str) -> Reference | None:
-    """Return the stored answer to the standard scene of this name, or `None`.
+    """Return the stored reference (the correct last state and gradient) of the standard scene of
+    this name, or `None` if there is none.
 
-    The answers are made by `tests/workprecision/make_references.py` at 40 digits and rounded to
-    float64.
+    The stored references are made by `tests/workprecision/make_references.py` at 40 digits and
+    rounded to float64.
     """
     file = resources.files("rigidjax.workprecision").joinpath("references.json")
     row = json.loads(file.read_text()).get(name)
@@ -106,7 +108,9 @@ class BenchmarkScene(eqx.Module):
     def numbers(self) -> Float[Array, " parameters"]:
         """Return the numbers with respect to which gradients are taken.
 
-        They are Ixx, Iyy, Izz, Ixy, Ixz, Iyz, Ω0, q0 (13,), or for a point x0, v0 (6,).
+        For a body they are the entries Ixx, Iyy, Izz, Ixy, Ixz, Iyz of the inertia tensor, the
+        initial body rate, and the quaternion of the initial attitude (13,). For a point they are
+        the initial position and velocity (6,).
         """
         if self.body is None:
             return jnp.concatenate([self.state0.x, self.state0.v])  # pyright: ignore
@@ -128,21 +132,25 @@ class BenchmarkScene(eqx.Module):
     def assemble(
         self, numbers: Float[Array, " parameters"]
     ) -> tuple[Inertia | None, Attitude | Point]:
-        """Return the body and the initial state with these `numbers`."""
+        """Return the body and the initial state that `numbers` describe; the body is `None` for a
+        point.
+        """
         if self.body is None:
             return None, Point(numbers[:3], numbers[3:])
         tensor = from_components(*(numbers[i] for i in range(6)))
         return Inertia(tensor), Attitude(quaternion.normalise(numbers[9:]), numbers[6:9])
 
     def flatten(self, state: PyTree) -> Float[Array, " state"]:
-        """Return a state as one vector, (7,) or (6,)."""
+        """Return a state as one vector, (7,) for a body or (6,) for a point."""
         return jnp.concatenate(jax.tree.leaves(state))
 
     @property
     def size(self) -> tuple[float, float]:
-        """Return two scales of errors: 1 rad for the attitude and |Ω0| for the rate.
+        """Return two scales of errors: 1 rad for the attitude; and for the body rate the length
+        |Ω0| of the initial body rate.
 
-        For a point: |x0| for the position, and for the velocity |v0|, at least |x0|/`end`.
+        For a point they are the initial distance |x0| for the position, and for the velocity the
+        initial speed |v0|, or |x0|/`end` if that is larger.
         """
         state: Any = self.state0
         if self.body is None:
@@ -164,9 +172,11 @@ def state_errors(
     final_state: ArrayLike | Sequence[float],
     reference: ArrayLike | Sequence[float],
 ) -> tuple[float, float]:
-    """Return two errors of a last state: of the attitude, an angle, rad; and of Ω relative to |Ω0|.
+    """Return two errors of a last state: the error of the attitude, an angle, rad; and the error of
+    the body rate, divided by the length |Ω0| of the initial body rate.
 
-    For a point: the errors of position and velocity relative to the scales of `scene.size`.
+    For a point they are the errors of position and velocity, divided by the two scales of
+    `scene.size`.
     """
     final_state, reference = np.asarray(final_state, float), np.asarray(reference, float)
     one, two = scene.size

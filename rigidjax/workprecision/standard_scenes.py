@@ -24,10 +24,13 @@ ARENSTORF = (0.012277471, 0.994, -2.00158510637908252240, 17.0652165601579625588
 TILTED = np.array([np.cos(0.15), np.sin(0.15), 0.0, 0.0])
 # The acceleration of gravity in the scenes of heavy tops, m/s², in world axes.
 WEIGHT = (0.0, 0.0, -2.0)
-# The distance of the planet in the scene `gravity-gradient`.
+# The distance of the planet in the scene `gravity-gradient`. The motion does not depend on it,
+# because the strength of gravity follows from it and the orbital rate.
 RADIUS = 7.0
 
-# Bodies: title, principal moments, Ω0, end, equations, and their constants.
+# The scenes of bodies, by name. Each has a title, the principal moments in kg m², the initial body
+# rate in rad/s, the last time in seconds, the handwritten torque (`None` for a free body), and the
+# constants of this torque.
 BODIES: dict[str, tuple[str, Any, Any, float, Any, Any]] = {
     "free-top": ("free asymmetric top", (1.0, 2.0, 3.0), (1.0, 0.7, 0.4), 100.0, None, ()),
     "middle-axis": (
@@ -60,8 +63,9 @@ BODIES: dict[str, tuple[str, Any, Any, float, Any, Any]] = {
 
 
 class Circle(eqx.Module):
-    """Compute the position (3,) on a circular orbit in the xy-plane; `rate` is the angular rate,
-    rad/s.
+    """Compute the position (3,) on a circular orbit in the xy-plane as a function of time.
+
+    `radius` is the radius of the orbit, and `rate` the angular rate, rad/s.
     """
 
     radius: Float[Array, ""]
@@ -86,7 +90,7 @@ def _library_torque(
 
     - `handwritten_torque`: the handwritten torque, a function of `workprecision.equations`, or
       `None`.
-    - `constants`: its constants, such as centre of mass and gravity.
+    - `constants`: the constants of this torque, such as centre of mass and gravity.
     """
     if handwritten_torque is equations.heavy_top_torque:
         return HeavyTop(1.0, constants[:3], constants[3:])
@@ -165,10 +169,10 @@ def _scene_of_point(
     - `name`: the name of the scene, by which its stored answer is found.
     - `title`: the name in words.
     - `start`: the initial position and velocity.
-    - `end`: the last time, s, or in the unit of time of the equations.
+    - `end`: the last time, in the unit of time of the equations (seconds for the pendulum).
     - `library_equations`: the object of this library that has the equations of motion.
-    - `handwritten_equations`: a function of `workprecision.equations` that makes the same equations
-      by hand.
+    - `handwritten_equations`: a function of `workprecision.equations` that returns the same
+      equations in plain arithmetic.
     - `constants`: the constants of these equations.
     """
 
