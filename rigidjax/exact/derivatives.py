@@ -5,9 +5,9 @@ Its results are the body momentum Π(t) and the turn, which is the rotation R of
 to t, as a quaternion.
 
 The derivative of the turn needs no elliptic integral of the third kind. Let `δR = R hat(θ)` be the
-change of R for a small change of the inputs, where θ is a small rotation vector, and let h = |Π|.
-The momentum is constant in space, `R Π(t) = Π(0)`, and this gives the component of θ normal to
-Π(t):
+change of R for a small change of the inputs, where θ is a small rotation vector and hat(θ) the
+matrix of the cross product with θ, and let h = |Π|. The momentum is constant in space, `R Π(t) =
+Π(0)`, and this gives the component of θ normal to Π(t):
 
     Π(t) × (Rᵀ δΠ(0) − δΠ(t)) = h² θ − Π (Π·θ)
 

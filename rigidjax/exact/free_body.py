@@ -197,8 +197,9 @@ def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
     """
     if isinstance(state0, HasPose) or not isinstance(state0, HasSpin):
         raise TypeError(
-            f"state0: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
-            "also moves is free in both: add x + v t yourself, or use simulate"
+            f"state0: wanted a Spin or an Attitude, got {type(state0).__name__}; the centre "
+            "of mass of a free body moves at constant velocity: add x + v t yourself, or use "
+            "simulate"
         )
     _checks.require_unbatched_instance(
         inertia, Inertia, "inertia", hint="of MassProperties pass .inertia"

@@ -29,9 +29,10 @@ class Elliptic(NamedTuple):
     """Hold the elliptic functions S, C and D of a free body at some time, and the phase ξ as a
     direction (x, y) ∝ (cos ξ, sin ξ).
 
-    S(u) solves dS/du = CD with S(0) = 0, where C² = 1 − pS² and D² = 1 − qS²; S, C and D are
-    Jacobi's sn, cn and dn in another scaling. The phase ξ is an angle,
-    rad: the correction to the rotation of the body about its momentum (see `elliptic_functions`).
+    S(u) solves dS/du = CD with S(0) = 0, where C² = 1 − pS² and D² = 1 − qS² for two numbers p and
+    q of the motion; S, C and D are Jacobi's sn, cn and dn in another scaling. The phase ξ is an
+    angle, rad: a correction to the rotation of the body about its momentum (see
+    `elliptic_functions`).
     """
 
     S: Scalar

@@ -493,7 +493,7 @@ def _scaled_matrix(matrix: SymmetricEntries, factor: Scalar | float) -> Symmetri
 
 def _add_to_diagonal(matrix: SymmetricEntries, summand: Scalar | float) -> SymmetricEntries:
     """Return the six entries (11, 22, 33, 12, 13, 23) of the matrix A + x 1, for a symmetric matrix
-    A and a number x.
+    A, a number x and the unit matrix 1.
 
     - `matrix`: the six entries of A, in the same order.
     - `summand`: x, a scalar.

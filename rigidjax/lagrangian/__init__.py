@@ -1,9 +1,9 @@
 """Derive equations of motion from any Lagrangian or Hamiltonian by automatic differentiation.
 
-Such equations serve cross-checks, teaching, and scenes with their own coordinates. For a rigid body
-the equations of `Attitude` cost less and have no singular attitude. Equations in Euler angles are
-singular at sin θ = 0, and need many small steps near this attitude. `equations_of_motion` takes a
-Lagrangian; `lie_poisson` and `lie_poisson_with_direction` take a Hamiltonian.
+Such equations serve cross-checks, teaching, and problems with their own coordinates. For a rigid
+body the equations of `Attitude` cost less and have no singular attitude. Equations in Euler angles
+are singular at sin θ = 0, and need many small steps near this attitude. `equations_of_motion` takes
+a Lagrangian; `lie_poisson` and `lie_poisson_with_direction` take a Hamiltonian.
 """
 
 from rigidjax._names import define_dir_and_getattr

@@ -1,7 +1,7 @@
-"""Compare the error and the cost of methods, for motions and gradients, to choose one for a scene.
+"""Compare the error and the cost of methods, for motions and gradients, to choose a method.
 
-`measure(scene)` runs methods on a scene, `draw` makes a chart with the Pareto front, and `choose`
-finds the quickest methods. `python -m rigidjax workprecision` does all three.
+`measure(scene)` runs methods on a scene (a motion to run), `draw` makes a chart with the Pareto
+front, and `choose` finds the quickest methods. `python -m rigidjax workprecision` does all three.
 """
 
 from rigidjax._names import define_dir_and_getattr

@@ -99,7 +99,7 @@ def _flow_of_closed_form(scene: BenchmarkScene) -> Flow | None:
 
 def _flow_of_simulate(scene: BenchmarkScene, setting_is_accuracy: bool = False) -> Flow | None:
     """Return the flow of `simulate` with its defaults, or `None` for a `scene` (a motion to run)
-    without a torque, to which `simulate` applies the closed form.
+    without a torque: there `simulate` applies the closed form, which is measured by itself.
 
     A flow is a function of the scene's numbers (inertia, initial rate and attitude; or position and
     velocity of a point) and of a setting, here the tolerance; it returns two things: the last state

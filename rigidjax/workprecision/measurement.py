@@ -59,8 +59,8 @@ class _TimedRun(NamedTuple):
     scene (a motion to run).
 
     **Fields:** `record` the measurement, still without its times; `ready` the compiled method;
-    `times` the measured times, s, the first of them from the run that found the errors, which does
-    not enter the median.
+    `times` the measured times, s. The first of them is the time of the run that found the errors,
+    and it does not enter the median.
     """
 
     record: Measurement
@@ -252,9 +252,9 @@ def _errors_and_drifts_of_final_state(
 def _gradient_errors(
     scene: BenchmarkScene, computed_gradient: np.ndarray | Array, reference: Reference
 ) -> dict[str, float]:
-    """Return, by the names of fields of `Measurement`, the relative errors of a gradient: of the
-    whole, and of its parts with respect to inertia, initial rate and initial attitude (for a point:
-    velocity and position).
+    """Return, by the names of fields of `Measurement`, the relative error of a whole gradient, and
+    the relative errors of its parts with respect to inertia, initial rate and initial attitude (for
+    a point: with respect to velocity and position).
 
     - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `computed_gradient`: the gradient of `scene.loss`, a scalar function of the last state, with

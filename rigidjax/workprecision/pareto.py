@@ -80,8 +80,9 @@ class Choice(NamedTuple):
     **Fields:** `scene` the name of the scene; `wanted` the wanted error; `method` the quickest of
     our methods, and `time`, s; `gradient` our quickest method for a gradient with the relative
     error `wanted`, and `gradient_time`, s; `default` and `default_gradient`, the times of
-    `simulate` with its defaults, s; `peer` the quickest method outside rigidjax if it is quicker
-    than `method`, and `peer_time`, s (an empty text and NaN if there is none).
+    `simulate` with its defaults, s (for a free body the times of the closed form, which `simulate`
+    then applies); `peer` the quickest method outside rigidjax if it is quicker than `method`, and
+    `peer_time`, s (an empty text and NaN if there is none).
 
     >>> Choice._fields[:2]
     ('scene', 'wanted')
@@ -121,7 +122,8 @@ def choose(records: Iterable[Measurement], wanted: Sequence[float] = WANTED) -> 
 def _choose_for_scene(records: list[Measurement], scene: str, error: float) -> Choice:
     """Return our quickest methods (for the value, and for the gradient) for one scene and one
     wanted error, and the quickest method of other packages for the value if it is quicker than
-    ours. The times of our default method (the closed form, else `simulate`) are included.
+    ours. The times of our default method (the closed form if it was measured, else `simulate`) are
+    included.
 
     - `records`: the measurements on this scene.
     - `scene`: the name of the scene.

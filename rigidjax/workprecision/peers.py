@@ -384,10 +384,10 @@ def _prepare_gradsolve_gradient(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, gradsolve: ModuleType
 ) -> RunAtSetting:
     """Return a function of the tolerance that computes the gradient of `scene.loss`, a scalar
-    function of the last state, by gradsolve, through steps that were recorded before, and returns
-    the gradient and the number of steps.
+    function of the last state, by gradsolve, which differentiates a solution whose steps it has
+    recorded before, and returns the gradient and the number of steps.
 
-    The recording is made once for each tolerance, and is not timed.
+    The steps are recorded once for each tolerance, and this recording is not timed.
 
     - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial

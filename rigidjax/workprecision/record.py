@@ -14,8 +14,9 @@ from rigidjax import _checks
 # Errors of the size of round-off vary between machines: an error below FLOOR is compared as FLOOR.
 FLOOR = 1e-13
 # A change is reported if an error changes by more than the factor WORSE, a number of steps by more
-# than the fraction STEPS of itself, or a time by more than the factor SLOWER. Each time is divided
-# by the time of the method BASE on the same machine, since times differ between machines.
+# than 1 and by more than the fraction STEPS of the old number, or a time by more than the factor
+# SLOWER. Each time is divided by the time of the method BASE on the same machine, since times
+# differ between machines.
 WORSE, STEPS, SLOWER = 3.0, 0.02, 2.0
 BASE = "diffrax Dopri8"
 
@@ -28,14 +29,14 @@ class Measurement:
     `gradient`; `adjoint` the way a gradient is computed; `setting` the tolerance, or the number of
     equal steps; `error` of the attitude, an angle in rad (for a point the relative error of its
     position), and for a gradient g the relative error |g − g*|/|g*|, where g* is the correct
-    gradient; `error_rate` the error of Ω relative to |Ω0| (for a point the relative error of the
-    velocity); `energy` the relative drift of the energy; `momentum` the largest drift of the
-    conserved momenta; `by_inertia`, `by_rate`, `by_attitude` the relative errors of the gradient
-    with respect to the inertia, the initial rate and the initial attitude (for a point `by_rate` is
-    for the velocity and `by_attitude` for the position); `steps` the number of steps; `time` the
-    median time of a run, and `time_low`, `time_high` the quartiles, s; `compile` the time of
-    compilation, s; `memory` the bytes of temporary arrays in the compiled run. A field that does
-    not apply is NaN.
+    gradient; `error_rate` the error of the body rate Ω, divided by the length of the initial rate
+    Ω0 (for a point the relative error of the velocity); `energy` the relative drift of the energy;
+    `momentum` the largest drift of the conserved momenta; `by_inertia`, `by_rate`, `by_attitude`
+    the relative errors of the gradient with respect to the inertia, the initial rate and the
+    initial attitude (for a point `by_rate` is for the velocity and `by_attitude` for the position);
+    `steps` the number of steps; `time` the median time of a run, and `time_low`, `time_high` the
+    quartiles, s; `compile` the time of compilation, s; `memory` the bytes of temporary arrays in
+    the compiled run. A field that does not apply is NaN.
 
     >>> Measurement("free-top", "closed form", "ours", "value", "", 0.0, error=1e-15).time
     nan

@@ -214,10 +214,10 @@ class TimedMethod(NamedTuple):
 
     **Fields:** `name`; `group` `ours`, `jax` (anything else that runs in JAX) or `peer`; `settings`
     tolerances, or numbers of equal steps, from coarse to fine; `value` prepares the method for a
-    scene, and returns `None` for a scene that it cannot do; `gradients` has, by adjoint, functions
-    like `value` for the gradient of the scene's scalar with respect to its `numbers`; `equal`
-    whether the settings are numbers of equal steps for a run that turns by 50 rad, which are scaled
-    to the angle of the scene.
+    scene, and returns `None` for a scene that it cannot do; `gradients` has, by the name of the
+    adjoint (the way in which a gradient is computed), functions like `value` for the gradient of
+    the scene's scalar with respect to its `numbers`; `equal` whether the settings are numbers of
+    equal steps for a run that turns by 50 rad, which are scaled to the angle of the scene.
 
     >>> import numpy as np
     >>> prepared = PreparedMethod(lambda setting: (np.ones(7), 0))

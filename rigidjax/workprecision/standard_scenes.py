@@ -24,8 +24,9 @@ ARENSTORF = (0.012277471, 0.994, -2.00158510637908252240, 17.0652165601579625588
 TILTED = np.array([np.cos(0.15), np.sin(0.15), 0.0, 0.0])
 # The acceleration of gravity in the scenes of heavy tops, m/s², in world axes.
 WEIGHT = (0.0, 0.0, -2.0)
-# The distance of the planet in the scene `gravity-gradient`. The motion does not depend on it,
-# because the strength of gravity follows from it and the orbital rate.
+# The distance of the planet in the scene `gravity-gradient`. The motion does not depend on this
+# distance, because the mass of the planet is chosen so that a circular orbit at this distance has
+# the orbital rate of the scene.
 RADIUS = 7.0
 
 # The scenes of bodies, by name. Each has a title, the principal moments in kg m², the initial body
