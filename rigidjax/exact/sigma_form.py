@@ -107,8 +107,9 @@ class Sigma(NamedTuple):
     """Hold Weierstrass's four sigma functions of a free motion at some time u: one is the number σ,
     and the other three are the eigenvalues of a symmetric matrix T.
 
-    σ and T satisfy T² = w 1 − σ² E, with a number w and the matrix E that `Invariants` describes.
-    Each matrix in this class is symmetric and is the tuple of its entries (11, 22, 33, 12, 13, 23).
+    σ and T satisfy T² = w 1 − σ² E, with a number w and the unit matrix 1. Here E = E₂ K + |Π|²
+    adj(K), with the inverse K of the inertia tensor, the body momentum Π and E₂ = Π·KΠ. Each matrix
+    in this class is symmetric and is the tuple of its entries (11, 22, 33, 12, 13, 23).
 
     - `s`: the number σ. A factor common to σ and T is free; it is chosen so that T₂₂ = 1.
     - `t`: the matrix T.
@@ -124,7 +125,10 @@ class Sigma(NamedTuple):
 
 
 def motion_invariants(inverse_inertia: Differences, momentum: Triple) -> Invariants:
-    """Return the constants of a free motion that its sigma functions need.
+    """Return the constants of a free motion from which its sigma functions are computed.
+
+    They are the entries of the matrix E − E₂₂ 1, where 1 is the unit matrix, and the numbers from
+    which these entries follow. Here E = E₂ K + |Π|² adj(K), and E₂ = Π·KΠ is twice the energy.
 
     - `inverse_inertia`: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
       inertia tensor.
@@ -194,7 +198,8 @@ def sigma_at_double_time(sigma: Sigma, constants: Invariants) -> Sigma:
     - `constants`: the invariants of the motion.
 
     The formulas are T(2u) = T⁴ − σ⁴ χ'(E) and σ(2u) = 2 σ det T, where χ' is the derivative of the
-    characteristic polynomial χ of the matrix E of the motion.
+    characteristic polynomial χ of the matrix E = E₂ K + |Π|² adj(K), with the inverse K of the
+    inertia tensor, the body momentum Π and E₂ = Π·KΠ.
     """
     t1, t2, t3, t12, t13, t23 = sigma.t
     s = sigma.s
@@ -246,11 +251,12 @@ class DivisorTerms(NamedTuple):
     """Hold the terms and factors of a number W that do not depend on the body momentum Π.
 
     The number W is the divisor in the addition theorem Π(t) = (adj(T) Π + σ T (Π × KΠ))/W. It is `W
-    = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²)`, where σ, T, E, E₂ and K are those of the head of this
-    module. The index i is 1 if `first` is true, else 3: with this choice W is a sum of positive
-    terms. The number `square` is (T²)ᵢᵢ. The factor of σ² is `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13
-    Π₁ Π₃ + |KΠ|² − less`, where K in KΠ is taken without its diagonal; d13 and k13 belong to
-    `Differences`, and `d`, `k`, `slant` and `less` to this class.
+    = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²)`, with the sigma functions σ and T at the duration of the
+    step, the inverse K of the inertia tensor, E₂ = Π·KΠ and E = E₂ K + |Π|² adj(K). The index i is
+    1 if `first` is true, else 3: with this choice W is a sum of positive terms. The number `square`
+    is (T²)ᵢᵢ. The factor of σ² is `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13 Π₁ Π₃ + |KΠ|² − less`, where
+    K in KΠ is taken without its diagonal; d13 and k13 belong to `Differences`, and `d`, `k`,
+    `slant` and `less` to this class.
     """
 
     first: Array
