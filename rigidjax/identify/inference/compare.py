@@ -49,9 +49,10 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     """Compare models of the same data by Schwarz's criterion, and return the best model first.
 
     The criterion is `Σ Nₛ log s² + p log N` for p free numbers (Schwarz 1978,
-    doi:10.1214/aos/1176344136). The sum is over the sensors; s² is the mean square error of a
-    sensor, and Nₛ its number of independent readings: the number of components read, over the
-    smallest autocorrelation time (in samples) of all models. N is the sum of Nₛ over the sensors.
+    doi:10.1214/aos/1176344136). The sum is over the sensors. For each sensor, s² is its mean square
+    error, and Nₛ its number of independent readings. Nₛ is the number of components read, divided
+    by the autocorrelation time (in samples) of the model for which this time is shortest. N is the
+    sum of Nₛ over the sensors.
 
     **Arguments:** `fits` is a dict of name → `Fit`, with fits of the same readings. **Returns** for
     each model a `Comparison` with `name`, `free`, `rms`, `correlation` and `information`.

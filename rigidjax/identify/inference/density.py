@@ -49,11 +49,12 @@ class LogDensity(eqx.Module):
     fit estimates, and one for each number of the process. `unpack(x)` returns the body, the states
     and the values that x represents.
 
-    If there is a process (a random torque) or a `Walk`, a Kalman filter integrates the unknown
-    torque and the drifts out. Otherwise the readings are independent and normal about the motion;
-    if their errors are autocorrelated, the density is then too narrow: keep fewer readings, or give
-    a process. The jitter of a sensor has the value of the fit. The priors are the priors of the
-    model (of its `Free`s, or an `Entropic` prior); the prior of all other numbers is flat in x.
+    If there is a process (a random torque) or a `Walk` (a drift of a sensor), a Kalman filter
+    integrates the unknown torque and the drifts out. Otherwise the readings are taken as
+    independent and normal about the motion. Such a density is too narrow if the errors of the
+    readings are autocorrelated: keep fewer readings, or give a process. The jitter of a sensor has
+    the value of the fit. The priors are the priors of the model (of its `Free`s, or an `Entropic`
+    prior); the prior of all other numbers is flat in x.
 
     **Arguments:**
 
@@ -61,11 +62,13 @@ class LogDensity(eqx.Module):
       `fit(model, starts=1, max_steps=1)`.
     - `process`: a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of such torques; `None` takes the
       process of the model.
-    - `deviation`: the standard deviation of the normal prior of the logarithms of all numbers of
-      the process (spectral densities and correlation times), about the values in `process`; `None`
-      for a known process. If only ratios of moments are determined, as by a gyro alone, the
-      spectral density of a torque scales with the square of a moment: compare
-      `density / moment**2`, and give the process in the unit of inertia of the fit (`fit.body`).
+    - `deviation`: the standard deviation of the normal prior of the logarithm of each number of the
+      process, such as a spectral density or a correlation time. The mean of this prior is the
+      logarithm of the number in `process`. `None` for a known process.
+
+    If only ratios of moments are determined, as by a gyro alone, the spectral density of a torque
+    scales with the square of a moment: compare `density / moment**2`, and give the process in the
+    unit of inertia of the fit (`fit.body`).
 
     **Fields:**
 
@@ -174,12 +177,13 @@ def map_draws(
 
 
 def _slots_and_variances_of_unknown_noise(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
-    """Return two things: a slot for each sensor of a `model` whose noise is unknown; and variances.
+    """Return two things for each sensor of a `model` whose noise is unknown: a slot; and an array
+    (groups,) of variances.
 
-    A slot is the description of a `Free`, a number that a fit may move. Here it is a factor of the
-    noise of the sensor, one for each group of recordings that share their noise, and the free
-    number is its logarithm. The variances, one array (groups,) for each slot, say how well the
-    readings determine these logarithms: 1/(2N) for a group with N numbers read by the sensor.
+    A slot is the description of a `Free`, a number that a fit may move. Here it describes one
+    factor of the noise of the sensor for each group of recordings that share their noise. The free
+    number is the logarithm of the factor. The variances say how well the readings determine these
+    logarithms: 1/(2N) for a group in which the sensor read N numbers.
     """
     groups, slots, variances = np.asarray(model.noise_groups), [], []
     for index, reading in enumerate(model.records.readings):
@@ -268,7 +272,8 @@ _MARK = object()
 def _add_free_numbers_and_reindex(
     model: Model, noises: Noise, process: Process | None, slots: list[Slot]
 ) -> tuple[Model, np.ndarray]:
-    """Return two things: a model with additional free numbers; and the new indices of its old ones.
+    """Return two things: a model with additional free numbers; and the indices (n,), in this model,
+    of the n free numbers of the old model.
 
     **Arguments:**
 
@@ -278,7 +283,8 @@ def _add_free_numbers_and_reindex(
     - `slots`: a slot (the description of a `Free`, a number that a fit may move) for each
       additional number. None of these numbers is given separately for each recording.
 
-    The indices (n,) say which of the new free numbers each old one is.
+    The additional numbers come before the numbers that belong to one recording alone, which
+    therefore get other indices.
     """
     bodies = indices_of_body_numbers(model.chart, model.body_indices, model.count)
     kinds = model.index.start.shape[1] // 3

@@ -37,11 +37,12 @@ Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 _BLACKJAX = ("blackjax", "posterior", "posterior")
 
 # The first mass matrix of a sampler counts like an estimate from this number of draws, because it
-# is the good one of Laplace's method.
+# comes from Laplace's method, which gives a good one.
 _FIRST_WEIGHT = 50.0
 
-# With at least this number of recordings one gradient keeps a core busy: the gradients of four
-# chains then take as long together as one after another.
+# With at least this number of recordings, one gradient keeps a core of the processor busy. The
+# gradients of four chains then take as long if they are computed together as if they are computed
+# one after another.
 _FULL = 8
 
 
@@ -55,9 +56,9 @@ class Nuts(eqx.Module):
 
     - `samples`: the number of draws of each chain.
     - `warmup`: the number of draws of the warm-up, which are thrown away.
-    - `acceptance`: the mean acceptance probability of the points of a trajectory, to which the
-      warm-up adapts the step. 0.8 is careful; 0.65 takes half as many gradients if the density is
-      nearly normal.
+    - `acceptance`: the mean acceptance probability of the points of a trajectory; the warm-up
+      adapts the step so that this mean is reached. 0.8 is careful; 0.65 takes half as many
+      gradients as 0.8 if the density is nearly normal.
 
     **Raises:** `ValueError` for numbers below 1 and an `acceptance` that is not between 0 and 1.
 
@@ -218,9 +219,9 @@ def posterior(
     - `density`: a `LogDensity`.
     - `key`: a key of `jax.random`.
     - `sampler`: a function that is given a key, a log-density and a first vector (n,), and returns
-      draws (samples, n); `Nuts()` by default. The vectors are shifted and scaled so that Laplace's
-      method gives them the mean 0 and the identity as covariance. The first vector is normal, with
-      half of this standard deviation.
+      draws (samples, n); `Nuts()` by default. The vectors are x, shifted and scaled so that by
+      Laplace's method they have the mean 0 and the identity as covariance. The components of the
+      first vector are normal, with the mean 0 and the standard deviation 0.5.
     - `chains`: the number of chains. The chains run together under `vmap`, or one after another for
       eight recordings and more.
 

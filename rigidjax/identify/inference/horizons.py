@@ -36,9 +36,9 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
     - `windows`: the windows of the fit, or other windows with the same kind of state and inputs.
 
     **Returns** a `Horizons` with `steps`, `mean_absolute`, `mean_norm` and `rms`. A good model has
-    smaller errors than `windows.held_horizons()`. **Raises:** `TypeError` for a fit of other
-    recordings than windows, `ValueError` for a `Free` with a value for each window and for missing
-    inputs.
+    smaller errors than `windows.held_horizons()`, which predicts that the state stays constant.
+    **Raises:** `TypeError` for a fit of other recordings than windows; `ValueError` for a `Free`
+    with a value for each window, and for missing inputs.
 
     >>> t = np.linspace(0.0, 1.0, 11)
     >>> spin = rj.Spin(np.stack([0 * t, 0 * t, np.exp(-0.5 * t)], 1))

@@ -17,7 +17,7 @@ from rigidjax.identify.uncertainty import quantities
 from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
 
 # The residual of a `Pull` has this standard deviation, in units of the standard deviation of the
-# quantity. A smaller one would slow the search down.
+# quantity. A smaller standard deviation would slow the search down.
 PULL = 0.3
 
 
@@ -121,8 +121,10 @@ def _profile_interval_end(
 ) -> float:
     """Return one end of a profile interval of a quantity, or infinity if the search finds no end.
 
-    At an end the misfit, minimised over all other numbers, has grown by the square of
-    `first_distance`. An infinite end has the sign of `side`.
+    The misfit is minimised over all other numbers here. Its growth is twice its difference from the
+    least misfit, divided by the number of samples over which errors are autocorrelated. At an end
+    of the interval the growth is the square of `first_distance`. An infinite end has the sign of
+    `side`.
 
     **Arguments:**
 

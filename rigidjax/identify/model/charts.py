@@ -15,13 +15,13 @@ from rigidjax.body import parameters as charts, validation
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of as tensor_of
 from rigidjax.body.symmetric3 import inertia_from_second_moment
 
-# This maps each part of a `MassProperties` that may be free to the indices of its numbers in the
-# result of `rigidjax.body.parameters.pack`.
+# A fit may move three parts of a `MassProperties`. This dict maps each part to the indices of its
+# numbers in the array that `rigidjax.body.parameters.pack` returns.
 _PARTS = {"mass": (0,), "com": (7, 8, 9), "inertia": (1, 2, 3, 4, 5, 6)}
 Numbers = Float[Array, " chart"]
 HessianRows = Float[Array, "rows chart"]
-# These are the components of a symmetric tensor in the order xx, yy, zz, yz, xz, xy, as in
-# `Tensor.plain_names`.
+# These are the index pairs of the six components of a symmetric tensor, in the order xx, yy, zz,
+# yz, xz, xy, as in `Tensor.plain_names`.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 # BASIS[k] is the symmetric tensor whose component COMPONENTS[k] is one and whose other components
 # are zero.
@@ -31,17 +31,18 @@ for _k, (_i, _j) in enumerate(COMPONENTS):
 
 
 class AbstractBodyChart(eqx.Module):
-    """Map `size` numbers to an `Inertia` or `MassProperties`, and back, as a chart of bodies.
+    """Define a chart of bodies, which maps `size` unconstrained numbers to an `Inertia` or
+    `MassProperties`, and back.
 
     To make a chart of your own, write a subclass with the methods `body`, `vector` and `logs` and
     these members:
 
-    - `size`: the number of its numbers.
-    - `log_names`: the names of the positive quantities that are reported; `logs(body)` returns
-      their logarithms.
-    - `plain_names`: the names of reported quantities of either sign, which `plain(body)` returns;
-      none unless given.
-    - `unit`: the unit of the reported quantities.
+    - `size`: how many numbers represent a body.
+    - `log_names`: the names of the positive quantities of a body that a fit reports; `logs(body)`
+      returns the logarithms of these quantities.
+    - `plain_names`: the names of the quantities of either sign that a fit reports; `plain(body)`
+      returns these quantities. By default there are no such quantities.
+    - `unit`: the unit of all reported quantities, by default an empty text.
 
     >>> class Spheres(AbstractBodyChart):  # one number: the logarithm of the moment
     ...     size, unit, log_names = 1, "kg m²", ("I",)
@@ -59,8 +60,9 @@ class AbstractBodyChart(eqx.Module):
     log_names: eqx.AbstractVar[tuple[str, ...]]
     plain_names: ClassVar[tuple[str, ...]] = ()
     unit: ClassVar[str] = ""
-    # This is the argument `scale` of the `Inertia` that a user gets from `Model`. Within a fit an
-    # `Inertia` is not marked as of arbitrary scale, since a torque on such a body would be refused.
+    # This is the argument `scale` of the `Inertia` that a user gets from `Model`: "arbitrary" if
+    # the chart finds the inertia only up to a factor. Within a fit the `Inertia` does not have this
+    # mark, since a torque on a body of arbitrary scale would be refused.
     scale: ClassVar[str | None] = None
 
     @abc.abstractmethod
@@ -69,16 +71,17 @@ class AbstractBodyChart(eqx.Module):
 
     @abc.abstractmethod
     def vector(self, body: PyTree) -> Numbers:
-        """Return the numbers (size,) that represent a `body` in this chart, such as the initial
-        guess of a fit.
+        """Return the numbers (size,) that represent a `body` in this chart. A fit may start from
+        these numbers.
         """
 
     def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
-        """Return j rows B (j, size) such that BᵀB is the part of a misfit's second derivative that
-        comes from the curvature of the chart, since the body is not linear in its numbers.
+        """Return j rows B (j, size), by which a fit allows for the curvature of the chart: the body
+        is not a linear function of its numbers.
 
-        This part matters if a body may be flat (`rigidjax.body.parameters.flat_bend`). A chart with
-        j = 0 leaves this part out.
+        The curvature adds BᵀB to the second derivative of a misfit. This matters if a body may be
+        flat (`rigidjax.body.parameters.flat_bend`). A chart that returns no rows (j = 0) leaves the
+        curvature out.
 
         - `vector`: (size,) the numbers of the body in the chart.
         - `slope`: (size,) the derivative of the misfit with respect to these numbers.
@@ -102,8 +105,8 @@ class Ratios(AbstractBodyChart):
     """Map five numbers to the inertia tensor up to scale: two ratios of moments and the principal
     axes.
 
-    It is for free motion, from which the scale cannot be found. The five numbers describe a square
-    root of the matrix of second moments 𝔖 = ∫ r rᵀ dm, whose scale is fixed
+    The chart is for free motion, which does not show the scale of the inertia. The five numbers
+    describe a square root of the matrix of second moments 𝔖 = ∫ r rᵀ dm; the scale of 𝔖 is fixed
     (`rigidjax.body.parameters.pack_shape`). In this way a flat body, whose 𝔖 is singular, is an
     ordinary point of the chart.
 
@@ -132,9 +135,9 @@ class Ratios(AbstractBodyChart):
 class PrincipalRatios(AbstractBodyChart):
     """Map two numbers to two ratios of moments, if the body axes are known to be principal.
 
-    The two numbers describe the square roots of the second moments λ1, λ2, λ3 along the axes, whose
-    scale is fixed (notes, eqs 72, 76–78). In this way the moments of inertia obey the triangle
-    inequalities for every pair of numbers.
+    The two numbers describe the square roots of the second moments λ1, λ2, λ3 along the axes; the
+    scale of the second moments is fixed (notes, eqs 72, 76–78). In this way the moments of inertia
+    obey the triangle inequalities for every pair of numbers.
 
     >>> PrincipalRatios().body(jnp.zeros(2)).moments.sum().round(12)  # Tr I = 2, as of `Ratios`
     Array(2., dtype=float64)
@@ -176,14 +179,14 @@ def _checked_typical_moment(value: object) -> Array:
 
 
 class Tensor(AbstractBodyChart):
-    """Map six numbers to the inertia tensor with its scale, which can be found with a known torque
-    or momentum.
+    """Map six numbers to the inertia tensor with its scale.
 
-    The six numbers are the logarithm of the size of the matrix of second moments 𝔖 in units of
-    `typical`, and the five numbers of `Ratios`.
+    The scale can be found if a torque or a momentum is known. The first of the six numbers is the
+    logarithm of the size of the matrix of second moments 𝔖 = ∫ r rᵀ dm, in units of `typical`. The
+    other five are the numbers of `Ratios`.
 
-    **Arguments:** `typical` kg m², the rough size of the moments, with which a fit starts.
-    **Raises** `ValueError` if it is not positive.
+    **Arguments:** `typical` kg m², the rough size of the moments of inertia, with which a fit
+    starts. **Raises** `ValueError` if `typical` is not positive.
 
     >>> Tensor(1e-3).body(jnp.zeros(6)).tensor[0, 0]
     Array(0.001, dtype=float64)
@@ -217,8 +220,8 @@ class Principal(AbstractBodyChart):
     """Map three numbers to three moments with their scale, if the body axes are known to be
     principal.
 
-    The three numbers are the logarithm of the size of the second moments in units of `typical`, and
-    the two numbers of `PrincipalRatios`.
+    The first number is the logarithm of the size of the second moments, in units of `typical`. The
+    other two are the numbers of `PrincipalRatios`.
 
     **Arguments:** as for `Tensor`.
 
@@ -245,22 +248,24 @@ class Principal(AbstractBodyChart):
 
 
 class Mass(AbstractBodyChart):
-    """Map numbers to mass, centre of mass and inertia, either all ten numbers or some of them.
+    """Map up to ten numbers to the mass, the centre of mass and the inertia of a body.
 
-    The recording must contain forces, without which the mass cannot be found. The numbers are
-    changes from the numbers of the `guess` in the chart `rigidjax.body.parameters.pack`.
+    The recording must contain forces, without which the mass cannot be found. The body of the
+    `guess` is described by ten numbers (`rigidjax.body.parameters.pack`), of which all or only some
+    are free. The numbers of this chart are the changes of the free ones.
 
     **Arguments:**
 
     - `guess`: a `MassProperties` of about the right size, with the true values of all numbers that
       are not free.
-    - `free`: the parts that a fit may move: `"mass"` (the second moment keeps its ratio to the mass
-      unless the inertia is free, too), `"inertia"` about the centre of mass, `"com"`. Examples are
-      `["inertia"]` for a body that was weighed and balanced, `["mass"]` for a load of known shape,
-      `["com"]` for a centre that moved.
+    - `free`: the parts that a fit may move, some of `"mass"`, `"inertia"` (about the centre of
+      mass) and `"com"` (the centre of mass). If the mass is free and the inertia is not, the second
+      moments keep their ratio to the mass. Examples are `["inertia"]` for a body that was weighed
+      and balanced, `["mass"]` for a load of known shape, and `["com"]` for a centre of mass that
+      moved.
 
-    **Raises:** `TypeError` for a guess of another type; `ValueError` if `free` contains another
-    word, or nothing.
+    **Raises:** `TypeError` for a `guess` that is not a `MassProperties`; `ValueError` if `free`
+    contains another word than these three, or nothing.
 
     >>> box = rj.shapes.box(2.0, [1.0, 1.0, 1.0])
     >>> float(Mass(box).body(jnp.zeros(10)).mass), Mass(box, ["inertia"]).log_names
@@ -376,15 +381,18 @@ def _pad_with_zeros(
 
 
 class Bodies(eqx.Module):
-    """Hold the charts of several bodies; the vector of numbers holds the numbers of one body after
-    the other.
+    """Hold the charts of several bodies. A chart maps unconstrained numbers to a body.
 
-    Charts of the same type and shapes (one form) are stacked, so that one program serves all
-    recordings.
+    The vector of the numbers of all bodies holds the numbers of one body after the other. Charts
+    are of one form if they have the same structure and their arrays have the same shapes. All
+    charts of one form are stacked in one chart, so that one program serves all recordings.
 
-    **Fields:** `names` and `charts` of the bodies; `kinds` the stacked charts, one for each form;
-    `kind_of` the index of the form of each body; `row_of` the row of each body in its stacked
-    chart.
+    **Fields:**
+
+    - `names`, `charts`: the names and the charts of the bodies.
+    - `kinds`: the stacked charts, one for each form.
+    - `kind_of`: for each body the index of its form in `kinds`.
+    - `row_of`: for each body the index of its chart in the stacked chart.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -452,10 +460,10 @@ class Bodies(eqx.Module):
 
 
 def body_with_scale_mark(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
-    """Return the body that the numbers `vector` represent in a `chart`; its `Inertia` is marked as
-    of arbitrary scale if the chart finds the inertia only up to a factor.
+    """Return the body that the numbers `vector` represent in a `chart`, with the mark that a user
+    needs: an `Inertia` that the chart finds only up to a factor is marked as of arbitrary scale.
 
-    The mark is `AbstractBodyChart.scale`. A user gets the body in this form.
+    The mark is `AbstractBodyChart.scale`. Inside a fit bodies have no such mark.
     """
     body = chart.body(vector)
     if chart.scale is None or isinstance(body, MassProperties):
@@ -468,11 +476,11 @@ def indices_of_body_numbers(
     body_indices: Int[Array, " records"] | None,
     recording_count: int,
 ) -> Int[np.ndarray, "records numbers"]:
-    """Return the indices (R, K) of the numbers of each recording's body among the numbers of all
-    bodies.
+    """Return, for each of R recordings, the indices of the numbers of its body among the numbers of
+    all bodies, as an array (R, K).
 
-    K is the number of numbers of the largest chart; the rows of bodies with fewer numbers are
-    filled with −1.
+    Here K is how many numbers the largest chart has. The row of a body with fewer numbers is filled
+    up with −1.
 
     - `chart`: the chart of one body, or the charts of several bodies.
     - `body_indices`: (R,) the index of the body of each of R recordings, or `None` for one body.

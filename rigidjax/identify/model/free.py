@@ -15,28 +15,30 @@ from rigidjax.identify.model.scene import Scene
 
 
 class Free(eqx.Module):
-    """Define a free number: a number or array in the torque or the sensors of a scene that a fit
-    moves.
+    """Define a free number, which a fit moves: a number or an array in the torque or in the sensors
+    of a `Scene`.
 
     **Arguments:**
 
     - `where`: a function that picks the number from a `Scene`, such as
       `lambda s: s.sensors[0].bias` or `lambda s: s.torque.coefficient`. The value in the scene is
       the starting value.
-    - `name`: its name in reports.
-    - `scale`: its natural size, in its unit; inside the fit the number is in units of this size.
+    - `name`: the name of the number in reports.
+    - `scale`: the natural size of the number, in the unit of the number; inside the fit the number
+      is in units of this size.
     - `each`: `False` for one value for all recordings; `True` for a value for each recording;
       `"body"` for a value for each body; or a sequence of labels, one for each recording:
       recordings with the same label share a value.
     - `positive`: whether the fit moves the logarithm of the number, so that its sign is kept.
-    - `prior`: the standard deviation of a normal prior about the starting value (in its unit;
-      relative for `positive`), or `None`.
-    - `spread`: the standard deviation of the deviations of single recordings from the shared value,
-      where each recording has its own deviation (in the unit of the number; relative for
-      `positive`); `"estimated"` to estimate it from three recordings or more, with one `scale` as
-      first guess; `None` for no deviations.
-    - `unit`: its unit in reports; `None` finds the unit of a bias, delay, clock offset, mounting,
-      tilt or place.
+    - `prior`: the standard deviation of a normal prior about the starting value. It is in the unit
+      of the number, or relative to the number if `positive` is true. With `None` the prior is the
+      `Tolerance` that the sensor has for this number; there is no prior if the sensor has none.
+    - `spread`: if the value of each recording deviates from the shared value, the standard
+      deviation of these deviations; `None` for no deviations. It is in the unit of the number, or
+      relative to the number if `positive` is true. With `"estimated"` the fit estimates it from
+      three recordings or more, and `scale` is the first guess.
+    - `unit`: the unit of the number in reports. With `None` the unit is found for a bias, delay,
+      clock offset, mounting, tilt or place; other numbers have no unit.
 
     **Raises** `ValueError` for a scale, prior or spread that is not positive, and for a spread
     together with `each=True`.
@@ -106,8 +108,9 @@ def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
 class Slot(eqx.Module):
     """Hold a `Free` whose leaf in the scene (as a JAX tree) has been found.
 
-    It contains no function, since a new function in a second model would force a new compilation. A
-    *step* is the change of the leaf in units of `scale`.
+    A `Slot` contains no function: a `Free` contains the function `where`, and a new function in a
+    second model would force a new compilation. A *step* is the change of the leaf (of its
+    logarithm, if `positive` is true) in units of `scale`.
 
     **Fields:**
 
@@ -117,15 +120,17 @@ class Slot(eqx.Module):
     - `shape`: the shape of a step, which is the shape of the leaf or broadcasts to the shape of the
       leaf.
     - `labels`: the labels of the groups of recordings that share a value.
-    - `groups`: (R,) the index of the group of each recording, `None` for one value for all
-      recordings.
+    - `groups`: (R,) the index of the group of each of R recordings; `None` if all recordings share
+      one value, or each recording has a value of its own.
     - `prior`, `spread`: the standard deviations `prior` and `spread` of the `Free`, in units of
       `scale`, or `None`.
     - `estimated`: whether the fit estimates the `spread`.
-    - `column`: the index of the first step in the row of a recording.
-    - `shared`: (groups, *shape) the indices of the shared steps among all free numbers.
-    - `own`: (R, *shape) the indices of the own step of each recording, or of its deviation from the
-      shared step, among all free numbers.
+    - `column`: the index of the first step among the free numbers of one recording.
+    - `shared`: (groups, *shape) the indices, among all free numbers, of the steps that recordings
+      share; `None` if no recordings share a step.
+    - `own`: (R, *shape) the indices, among all free numbers, of the steps that each recording has
+      alone. Such a step is the change of the recording's own value, or the deviation from the
+      shared step. `None` if all steps are shared.
     """
 
     path: tuple[Any, ...] = eqx.field(static=True)
@@ -146,8 +151,9 @@ class Slot(eqx.Module):
 
     @property
     def columns_in_row(self) -> slice:
-        """Return which of the free numbers of one recording are the steps of this slot, as a slice
-        of these numbers.
+        """Return a slice that picks the steps of this slot from the free numbers of one recording.
+
+        A step is the change of a number of the slot's leaf, in units of `scale`.
         """
         return slice(self.column, self.column + int(np.prod(self.shape, dtype=int)))
 
@@ -204,7 +210,8 @@ def find_slots(free: Sequence[Free], scene: Scene, body_names: Sequence[str]) ->
     path of its array in a `scene`.
 
     `body_names` (R,) holds the name of the body of each of R recordings. An error is raised if a
-    `Free` picks no numbers, or numbers or a name that another `Free` has.
+    `Free` picks no numbers, if it picks the numbers of another `Free`, or if it has the name of
+    another `Free`.
     """
     slots: list[Slot] = []
     for item in free:
@@ -261,8 +268,10 @@ def leaf_at(
 
     - `where`: a function of the `tree` that returns one of its leaves.
     - `tree`: a tree of JAX, such as a `Scene`.
-    - `name`, `role`: words for errors: the object that has `where`, and the object that needs a
-      starting value. An error is raised if `where` does not pick one array of numbers.
+    - `name`: what the object that has the function `where` is called in an error.
+    - `role`: what the object that needs a starting value is called in an error.
+
+    A `ValueError` is raised if `where` does not pick one array of numbers.
     """
     pairs, structure = jax.tree.flatten_with_path(tree)
     paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
@@ -290,7 +299,8 @@ def leaf_at(
     return paths[index], leaves[index]
 
 
-# This maps the name of a number in the scene to its unit. The unit of a bias is that of its sensor.
+# This maps the name of a number in the scene to its unit. A bias is not in this dict: its unit is
+# the unit of its sensor.
 _UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place": "m"}
 
 
@@ -324,8 +334,8 @@ def _tolerance_of_sensor(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
     """Return the tolerance that a sensor states for the numbers at a `path` in a `scene`, or `None`
     if they are not numbers of a sensor, or have no tolerance.
 
-    The tolerance comes from a data sheet. It is taken as the standard deviation of the prior of
-    these numbers, such as a bias in the sensor's unit.
+    The tolerance is a standard deviation from a data sheet, such as the standard deviation of the
+    bias of a gyro. It is taken as the standard deviation of the prior of these numbers.
 
     - `scene`: the body, torque, sensors and initial state of a recording, as a tree of JAX.
     - `path`: the path (a tuple of keys of JAX) of the numbers in the tree.

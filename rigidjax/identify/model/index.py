@@ -15,24 +15,27 @@ class Index(eqx.Module):
     """Hold the places (indices) of the numbers of each recording among the n free numbers x of a
     model.
 
-    x holds the numbers of the bodies, then the shared steps of the slots, then the numbers that
-    belong to one recording alone, which are the initial states and the own steps of the recordings.
-    The row of a recording holds the numbers of its body, the step of each slot, and its initial
-    state. A slot with deviations has one step in the row, which is the sum of two numbers of x: the
-    shared step and the deviation of the recording.
+    A slot is an array of the scene (body, torques, sensors, initial state) that a fit may move, and
+    a step is a change of this array. x holds the numbers of the bodies, then the steps that
+    recordings share, then the numbers that belong to one recording alone. These are the initial
+    states of all recordings, and then the own steps of all recordings. The row of a recording holds
+    the numbers of its body, the step of each slot, and its initial state. If recordings deviate
+    from the shared step of a slot, the step in the row is the sum of two numbers of x: the shared
+    step and the deviation of the recording.
 
     **Fields:**
 
-    - `places`: (R, columns) the place in x of each column of the rows. A slot with deviations has a
-      second column at the end. A column that stands for no number, as in the row of a body whose
-      chart has fewer numbers, has the place n.
+    - `places`: (R, columns) the place in x of each column of the rows. A slot with deviations has
+      further columns at the end, which hold the places of the deviations. A column that stands for
+      no number, as in the row of a body whose chart has fewer numbers, has the place n.
     - `start`: (R, k) the places of the initial states.
-    - `columns`: for each column of `places`, the column of the row to which its number is added.
-    - `alone`: the columns of the numbers that one recording has alone.
+    - `columns`: for each column of `places`, the column of the row to which the number at this
+      place is added.
+    - `alone`: the columns of `places` whose numbers belong to one recording alone.
     - `width`: the number of columns of a row.
     - `bodies`: how many numbers of x describe the bodies.
-    - `first`: the first column of the initial state.
-    - `size`: n.
+    - `first`: the first column of the initial state in a row.
+    - `size`: n, how many free numbers there are.
     """
 
     places: Int[Array, "records columns"]

@@ -86,7 +86,7 @@ class AbstractPull(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-        """Return j residuals, in standard deviations, whose half sum of squares is added to the
+        """Return j residuals, in standard deviations. Half the sum of their squares is added to the
         misfit of a fit.
 
         `model` is the model that is fitted, and x (n,) its free numbers.
@@ -100,10 +100,11 @@ class Unpacked(eqx.Module):
 
     - `x`: (n,) the free numbers.
     - `body`: the body; several bodies as a dict by name.
-    - `state0`: the initial state; of several recordings with a leading axis.
+    - `state0`: the initial state; the initial states of several recordings have a leading axis.
     - `values`: the values of the `Free`s by name, in their units.
-    - `noise`: (R, k) of each sensor, in its unit, or `None`.
-    - `process`: the random torque of a density, or `None`.
+    - `noise`: if x belongs to a `LogDensity`, for each sensor the standard deviations (R, k) of its
+      noise, in its unit, for R recordings and k components; else `None`.
+    - `process`: if x belongs to a `LogDensity` with a random torque, this torque; else `None`.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> low, high = result.interval_of(lambda point: point.state0.omega)  # a function of `Unpacked`
@@ -120,8 +121,8 @@ class Unpacked(eqx.Module):
 
 
 class Model(eqx.Module):
-    """Hold the recordings of one body or of several bodies, and the description of the n free
-    numbers x of the scenes of the recordings.
+    """Hold the recordings of one body or of several bodies, and describe by n free numbers x
+    everything that their readings depend on.
 
     **Arguments:**
 
@@ -145,15 +146,15 @@ class Model(eqx.Module):
       for each body, group or recording.
     - `loss`: a robust loss, `SoftL1()` or `Huber()`; `None` for plain least squares.
     - `prior`: `Entropic(guess, weight)`, a prior about a roughly known body, or `None`.
-    - `integrator`: of a forced motion, `FixedSteps(n)` or `Adaptive(rtol, atol)`; `None` chooses an
-      integrator by the sampling. `Adaptive()` is quicker if the torque is smooth and the body turns
-      by 0.1 rad or more between readings, but slow if the torque reads a noisy log. The motion of a
-      free body is computed by the closed form. Windows, and recordings whose inputs are samples,
-      take one step of order 4 from each time to the next, and the samples are held constant during
-      this step.
-    - `stretches`: the number of stretches into which windows are divided. Deviations come from
-      leaving out one stretch after the other; a stretch should be longer than the errors of the
-      model last.
+    - `integrator`: the integrator of a forced motion, `FixedSteps(n)` or `Adaptive(rtol, atol)`.
+      With `None` it is chosen by the sampling. `Adaptive()` is quicker than fixed steps if the
+      torque is smooth and the body turns by 0.1 rad or more between readings, but slow if the
+      torque reads a noisy log. The motion of a free body is computed by the closed form. For
+      windows, and for recordings whose inputs are samples, one step of order 4 is taken from each
+      time to the next, and the samples are held constant during this step.
+    - `stretches`: the number of stretches (groups of neighbouring windows) into which windows are
+      divided. Standard deviations are computed by leaving out one stretch after the other. A
+      stretch should be longer than the time for which an error of the model lasts.
     - `noise_each`: whether an estimated noise is one number for all recordings (`False`), one for
       each recording (`True`), one for each body (`"body"`), or one for all recordings with the same
       label (a sequence of labels, one for each recording).
@@ -306,8 +307,9 @@ class Model(eqx.Module):
 
         **Arguments:**
 
-        - `body`: an `Inertia` or `MassProperties`, a sphere for `None`; for several bodies a dict,
-          by name, of the bodies that are roughly known.
+        - `body`: an `Inertia` or `MassProperties`; for several bodies a dict, by name, of the
+          bodies that are roughly known. For a body that is not given, the chart chooses: the
+          `guess` of a `Mass`, the body of a `Known`, and a sphere for the other charts of rigidjax.
         - `omega`: (3,) the initial rate in all recordings, rad/s, body frame. With `None` it is the
           first reading of a gyro, or the rate between measured attitudes (0 if the readings are
           traced).
@@ -419,9 +421,9 @@ class _RecordedData(NamedTuple):
     - `state_kind`: the type of the states: `Spin`, `Attitude` or `Rigid`.
     - `reference`: the state of each recording from which its initial state is measured: the free
       numbers of the initial state are changes of this state.
-    - `start_weight`: (R, n) one over the standard deviation of each of the n free numbers of an
-      initial state, in the unit of the number, about the measured start of a window; `None` without
-      such a prior.
+    - `start_weight`: (R, n) for windows whose initial states have a prior about the measured
+      states: one over the standard deviation of each of the n free numbers of an initial state, in
+      the unit of the number. `None` without such a prior.
     - `clusters`: (R,) the index of the stretch (group of neighbouring windows) of each window;
       `None` for recordings.
     - `vectors_in_state`: the number of three-vectors (such as attitude and rate) of a free initial
@@ -601,8 +603,9 @@ def with_first_times_only(model: Model) -> Model:
     """Return the model with only the first time of each recording, and with its recordings as NumPy
     arrays.
 
-    The quantities that x represents depend on no reading. A program that computes these quantities
-    from the shortened model is compiled once, and not again for recordings of another length.
+    The bodies, the initial states and the values of the `Free`s depend on no reading. A program
+    that computes them from the shortened model is compiled once, and not again for recordings of
+    another length.
     """
     records = jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, model.records)
     return with_replaced_fields(model, records=stacking.take_rows(records, 1, axis=1))
@@ -760,10 +763,11 @@ def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) 
 
 
 def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
-    """Raise `ValueError` if `windows` lack an input that the `torque` reads, or samples before or
-    after a window that a delayed input needs.
+    """Raise `ValueError` if `windows` lack an input that the `torque` reads, or lack the samples
+    that a delayed input needs before or after a window.
 
-    An input is a logged quantity such as a motor command. The `torque` may be `None`.
+    A window is a short part of a record of measured states. An input is a logged quantity such as a
+    motor command. The `torque` may be `None`.
     """
     missing = [name for name in input_names_of(torque) if name not in windows.inputs]
     if missing:
@@ -778,11 +782,11 @@ def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
 
 
 def describe_delays_outside_windows(model: Model, x: Float[Array, " n"]) -> list[str]:
-    """Return a text for each delay that, at the free numbers x (n,) of a `model`, reads samples of
-    the inputs outside of the windows of the model.
+    """Return a text for each delay that needs samples outside of the windows of a `model`, at the
+    free numbers x (n,) of the model.
 
-    A delay shifts an input (a logged quantity such as a motor command) in time. No text is
-    returned for a model of recordings.
+    A window is a short part of a record of measured states. A delay shifts an input (a logged
+    quantity such as a motor command) in time. No text is returned for a model of recordings.
     """
     if model.clusters is None or not delays_of(model.torque):
         return []

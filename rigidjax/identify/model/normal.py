@@ -12,16 +12,17 @@ from jaxtyping import Array, Float, Int
 
 
 class OwnBlocks(eqx.Module):
-    """Hold the blocks of a normal matrix for the numbers that belong to one recording alone.
+    """Hold the blocks of a normal matrix of n numbers that belong to the own numbers of the
+    recordings.
 
-    Each of the R recordings has k such own numbers. The core is the s numbers that recordings
-    share.
+    Each of R recordings has k own numbers, which no other recording has. The core is the s numbers
+    that recordings share, so that n = s + R k.
 
     **Fields:**
 
     - `own`: (R, k, k) the blocks of the own numbers of each recording.
     - `sides`: (R, k, s) the blocks between the own numbers and the numbers of the core.
-    - `at`: (R, k) the indices of the own numbers among all n numbers.
+    - `at`: (R, k) the indices of the own numbers among the n numbers.
     """
 
     own: Float[Array, "records k k"]
@@ -32,9 +33,11 @@ class OwnBlocks(eqx.Module):
 class NormalMatrix(eqx.Module):
     """Hold a normal matrix of n numbers.
 
-    **Fields:** `core` (s, s) the block of the core, which is the first s numbers, shared by
-    recordings; `own_blocks` the blocks of the other numbers, which belong to one recording each, or
-    `None` if all n numbers are in the core.
+    **Fields:**
+
+    - `core`: (s, s) the block of the first s numbers, which recordings share.
+    - `own_blocks`: the blocks of the other numbers, each of which belongs to one recording alone.
+      `None` if there are no other numbers; then s = n.
     """
 
     core: Float[Array, "s s"]
@@ -91,10 +94,10 @@ class NormalMatrix(eqx.Module):
         )
 
     def solve(self, rhs: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
-        """Return the solution x of `matrix @ x = rhs`, or NaN unless the matrix is positive
+        """Return the solution x of `matrix @ x = rhs`, or NaN unless this matrix is positive
         definite.
 
-        `rhs` (n,) or (n, columns) holds one right-hand side or several; x has its shape.
+        `rhs` (n,) or (n, columns) holds one right-hand side or several; x has the shape of `rhs`.
         """
         alone, count = self.own_blocks, self.core.shape[0]
         if alone is None:
@@ -137,7 +140,7 @@ def _solve_by_cholesky(matrix: Array, rhs: Array) -> Array:
     """Return the solution x of `matrix @ x = rhs` by Cholesky's decomposition, or NaN unless the
     symmetric `matrix` (n, n) is positive definite.
 
-    `rhs` (n,) or (n, columns) holds one right-hand side or several; x has its shape.
+    `rhs` (n,) or (n, columns) holds one right-hand side or several; x has the shape of `rhs`.
     """
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), rhs)
 
@@ -168,8 +171,8 @@ def normal_matrix_of_jacobians(
         # the axes of times and residuals.
         flat = rows.reshape(count, -1, columns)
         squares = squares + flat.swapaxes(1, 2) @ flat
-    # A column that stands for no number is added to an additional last row and column, which are
-    # dropped below.
+    # The core gets an additional last row and column. Columns of J that stand for no number are
+    # added to them, and they are dropped below.
     last = size - count * alone.size
     at = jnp.minimum(places[:, rest], last)
     core = jnp.zeros((last + 1, last + 1), squares.dtype)

@@ -39,8 +39,8 @@ from rigidjax.solve.tableaus import KUTTA4
 TURN_A_STEP, TURN_OF_ORDER_4 = 0.1, 0.02
 # More fixed steps than this number between two samples cost more than adaptive steps.
 FINEST = 32
-# A refinement multiplies the relative tolerance of adaptive steps by _CLOSER. The tolerance never
-# becomes smaller than _LEAST.
+# `Adaptive.refine` multiplies the relative tolerance by _CLOSER, but never makes it smaller than
+# _LEAST.
 _LEAST, _CLOSER = 2.5e-14, 1e-2
 
 
@@ -67,7 +67,8 @@ class AbstractIntegrator(eqx.Module):
     ) -> PyTree:
         """Return the states of a forced motion at the times `ts` (T,), s, with a leading time axis.
 
-        The states are a `motion.Coupled` if the torque has states of its own.
+        The states are a `motion.Coupled` if the torque has states of its own, such as the speed of
+        a motor.
 
         - `body`: the body.
         - `state0`: the state at `ts[0]`.
@@ -208,10 +209,11 @@ def states_at(
 
 
 class HeldSteps(AbstractIntegrator):
-    """Integrate with one step of order 4 between samples, and hold the inputs in each step.
+    """Integrate with one step of order 4 from each sample to the next, and hold the inputs constant
+    in each step.
 
-    The samples must be evenly spaced in time. The value of a delayed input changes inside a step;
-    the step is then split at the change.
+    An input is a logged quantity such as a motor command. The samples must be evenly spaced in
+    time. The value of a delayed input changes inside a step; the step is then split at the change.
 
     **Arguments:** `last` the index of the last time whose state is needed, `None` for all times.
 
@@ -354,7 +356,7 @@ def errors_along(
     - `input_at`: a function of a time and a state that returns the `SensorInput` from which the
       sensor predicts its reading.
 
-    The last three are the results of `sensor_inputs`.
+    The arguments `times`, `states` and `input_at` are the results of `sensor_inputs`.
     """
 
     def error(t: Array, state: PyTree, value: Array) -> Array:
@@ -419,8 +421,9 @@ def simulate_readings(
     - `sensor`: an `AbstractSensor`, or a sequence of them along one motion.
     - `body`, `state0`, `ts` (T,) s, `torque`: as for `rigidjax.simulate`. `MassProperties` are
       allowed for all states; a sensor's `place` is then in the frame of the `MassProperties`.
-    - `key`: of `jax.random`, to add normal noise of the sensor's `noise`, and to scatter the times
-      by its `jitter`; `None` for readings without noise and jitter.
+    - `key`: a key of `jax.random`, with which normal noise of the sensor's standard deviations
+      `noise` is added, and the times are scattered by the sensor's `jitter`; `None` for readings
+      without noise and jitter.
 
     **Returns** readings (T, *reading_shape) in the sensor's unit, for `Recording(ts, (sensor,
     readings))`; for a sequence of sensors a tuple with the readings of each sensor.
@@ -508,9 +511,9 @@ def _require_sensor_for_simulation(sensor: PyTree, state0: State, key: object) -
     - `sensor`: must be a single sensor, not a batch. Its readings must have as many numbers as its
       error has components, unless the sensor has a method `reading_of`.
     - `state0`: the initial state of the motion, which must have the parts that the sensor reads.
-    - `key`: a random key, or `None` for readings without noise. With a key the noise of the sensor
-      must be known. If the sensor has jitter (a random error of its time stamps), with a key this
-      jitter must be of known size, and the sensor may not have a low-pass filter.
+    - `key`: a random key, or `None` for readings without noise and jitter. With a key the noise of
+      the sensor must be known. With a key a sensor that has jitter (a random error of its time
+      stamps) must have jitter of known size and no low-pass filter.
     """
     name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
     _checks.require_instance(sensor, AbstractSensor, "sensor", requirement=wanted)

@@ -14,11 +14,10 @@ from rigidjax.body.inertia import Inertia, MassProperties
 
 
 class AbstractLoss(eqx.Module):
-    """Define a robust loss ρ(s), a function of the squared length s of an error in units of its
-    noise.
+    """Define a robust loss ρ(s), which gives outliers less weight.
 
-    The loss is a function of the length of a reading's error vector, so that it does not depend on
-    the frame.
+    Here s is the squared length of the error vector of a reading, in units of its noise. Since the
+    loss is a function of this length alone, it does not depend on the frame of the vector.
 
     >>> class Squares(AbstractLoss):  # no outliers: ρ(s) = s
     ...     def shrink(self, error):
@@ -31,8 +30,10 @@ class AbstractLoss(eqx.Module):
 
     @abc.abstractmethod
     def shrink(self, error: Float[Array, " k"]) -> Float[Array, " k"]:
-        """Return the `error` (k,), in units of its noise, multiplied by a factor such that its
-        squared length is the loss ρ(s) and no longer s.
+        """Return the `error` (k,) of a reading, multiplied by a factor so that its squared length
+        becomes the loss ρ(s).
+
+        Here s is the squared length of the given `error`, which is in units of its noise.
         """
 
     @abc.abstractmethod
@@ -50,8 +51,8 @@ _scale = partial(_checks.positive_float, name="scale")
 class SoftL1(AbstractLoss):
     """Define a loss that is quadratic for ordinary errors and linear for large ones.
 
-    It is `ρ(s) = 2c²(√(1 + s/c²) − 1)`, SciPy's `soft_l1` (Charbonnier et al. 1997,
-    doi:10.1109/83.551699).
+    It is `ρ(s) = 2c²(√(1 + s/c²) − 1)`, where s is the squared length of the error in standard
+    deviations. SciPy calls this loss `soft_l1` (Charbonnier et al. 1997, doi:10.1109/83.551699).
 
     **Arguments:** `scale` c, the error at which the loss turns from quadratic to linear, in
     standard deviations. **Raises:** `ValueError` for a scale that is not positive.
@@ -73,10 +74,11 @@ class SoftL1(AbstractLoss):
 class Huber(AbstractLoss):
     """Define a loss that is quadratic up to an error c and linear beyond it.
 
-    It is `ρ(s) = s` for s ≤ c², else `2c√s − c²` (Huber 1964, doi:10.1214/aoms/1177703732).
+    It is `ρ(s) = s` for s ≤ c², else `2c√s − c²`, where s is the squared length of the error in
+    standard deviations (Huber 1964, doi:10.1214/aoms/1177703732).
 
-    **Arguments:** `scale` c, in standard deviations. **Raises:** `ValueError` for a scale that is
-    not positive.
+    **Arguments:** `scale` c, the error at which the loss turns from quadratic to linear, in
+    standard deviations. **Raises:** `ValueError` for a scale that is not positive.
 
     >>> Huber(3.0).weight(jnp.array([6.0, 0.0, 0.0]))
     Array(0.5, dtype=float64)
@@ -106,11 +108,12 @@ class Entropic(eqx.Module):
     """Define the entropic prior `w D(body, guess)`, where D is the log-determinant divergence of
     two bodies.
 
-    For a `Mass` chart D is `rigidjax.body.divergence`, the divergence of the pseudo-inertias J. For
-    other charts the matrices of second moments 𝔖 = ∫ r rᵀ dm take the place of J; for a chart
-    without a scale each 𝔖 is divided by its trace. D is a sum of squares: with the pseudo-inertia
-    `J₀ = L₀ L₀ᵀ` of the guess and `L₀⁻¹ J L₀⁻ᵀ = C Cᵀ`, `D = Σ_{i>j} c_ij² + Σ_i (c_ii² − 1 − 2 log
-    c_ii)`. A weight w has the effect of w/2 readings drawn from the guess.
+    For a `Mass` chart D is `rigidjax.body.divergence`, the divergence of the pseudo-inertias J (of
+    the body) and J₀ (of the guess). For other charts the matrices of second moments 𝔖 = ∫ r rᵀ dm
+    of both bodies take the place of J and J₀; for a chart without a scale each 𝔖 is divided by its
+    trace. D is a sum of squares, `D = Σ_{i>j} c_ij² + Σ_i (c_ii² − 1 − 2 log c_ii)`. Here c_ij are
+    the elements of the Cholesky factor C of `L₀⁻¹ J L₀⁻ᵀ = C Cᵀ`, and L₀ is the Cholesky factor of
+    `J₀ = L₀ L₀ᵀ`. The weight w has the effect of w/2 readings drawn from the guess.
 
     **Arguments:** `guess` an `Inertia`, or `MassProperties` for a `Mass` chart; `weight` w > 0.
     Source: Lee, Wensing and Park 2020, doi:10.1109/TRO.2019.2926491 (the divergence).

@@ -34,8 +34,9 @@ if TYPE_CHECKING:
 # recording among several bodies, or `None` for one body.
 Row = Float[Array, " columns"]
 BodyIndex = Array | None
-# `Blocks` are two tuples with one array for each sensor: the errors (R, T, k); and the derivatives
-# (R, T, k, m) of these errors with respect to the m numbers of a row.
+# `Blocks` are two tuples with one array for each sensor, for R recordings, T times and k
+# components: the errors (R, T, k); and the derivatives (R, T, k, m) of these errors with respect to
+# the m numbers of a row.
 Blocks = tuple[tuple[Array, ...], tuple[Array, ...]]
 # `SensorErrors` holds one array for each sensor, such as its errors (R, T, k).
 SensorErrors = tuple[Array | np.ndarray, ...]
@@ -192,7 +193,7 @@ def differentiable_map_over_recordings(
 
     The last four arguments are the free numbers, the readings, the reference state and the index of
     the body of one recording. Only derivatives with respect to the rows are defined. They are
-    computed as in `errors_and_jacobians`.
+    computed recording by recording, in forward mode.
 
     - `rows`: (R, columns) the free numbers of each of R recordings, one row for each recording.
     - `function`: a function such as `errors_in_sensor_units`, which returns an array or a tree of
@@ -209,8 +210,8 @@ def differentiable_map_over_recordings(
 def _jvp_of_map_over_recordings(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[PyTree, PyTree]:
-    """Return two things: the values of a function of each recording, with a leading axis (R,) of
-    recordings; and the derivatives of these values along a change of the free numbers.
+    """Return two things: the values of a function for each of R recordings, with a leading axis
+    (R,); and the derivatives of these values along a change of the free numbers.
 
     It is the rule by which JAX differentiates `differentiable_map_over_recordings`. An error is
     raised if anything but the free numbers changes.
@@ -236,8 +237,8 @@ def errors_and_jacobians(
     """Return two things: the value of `function` for each of R recordings (R, …); and its
     derivatives (R, …, m) with respect to the m free numbers of the recording.
 
-    The m columns are those of `model.index.places`. Derivatives of readings with respect to free
-    numbers are computed by this function and nowhere else.
+    The indices of these m free numbers among all free numbers are the row of the recording in
+    `model.index.places` (R, m).
 
     - `x`: (n,) the free numbers of the `model`.
     - `function`: a function such as `errors_in_sensor_units`, with the same arguments, of one
@@ -304,9 +305,11 @@ def jacobian_and_value(function: Callable[[Array], Any], x: Float[Array, " n"]) 
 
 
 def whiten(model: "Model", errors: SensorErrors, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors (R, T, k) of each sensor in standard deviations, where errors due to jitter
-    are made independent, and readings at full scale are treated as limits
-    (`standardised_errors_and_saturation`).
+    """Return the errors (R, T, k) of each sensor in standard deviations.
+
+    Jitter, which is the random error of time stamps, correlates the errors of the k components of a
+    reading; these errors are made independent. A reading at full scale is treated as a limit of the
+    true value. Both are done by `standardised_errors_and_saturation`.
 
     - `model`: the model, which has the readings of R recordings.
     - `errors`: for each sensor the errors (R, T, k) in its unit.
@@ -326,11 +329,11 @@ def white_errors_and_log_variances(
     """Return two arrays (…, k), from errors e (…, k) whose covariance is `1 + v vᵀ`: independent
     errors of variance one (white errors); and the logarithms of conditional variances.
 
-    Here v (…, k) is the `jitter_error`, the error due to a time stamp that is one standard
-    deviation late; both e and v are in standard deviations of the noise. The independent errors are
-    `L⁻¹ e`, where L is the Cholesky factor of the covariance. The conditional variance of a
-    component is its variance if all components before it are given, which is the square of the
-    diagonal element of L.
+    Here 1 is the unit matrix, and v (…, k) is the `jitter_error`, the error due to a time stamp
+    that is one standard deviation late. Both e and v are in standard deviations of the noise. The
+    independent errors are `L⁻¹ e`, where L is the Cholesky factor of the covariance. The
+    conditional variance of a component is its variance if all components before it are given. It is
+    the square of the diagonal element of L.
     """
     e, v = errors, jitter_error
     along, total = jnp.cumsum(v * e, axis=-1), 1.0 + jnp.cumsum(v * v, axis=-1)
@@ -345,10 +348,11 @@ def standardised_error_changes(
 ) -> Float[Array, "..."] | Float[np.ndarray, "..."]:
     """Return n changes (R, T, k, n) of a sensor's errors, converted to standard deviations.
 
-    The `error_changes` are in the unit of the sensor. They are scaled as
-    `standardised_errors_and_saturation` scales the errors themselves, with the noise `sigma` (R,
-    k). If there is a `jitter_error` (R, T, k), which is the error due to a time stamp that is one
-    standard deviation late, they are also made independent by `white_errors_and_log_variances`.
+    The `error_changes` are in the unit of the sensor, such as derivatives of the errors with
+    respect to n numbers. They are divided by the standard deviations `sigma` (R, k) of the noise. A
+    `jitter_error` (R, T, k) is the error due to a time stamp that is one standard deviation late,
+    in the unit of the sensor. If it is given, the changes are also transformed as
+    `white_errors_and_log_variances` transforms errors to independent ones.
     """
     scaled = error_changes / sigma[:, None, :, None]
     if jitter_error is None:
@@ -370,18 +374,20 @@ def standardised_errors_and_saturation(
     channels; and the effect of jitter.
 
     The effect of jitter is the logarithm of the factor by which jitter multiplies each variance, or
-    `None` without jitter. A saturated channel says "at least that much". Its error is `√(−2 log
-    Φ(z))` in magnitude, where z is the excess of the prediction over the limit in standard
-    deviations and Φ is the normal distribution function (Tobin 1958, doi:10.2307/1907382).
+    `None` without jitter. The reading of a saturated channel says only that the true value is at
+    least as large as the limit. Its error is `√(−2 log Φ(z))` in magnitude, where z is the excess
+    of the prediction over the limit in standard deviations and Φ is the normal distribution
+    function (Tobin 1958, doi:10.2307/1907382).
 
     **Arguments:**
 
-    - `values`, `mask`: the readings, and a mask (T,) that is true where there is a reading.
+    - `values`: the readings at T times.
+    - `mask`: (T,) true where there is a reading.
     - `error`: (T, k) reading minus prediction, in the unit of the sensor.
-    - `sigma`: (k,) the standard deviation of the noise, in this unit.
+    - `sigma`: (k,) the standard deviations of the noise, in the unit of the sensor.
     - `limit`: (k,) the full scale, or `None`.
-    - `jitter_error`: (T, k) the error that a time stamp makes if it is one standard deviation late,
-      or `None`.
+    - `jitter_error`: (T, k) the error, in the unit of the sensor, that a time stamp makes if it is
+      one standard deviation late, or `None`.
     """
     scaled, wider = error / sigma[None], None
     full = jnp.zeros(scaled.shape, bool)
@@ -461,8 +467,11 @@ def prior_weights(model: "Model") -> Float[Array, " n"]:
 
 
 def body_prior_and_pull_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-    """Return the residuals (j,) of the prior of the body, and of the `AbstractPull` of a `model`,
-    at its free numbers x (n,). Each of these residuals may depend on several of the free numbers.
+    """Return the residuals (j,) of a `model` at its free numbers x (n,) that may depend on several
+    of these numbers: the residuals of the prior of the body and of an `AbstractPull`.
+
+    An `AbstractPull` is an addition to the misfit that pulls free numbers towards chosen values. A
+    `model` need not have a prior of the body or a pull, so that j may be zero.
     """
     out = [jnp.zeros(0, x.dtype)]
     if model.prior is not None:
@@ -475,9 +484,11 @@ def body_prior_and_pull_residuals(model: "Model", x: Float[Array, " n"]) -> Floa
 
 
 def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """Return all residuals of a `model` that do not belong to readings, at the free numbers x (n,):
-    first n residuals of the priors of the single free numbers, then the residuals of the prior of
-    the body and of an `AbstractPull`.
+    """Return all residuals of a `model` that do not belong to readings, at the free numbers x (n,).
+
+    The first n residuals belong to the priors of the single free numbers. Then come the residuals
+    of the prior of the body, and of an `AbstractPull`, an addition to the misfit that pulls free
+    numbers towards chosen values.
     """
     return jnp.concatenate([prior_weights(model) * x, body_prior_and_pull_residuals(model, x)])
 

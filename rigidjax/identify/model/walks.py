@@ -14,16 +14,17 @@ from rigidjax.identify.model.scene import Scene
 
 
 class Walk(eqx.Module):
-    """Define an unknown sensor error x that drifts as a random walk, `dx = √density dW`.
+    """Define an unknown sensor error x that drifts as a random walk, `dx = √density dW`, where W is
+    a Wiener process.
 
     **Arguments:**
 
     - `where`: a function that picks the error from a `Scene`, such as
       `lambda s: s.sensors[0].bias`. The value in the scene is the initial value.
-    - `deviation`: the standard deviation of the initial value, in its unit, one number or one for
-      each component.
-    - `density`: the density of the drift, unit²/s, one number or one for each component; zero for a
-      constant error.
+    - `deviation`: the standard deviation of the initial value, in the unit of the error, one number
+      or one for each component.
+    - `density`: the variance by which the error spreads in a second, in the square of its unit per
+      second, one number or one for each component; zero for a constant error.
 
     **Raises** `ValueError` for a deviation or density below zero.
 
@@ -47,10 +48,14 @@ class Walk(eqx.Module):
 class Drift(eqx.Module):
     """Hold a `Walk` whose leaf in the scene (as a JAX tree) has been found.
 
-    It contains no function, since a new function in a second model would force a new compilation.
+    A `Drift` contains no function: a `Walk` contains the function `where`, and a new function in a
+    second model would force a new compilation.
 
-    **Fields:** `path` the path of the leaf in the scene; `deviation` and `density` those numbers of
-    the `Walk`, broadcast to the shape of the leaf.
+    **Fields:**
+
+    - `path`: the path of the leaf in the scene.
+    - `deviation`, `density`: the arguments of the `Walk` with these names, broadcast to the shape
+      of the leaf.
     """
 
     path: tuple[Any, ...] = eqx.field(static=True)

@@ -28,18 +28,18 @@ FAIR = 0.25
 # The problem counts as linear if the ratio of actual to predicted gain differs from one by less
 # than this.
 LINEAR = 0.05
-# A search ends if it would need more than PATIENCE steps, at its present pace, to reach the cost at
-# which another search ended. The pace is the mean fall of the logarithm of the cost in a step. In
-# this mean the weight of each step is half the weight of the next step. FIRST_PACE is the pace
-# before the first step.
+# The pace of a search is the mean fall of the logarithm of the cost in a step. In this mean the
+# weight of each step is half the weight of the next step. FIRST_PACE is the pace before the first
+# step. A search ends if, at its present pace, it would need more than PATIENCE steps to reach the
+# cost at which another search ended.
 PATIENCE, FIRST_PACE = 25.0, 4.0
 # A search with more damping than this is stuck: its steps are too short to change the point.
 STUCK = 1e12
-# A cost counts as noisy, such as a cost computed by adaptive integration, if three things are true.
-# Two steps in succession are refused. The second step raises the cost by more than NOISY times its
-# predicted gain, and by a larger multiple of this gain than the first step does. The predicted gain
-# is less than the fraction LITTLE of the cost. A smooth cost is raised by smaller and smaller
-# multiples of the predicted gain as steps get shorter.
+# A cost computed by adaptive integration, for instance, is noisy. Take the ratio of the rise of the
+# cost in a refused step to the predicted gain of this step. A cost counts as noisy if three things
+# are true. Two steps in succession are refused. The ratio of the second step is larger than NOISY,
+# and larger than the ratio of the first step. The predicted gain of the second step is less than
+# the fraction LITTLE of the cost. For a smooth cost the ratio becomes smaller as steps get shorter.
 NOISY, LITTLE = 10.0, 1e-4
 # If the noise is unknown, the length of the step that ends a search is in proportion to the root
 # mean square of the errors. This root mean square is taken to be at least this number, because
@@ -57,9 +57,11 @@ def _setting_as_array(value: ArrayLike) -> np.ndarray:
 
 
 class Settings(eqx.Module):
-    """Hold the settings of a search as arrays: another value does not compile the search again.
+    """Hold the settings of a search for the least cost as arrays, so that other values need no new
+    compilation of the search.
 
-    **Arguments**; each of the last four is switched off by zero:
+    The gain of a step is the fall of the cost. **Arguments**, where zero switches off each of
+    `aim`, `near`, `count` and `level`:
 
     - `tolerance`: the search has converged if the next step changes each number by less than this
       many standard deviations of the number, computed with all other numbers fixed.
@@ -69,7 +71,8 @@ class Settings(eqx.Module):
       `PATIENCE` steps to reach this cost at its present pace.
     - `near`: the search ends at a cost of this value or less.
     - `count`: the number of errors, if the noise is unknown; the standard deviation of an error is
-      then estimated by the root mean square of all errors. With zero it is one.
+      then estimated by the root mean square of all errors. With zero this standard deviation is
+      one.
     - `level`: the search ends after a step whose gain is about the predicted gain, but less than
       this fraction of the gain of a fit from noise alone.
     """
@@ -89,7 +92,7 @@ class LMState(eqx.Module):
 
     **Fields:**
 
-    - `first`: the cost at the start.
+    - `first`: the cost at the starting point.
     - `point`: (n,) the best point so far.
     - `cost`, `normal`, `slope`: the cost, its normal matrix (n, n) and its gradient (n,) at the
       best point.
@@ -102,7 +105,7 @@ class LMState(eqx.Module):
     - `evaluation`, `evaluated_at_best`: the values kept from the last evaluation, and whether this
       evaluation was at the best point.
     - `rise`: the rise of the cost at the last trial point divided by the predicted gain; zero if
-      the trial point was better.
+      the trial point was better, or if the cost there was not finite.
     """
 
     first: Float[Array, ""]
@@ -144,8 +147,8 @@ def minimise(
       information as the normal matrix (scoring).
     - `start`: (n,) the point at which the search begins; if no steps are allowed, only this point
       is evaluated.
-    - `order_one`: (n,) one for numbers of order one, which no step changes by more than `LONGEST`;
-      zero for other numbers.
+    - `order_one`: (n,) one for each number of order one, which no step may change by more than
+      `LONGEST`; zero for each number that may have any size.
     - `settings`: the settings of the search.
     - `zeros`: a tree of zeros with the shapes of the values to keep.
     - `zero_normal`: zeros with the shapes of the normal matrix, if it is not one dense matrix
@@ -201,8 +204,8 @@ def _next_state(
       zero for other numbers.
     - `settings`: the settings of the search, such as its tolerance.
     - `gain_of_noise`: a function of the kept values and the normal matrix that returns the gain of
-      a fit that follows only the noise. The search ends after a step with a small fraction
-      (`settings.level`) of this gain. With `None` it does not end in this way.
+      a fit that follows only the noise. The search may end after a step whose gain is less than the
+      fraction `settings.level` of this gain. With `None` the search does not end in this way.
     """
     values, cost, normal, slope = evaluation
     parts = jax.tree.leaves((cost, normal, slope))
@@ -211,8 +214,8 @@ def _next_state(
     better = finite & ((cost < state.cost) | first)
     ratio = (state.cost - cost) / jnp.where(state.hoped > 0, state.hoped, 1.0)
     grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > FAIR, 0.5, 2.0))
-    # If the cost falls as predicted by the linear model, damping is not needed and only makes steps
-    # shorter.
+    # If the cost falls as the linear model predicts, damping is not needed: it would only make
+    # steps shorter.
     linear = (jnp.abs(ratio - 1.0) < LINEAR) & (state.damping > FREE)
     grown = jnp.where(linear, 0.01, grown)
     damping = state.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))

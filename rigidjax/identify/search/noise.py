@@ -105,10 +105,10 @@ def _variance_by_median(
     median that outliers hardly change.
 
     The median of the squared lengths is taken over the readings of a group, and divided by the
-    median of χ² with k degrees of freedom. Readings with an unused component are left out; the
-    variance is 0 for a group without other readings. A mean with the weights of the robust loss
-    (which gives outliers less weight) would be too small without outliers, and too large with many
-    outliers.
+    median of χ² with k degrees of freedom. A reading is left out if one of its components is not
+    used. If no reading of a group is left, its variance is 0. A mean with the weights of the robust
+    loss (which gives outliers less weight) would be too small without outliers, and too large with
+    many outliers.
 
     - `squared_errors`: (R, T) the squared lengths of the errors, at T times of R recordings.
     - `mask`: (R, T, k) true for each of the k components of an error that is used.
@@ -137,12 +137,12 @@ def median_and_density_of_chi2(degrees_of_freedom: int) -> tuple[float, float]:
 def _shares_of_squared_error_left_by_fit(
     model: Model, x: Array, blocks: Blocks, noise: Noise
 ) -> list[np.ndarray]:
-    """Return, for each sensor, the share (groups,) of the expected sum of squared errors that
-    remains after a fit, for each group of recordings.
+    """Return, for each sensor, the fraction of the expected sum of its squared errors that remains
+    after a fit, as an array (groups,) with one fraction for each group of recordings.
 
-    A fit makes the errors smaller than the noise. The share is one minus N / M, and at least 0.1.
-    Here M is the number of the sensor's errors in the group, and N is the number of free numbers
-    that these errors determine (the sum of their leverages).
+    A fit makes the errors smaller than the noise. The fraction is one minus N / M, and at least
+    0.1. Here M is the number of the sensor's errors in the group, and N is the number of free
+    numbers that these errors determine (the sum of their leverages).
 
     - `model`: the model, which says which recordings form a group.
     - `x`: (n,) the free numbers after the fit.
@@ -183,9 +183,9 @@ def _most_likely_noise_and_jitter(
     components of the errors along u, whose mean is `σ² + τ² |u|²`; and σ² by a step of expectation
     and maximisation (EM).
 
-    - `errors`: (R, T, k) the errors of a sensor with k channels, at T times of R recordings,
-      divided by the noise (known, or its present estimate), weighted by the robust loss, and
-      enlarged by what the fit has taken from them.
+    - `errors`: (R, T, k) the errors of a sensor with k channels, at T times of R recordings. They
+      are divided by the noise (known, or its present estimate) and weighted by the robust loss.
+      They are also enlarged, since the fit has made them smaller than the noise.
     - `u`: (R, T, k) the derivative of the errors with respect to the clock offset of the sensor,
       per second, divided by the same noise.
     - `count`: (R, T) the number of channels that were read.

@@ -24,9 +24,9 @@ from rigidjax.identify.model.terms import Blocks, Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
 from rigidjax.rotation.barrier import barrier
 
-# The beginning of a record, of these fractions of its length, is fitted one after the other. A fit
-# to a long record has many wrong minima, in which the phase is wrong by whole turns; a fit to a
-# short record has no such minima.
+# Fits to longer and longer beginnings of a record follow each other: to a quarter of its length, to
+# half of its length, and to the whole. A fit to a long record has many wrong minima, in which the
+# phase is wrong by whole turns. A fit to a short record has no such minima.
 HORIZONS = (0.25, 0.5, 1.0)
 # If there are at least this many recordings, the numbers that belong to one recording alone are
 # eliminated from the normal equations.
@@ -39,14 +39,15 @@ SETTLED = 1e-7
 # A fit to the beginning of a record may raise the misfit of the whole record by at most this
 # factor.
 WILD = 100.0
-# A search over windows ends at a distance of about TOLERANCES times the tolerance from the minimum,
-# which is 0.05 standard deviations by default. It ends when the gain of a step, divided by the gain
-# of a fit from noise alone, is less than the square of this distance. A rough search ends when this
-# ratio is less than ROUGH.
+# A search over windows ends at a distance of about TOLERANCES times the tolerance from the minimum.
+# By default this distance is 0.05 standard deviations. The search ends when the gain of a step
+# (fall of the cost), divided by the gain of a fit from noise alone, is less than the square of this
+# distance. A rough search ends when this ratio of gains is less than ROUGH.
 TOLERANCES, ROUGH = 500.0, 1.0
-# The first searches over windows use one ninth (then one third) of each window, as PARTS says, if
-# this fraction of a window has at least SHORTEST time steps. Each of these searches takes at most
-# FEW steps of Levenberg and Marquardt.
+# Two short searches come before the search over whole windows. As PARTS says, the first one uses
+# one ninth of each window, and the second one a third. Each of them takes at most FEW steps of
+# Levenberg and Marquardt, and is left out if its part of a window has fewer than SHORTEST time
+# steps.
 PARTS, SHORTEST, FEW = (9, 3), 5, 10
 # The motion is integrated for this many samples beyond the last sample with a weight, since a
 # low-pass filter computes the slope at a sample from later samples, too.
@@ -56,9 +57,12 @@ _BEYOND = 2
 class Evaluation(NamedTuple):
     """Hold the values that a search keeps from its last evaluation of the cost.
 
-    **Fields:** `blocks` the errors of all readings and their derivatives
-    (`terms.errors_and_jacobians`); `pulls` (R, m) the gradient of the cost of each of R recordings
-    with respect to the m free numbers of the recording.
+    **Fields:**
+
+    - `blocks`: the errors of all readings and their derivatives, as `terms.errors_and_jacobians`
+      returns them.
+    - `pulls`: (R, m) for each of R recordings the gradient of the cost of its readings with respect
+      to its m free numbers.
     """
 
     blocks: Blocks
@@ -86,9 +90,12 @@ class Attempt(eqx.Module):
 class Task(NamedTuple):
     """Hold what a search has to fit, and how precisely.
 
-    **Fields:** `model` the model to be fitted; `noise` the noise of its sensors; `tolerance` the
-    tolerance of the search, in standard deviations (`Settings.tolerance`); `max_steps` the largest
-    number of steps of the search.
+    **Fields:**
+
+    - `model`: the model to be fitted.
+    - `noise`: for each sensor the standard deviations (R, k) of its noise.
+    - `tolerance`: the tolerance of the search, in standard deviations (`Settings.tolerance`).
+    - `max_steps`: the largest number of steps of the search.
     """
 
     model: Model
@@ -220,11 +227,11 @@ def order_one_indicator(model: Model, dtype: DTypeLike) -> Float[Array, " n"]:
 def _rows_for_chart_curvature(
     model: Model, x: Array, slope: Float[Array, " n"]
 ) -> Float[Array, "m n"]:
-    """Return rows B (m, n) by which the normal matrix allows for the curvature of the charts of the
-    bodies: BᵀB is added to the normal matrix of the n free numbers of a `model`.
+    """Return rows B (m, n), by which a fit allows for the curvature of the charts of the bodies:
+    BᵀB is added to the normal matrix of the n free numbers of a `model`.
 
-    A chart is a map from free numbers to a possible body. Its curvature matters if a body may be
-    flat, and each chart gives its own part of the m rows (`AbstractBodyChart.bend`).
+    A chart is a map from free numbers to a possible body, and this map is not linear. Its curvature
+    matters if a body may be flat. Each chart gives some of the m rows (`AbstractBodyChart.bend`).
 
     - `x`: (n,) the free numbers.
     - `slope`: (n,) the gradient of the cost at x.
@@ -296,9 +303,8 @@ def weights_of_beginning(model: Model, part: float) -> Float[Array, "records tim
 def _attempt_at_best_point(state: LMState) -> Attempt:
     """Return the best point of a search as an `Attempt` (free numbers, cost, convergence).
 
-    The `Attempt` also has the errors and derivatives at this point if the last evaluation of the
-    search was at this point, since a search keeps only those of its last evaluation. `state` is the
-    last state of the search.
+    A search keeps the errors and derivatives of its last evaluation only. The `Attempt` has them if
+    the last evaluation was at the best point. `state` is the last state of the search.
     """
     blocks = state.evaluation.blocks if bool(state.evaluated_at_best) else None
     return Attempt(state.point, state.cost, state.converged, blocks)
@@ -397,8 +403,8 @@ def search_whole_records(
     - `begin`: the attempt at the first point.
     - `task`: the model, its noise, the tolerance, and the largest number of steps.
     - `damping`: the damping of the first run.
-    - `aim`: the cost that another start reached; a search that is not likely to reach this cost
-      ends early.
+    - `aim`: the cost that the search from another start reached, or zero for none. This search
+      ends early if it is not likely to reach this cost.
     - `watch`: a function that is called with the attempt after each run.
     """
     attempt, weights = begin, weights_of_whole_record(task.model)
@@ -445,8 +451,8 @@ def fit_in_stages(
 
     - `x`: (n,) the free numbers at the start.
     - `task`: the model, its noise, the tolerance, and the largest number of steps.
-    - `aim`: the cost that another start reached; a search that is not likely to reach this cost
-      ends early.
+    - `aim`: the cost that the search from another start reached, or zero for none. This search
+      ends early if it is not likely to reach this cost.
     - `watch`: a function that is called with each `Attempt` at a fit to the whole of the records.
     """
     model, noise, *_ = task
@@ -498,8 +504,8 @@ def _fit_windows(
 
     - `x`: (n,) the free numbers at the start.
     - `task`: the model, its noise, the tolerance, and the largest number of steps.
-    - `aim`: the cost that another start reached; a search that is not likely to reach this cost
-      ends early.
+    - `aim`: the cost that the search from another start reached, or zero for none. This search
+      ends early if it is not likely to reach this cost.
     - `watch`: a function that is called with each `Attempt` (result so far) of a fit to the whole
       windows.
     """
@@ -520,15 +526,18 @@ def _fit_windows(
 
 
 def has_unit_noise(reading: Reading) -> bool:
-    """Return whether the noise of the sensor of a `reading` is only a unit for its errors, whose
-    size is not known.
+    """Return whether the noise of the sensor of a `reading` is only a unit for the errors of the
+    sensor, because the size of these errors is not known.
     """
     return getattr(reading.sensor, "nominal", False)
 
 
 def count_of_errors_if_unit_noise(model: Model) -> int:
-    """Return the number of errors of a `model` (readings times components) if the noise of every
-    sensor is only a unit for its errors, whose size is not known; else 0.
+    """Return the number of errors of a `model` (readings times components) if no sensor has errors
+    of known size; else 0.
+
+    The noise of a sensor whose errors are of unknown size is only a unit for these errors
+    (`has_unit_noise`).
     """
     readings = model.records.readings
     return sum(map(count_numbers_read, readings)) if all(map(has_unit_noise, readings)) else 0
@@ -538,8 +547,9 @@ def sufficient_misfit(model: Model) -> float:
     """Return a misfit of a `model` that is low enough to accept a fit: wrong minima have a larger
     misfit.
 
-    A sensor of known noise adds twice the expected value of half its χ². A sensor of unknown noise
-    adds a term that allows errors of about 1 % of the signal.
+    It is a sum over the sensors. A sensor of known noise adds the number of its errors, which is
+    twice the misfit to expect of them. A sensor of unknown noise adds a hundredth of the number of
+    its errors, which allows errors of about 1 % of the signal.
     """
     return sum(
         (1.0 if reading.has_known_noise and not has_unit_noise(reading) else 0.01)

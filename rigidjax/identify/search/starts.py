@@ -22,13 +22,18 @@ from rigidjax.motion.torques.states import contains_own_states
 
 
 def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[Float[Array, " n"]]:
-    """Return `count` starting points (n,) of a fit: the regression first, then scattered points.
+    """Return `count` starting points (n,) of a fit, the first one from a regression, the others by
+    random scatter.
 
-    The scattered points lie about the regression or all over the chart of the body. Their initial
-    rates differ from the measured rates by about a tenth of the typical rate. A `Free` starts at
-    its value in the scene. There is only one point if neither a body nor initial rates are free.
-    **Arguments:** `key` the random key of the scatter; without a key the points are the same at
-    each call.
+    The body of the first point comes from `regress_inertia`, if the data allow it, and else from
+    `Model.start`. The bodies of the other points lie about the regressed body or all over the chart
+    of the body. Their initial rates differ from the measured rates by about a tenth of the typical
+    rate. A `Free` starts at its value in the scene. There is only one point if neither a body nor
+    initial rates are free.
+
+    - `model`: the readings and the free numbers.
+    - `count`: the number of points.
+    - `key`: the random key of the scatter; without a key the points are the same at each call.
     """
     recordings = (
         stacking.recordings_on_host(model.records, model.counts) if model.index.bodies else ()
@@ -61,10 +66,11 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
 def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) -> Inertia | None:
     """Return the inertia of a body by a regression on Euler's equations in integral form.
 
-    The equation `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I, where Ω is the
-    body rate. With a torque τ the components are found by least squares; without a torque they are,
-    up to scale, the right singular vector of the smallest singular value. Second moments that are
-    too small or negative are raised to 1 % of the largest, so that the result is a possible body.
+    The equation `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of the inertia tensor
+    I. Here Ω is the body rate, and ΔΩ its change during the time of the integrals. With a torque τ
+    the components are found by least squares. Without a torque they are found up to scale, as the
+    right singular vector of the smallest singular value. Principal second moments that are too
+    small or negative are raised to 1 % of the largest one, so that the result is a possible body.
     The result is `None` if samples are too few or too far apart, if the torque depends on more than
     time and rate, or if the tensor has no positive trace.
 
@@ -97,9 +103,9 @@ def inertia_components_and_feasibility_margin(
     which is positive if a body can have this tensor.
 
     The components solve `matrix @ components = rhs` in the least-squares sense, with `matrix` (n,
-    6) and `rhs` (n,). If `rhs` is zero, the tensor has the trace one. The margin is the smallest
-    eigenvalue of the tensor's matrix of second moments divided by the largest eigenvalue in
-    magnitude.
+    6) and `rhs` (n,). If `rhs` is zero, the scale of the tensor is unknown, and its trace is set to
+    one. The margin is the smallest eigenvalue of the tensor's matrix of second moments, divided by
+    the largest magnitude of an eigenvalue.
     """
     if np.abs(rhs).max() > 0:
         components = np.linalg.lstsq(matrix, rhs, rcond=None)[0]
@@ -125,11 +131,12 @@ def integrated_euler_equations(
     recording: Recording, torque: Torque | None, rate_matrix: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Euler's equations integrated over a recording, as n linear equations for the six
-    components of the inertia.
+    components of the inertia tensor.
 
-    The three results are: the matrix (n, 6) of the equations; their right sides (n,), from the
-    torque; and the part (n, 6) of the matrix that comes from the angular momentum, without the
-    integral of Ω × IΩ, where Ω is the body rate and I the inertia.
+    The three results are: the matrix (n, 6) of the equations; their right sides (n,), which come
+    from the torque; and the part (n, 6) of the matrix that comes from the angular momentum IΩ. The
+    other part of the matrix comes from the integral of Ω × IΩ. Here Ω is the body rate and I the
+    inertia tensor.
 
     - `recording`: the recording, which shows the body rates.
     - `torque`: a torque that depends on time and body rate alone, or `None`.
@@ -147,7 +154,8 @@ def integrated_euler_equations(
 
     def less_mean(x: np.ndarray) -> np.ndarray:
         # Each integrated equation has an unknown constant of integration. The difference of each
-        # sample from the mean over the record does not contain it. About sixty samples are enough.
+        # sample from the mean over the record does not contain this constant. About sixty samples
+        # are enough.
         samples = (x - x.mean(axis=0))[:: max(1, t.size // 60)]
         return samples.transpose(0, 2, 1).reshape(-1, x.shape[1])
 
