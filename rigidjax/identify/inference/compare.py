@@ -96,8 +96,9 @@ def _log_mean_square_errors(fit: Fit) -> np.ndarray:
 
     Jitter (errors of time stamps) correlates the errors of a sensor and raises their variance. The
     errors of a sensor with jitter are therefore first whitened, so that they have the variance of
-    the noise alone; then the mean logarithm of the factor by which jitter raises the variance is
-    added. White errors with this mean square have the same likelihood.
+    the noise alone. Then the mean logarithm of the factor by which jitter raises the variance is
+    added. White errors with the resulting mean square have the same likelihood as the errors of the
+    sensor.
     """
     out, model = 2.0 * np.log(np.maximum(fit.rms, 1e-300)), fit.model
     errors, _ = errors_and_slopes(model, fit.x)

@@ -204,10 +204,10 @@ def _slots_and_variances_of_unknown_noise(model: Model) -> tuple[list[Slot], lis
 
 
 def _slots_of_random_torque(process: Process | None, prior: Array) -> list[Slot]:
-    """Return a slot for the factor of each number of a random torque, such as its spectral density.
+    """Return a slot for each number of a random torque, such as its spectral density.
 
-    A slot is the description of a `Free`, a number that a fit may move; the free number is the
-    logarithm of the factor.
+    A slot is the description of a `Free`, a number that a fit may move. Here the free number is the
+    logarithm of a factor, by which the number of the torque is multiplied.
 
     **Arguments:** `process` the random torque, or `None`, which has no numbers; `prior` the
     standard deviation of the normal prior of each logarithm, about zero.
@@ -233,11 +233,10 @@ def _slot_of_positive_factor(
     groups: Array | None,
     prior: Array | None = None,
 ) -> Slot:
-    """Return the slot of a positive factor of one number of a scene; the free number is its
-    logarithm.
+    """Return the slot of a positive factor, by which a number or an array of a scene is multiplied.
 
-    A slot is the description of a `Free`, a number that a fit may move. A scene is the body,
-    torques, sensors and initial state of a recording.
+    A slot is the description of a `Free`, a number that a fit may move. Here the free number is the
+    logarithm of the factor. A scene is the body, torques, sensors and initial state of a recording.
 
     **Arguments:**
 

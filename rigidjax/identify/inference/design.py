@@ -138,9 +138,9 @@ def best_first_rate(
 ) -> tuple[Vec3, tuple[Quantity, ...]]:
     """Return the initial body rate, of the same length as `omega`, that determines the body best.
 
-    The direction of the rate minimises the mean logarithm of the standard deviations of the free
-    numbers of the body (D-optimality), where all other numbers are free as well. The BFGS method of
-    optimistix finds a minimum near the direction of `omega`: try several directions.
+    The direction of the rate minimises the determinant of the covariance of the free numbers of the
+    body (D-optimality), where all other numbers are free as well. The BFGS method of optimistix
+    finds a minimum near the direction of `omega`: try several directions.
 
     **Arguments:**
 
@@ -169,8 +169,8 @@ def _most_informative_rate_direction(
 ) -> Vec3:
     """Return the direction (3,) of the initial body rate that determines the body best, by BFGS.
 
-    The direction minimises the mean logarithm of the standard deviations of the body's numbers,
-    near the direction `initial_direction`. Its length is only near 1.
+    The search starts at `initial_direction`, and finds a minimum of the determinant of the
+    covariance of the body's free numbers. The length of the resulting vector is only near 1.
 
     **Arguments:**
 
@@ -194,11 +194,11 @@ def _most_informative_rate_direction(
 
 
 def _log_uncertainty_of_body(direction: Array, args: tuple[Model, PyTree, Array]) -> Scalar:
-    """Return the mean logarithm of the standard deviations of the body's numbers, with a penalty.
+    """Return the uncertainty of a body that is to be found from planned recordings, with a penalty.
 
-    It is ½ log det C / n, where C (n, n) is the covariance of the n free numbers of the body in
-    planned recordings, for one direction of the initial body rate. The penalty keeps the length of
-    `direction` near 1.
+    The uncertainty is ½ log det C / n, where C (n, n) is the covariance of the n free numbers of
+    the body for one direction of the initial body rate. It is the mean logarithm of the standard
+    deviations along the principal axes of C. The penalty keeps the length of `direction` near 1.
 
     **Arguments:** `direction` (3,) the direction, in the body frame; `args` the model with the
     planned recordings, the expected body, and the length of the initial rate, rad/s.

@@ -334,10 +334,11 @@ class Refit(eqx.Module):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the interval (low, high), with equal tails, of a function of the drawn quantities.
 
-        The interval is computed from the weighted draws. If the draws are worth fewer than 100
-        independent draws (`effective_count`), the interval is computed from the covariance and the
-        derivative of the function, which must then be differentiable: take the logarithm of a
-        positive quantity. An interval from the covariance is too narrow for short records.
+        The interval is computed from the weighted draws, if these are worth 100 independent draws
+        or more (`effective_count`). Else it is computed from the covariance of x and the derivative
+        of the function. In this case the function must be differentiable, and should return the
+        logarithm of a positive quantity instead of the quantity. An interval from the covariance is
+        too narrow for short records.
 
         **Arguments:**
 

@@ -127,9 +127,9 @@ class Model(eqx.Module):
     **Arguments:**
 
     - `recording`: one `Recording`, or a sequence of recordings with the same sensors: each
-      recording has its own initial state, and all recordings share the body. Or `Windows` of a
-      record of measured states: each window is a short recording whose initial state is known, or
-      free about the measured state.
+      recording has its own initial state, and all recordings share the body. `Windows` of a record
+      of measured states may be given instead: each window is then a short recording whose initial
+      state is known, or free about the measured state.
     - `chart`: the chart of the body: `Ratios()` (the full tensor up to scale), `PrincipalRatios()`
       (if the body axes are known to be principal), `Tensor()` or `Principal()` (the full or the
       principal tensor with its scale), `Mass(guess)` (all ten numbers), or `Known(body)`. For
@@ -840,8 +840,8 @@ def _require_held_steps_or_none(integrator: object) -> None:
     """Raise `ValueError` unless the `integrator` that a user gave is a `HeldSteps` or `None`. A
     `HeldSteps` takes one step from each time to the next and holds samples constant over this step.
 
-    It is called for a model of windows or with sampled inputs, for which all other integrators are
-    refused.
+    This check is made for a model of windows, or with sampled inputs. All other integrators are
+    refused for such a model, because they do not hold the samples constant.
     """
     if integrator is not None and not isinstance(integrator, HeldSteps):
         raise ValueError(
@@ -957,7 +957,7 @@ def _smallest_state_type(
     torque need.
 
     `Rigid`, a state with a position, is needed if a sensor or the torque reads the position, or if
-    a part of the torque is a force. Its motion needs the mass.
+    a part of the torque is a force. The equations of motion of such a state need the mass.
 
     - `sensors`: the sensors of a recording.
     - `torque`: the torque on the body, or `None`.

@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, Int
 
 
 class OwnBlocks(eqx.Module):
-    """Hold the blocks of a normal matrix of n numbers that belong to the own numbers of the
-    recordings.
+    """Hold some blocks of a normal matrix of n numbers: the blocks in the rows of the own numbers
+    of each recording.
 
     Each of R recordings has k own numbers, which no other recording has. The core is the s numbers
     that recordings share, so that n = s + R k.

@@ -121,8 +121,8 @@ class FixedSteps(AbstractIntegrator):
 
 
 def _tolerance_converter(name: str) -> Callable[[ScalarLike], Array]:
-    """Return a function that makes an array of shape () of a tolerance (one number), for use as the
-    `converter` of a dataclass field.
+    """Return a function that converts a tolerance (one number) to an array of shape (), for use as
+    the `converter` of a dataclass field.
 
     `name` is the name of the field. It appears in the error that the function raises unless the
     tolerance is one number that JAX does not trace. A compiled program takes an array as an
@@ -313,8 +313,9 @@ def sensor_inputs(
     - `sensor`: the sensor; if it has a clock offset, it reads at t + `offset` for the time stamp t.
     - `body`, `torque`: the body and the torque of the motion.
     - `ts`: (T,) the time stamps of the readings, s.
-    - `state0`, `states`: the initial state, and the states at `ts`; `Coupled` if a torque has
-      states of its own.
+    - `state0`: the initial state of the body.
+    - `states`: the states at `ts`; if the torque has states of its own (such as the speed of a
+      motor), a `Coupled`, which holds the states of the body and of the torque.
     - `delay`: a further time, s, that is added to the clock offset, one number or (T,).
     """
     turned = drop_unneeded_mass(body, type(state0))

@@ -23,11 +23,11 @@ class Scene(eqx.Module):
 
     **Fields:**
 
-    - `body`: the body.
+    - `body`: the body, or `None` while it is not known.
     - `torque`: the known torque on the body, or `None`.
     - `process`: the unknown torque on the body, as noise, or `None`.
     - `sensors`: the sensors, in the order of the readings.
-    - `start`: the state at the first time of the recording.
+    - `start`: the state at the first time of the recording, or `None` while it is not known.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> model = rj.identify.Model(record, rj.identify.PrincipalRatios())

@@ -61,8 +61,9 @@ def scene_from_row(
 
     - `row`: the free numbers of the recording: those of its body, of the `Free`s, and of its
       initial state, as `Index` describes.
-    - `record`, `reference`: the recording, and the state from which its free initial state is
-      measured.
+    - `record`: the recording.
+    - `reference`: a known state of the recording; the free numbers of its initial state are changes
+      of this state.
     - `body_index`: the index of the body of the recording among several bodies, or `None` for one
       body.
     """
@@ -117,7 +118,9 @@ def errors_in_sensor_units(
     **Arguments:**
 
     - `row`: the free numbers of the recording.
-    - `record`, `reference`: the readings of the recording, and its reference state.
+    - `record`: the readings of the recording.
+    - `reference`: a known state of the recording; the free numbers of its initial state are changes
+      of this state.
     - `body_index`: the index of the body of the recording, or `None` for one body.
     - `delay`: a time, s, that is added to the clock offset of each sensor; `None` for none.
     """
@@ -147,9 +150,10 @@ def map_over_recordings(function: Callable[..., PyTree], model: "Model", *argume
     """Return `function(*arguments, record, reference, body_index)` of every recording, with a
     leading axis of recordings.
 
-    On a CPU the recordings are computed one after another. XLA compiles the loop of one recording,
-    over a few dozen numbers, to one kernel; batched over recordings, this loop runs at half the
-    speed.
+    On a CPU the recordings are computed one after another. XLA compiles the loop over the times of
+    one recording, which changes a few dozen numbers in each step, to one kernel. Batched over
+    recordings, this loop runs at half the speed. On other devices all recordings are computed
+    together.
 
     - `function`: a function of one recording.
     - `model`: the model, which has the R recordings, their reference states, and the index of the

@@ -100,8 +100,10 @@ def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
 
 
 def require_nonnegative(value: NumbersLike, name: str) -> Array:
-    """Return `value` (one number or several) as an array, and raise `ValueError`, in which it is
-    called `name`, unless its numbers are finite and not below zero.
+    """Return `value` (one number or several) as an array, after a check that its numbers are finite
+    and not below zero.
+
+    If they are not, a `ValueError` is raised, in which the argument is called `name`.
     """
     array, wanted = _checks.numeric_array(value, name), "a finite number that is not below zero"
     if not array.size:

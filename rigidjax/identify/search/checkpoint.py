@@ -124,8 +124,7 @@ class Checkpoint:
                 part.unlink(missing_ok=True)
 
     def _read_attempts(self, path: Path) -> None:
-        """Read the results of the search from all finished starts from the file `path` into the
-        member `done`.
+        """Read the file `path`, and put the results of all finished starts into the member `done`.
 
         `ValueError` is raised for a damaged file, and for a file that the search of another model
         or with other options has written.

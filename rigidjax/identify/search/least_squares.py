@@ -200,8 +200,8 @@ def _next_state(
     - `state`: the state before the evaluation.
     - `evaluation`: what was found at the point `state.trial`: values to keep, the cost, the normal
       matrix (n, n) and the gradient (n,).
-    - `order_one`: (n,) one for numbers of order one, which no step changes by more than `LONGEST`;
-      zero for other numbers.
+    - `order_one`: (n,) one for each number of order one, which no step may change by more than
+      `LONGEST`; zero for each number that may have any size.
     - `settings`: the settings of the search, such as its tolerance.
     - `gain_of_noise`: a function of the kept values and the normal matrix that returns the gain of
       a fit that follows only the noise. The search may end after a step whose gain is less than the

@@ -106,12 +106,12 @@ def _variance_by_median(
 
     The median of the squared lengths is taken over the readings of a group, and divided by the
     median of χ² with k degrees of freedom. A reading is left out if one of its components is not
-    used. If no reading of a group is left, its variance is 0. A mean with the weights of the robust
-    loss (which gives outliers less weight) would be too small without outliers, and too large with
-    many outliers.
+    used. If no reading is left in a group, the variance of the group is 0. A mean with the weights
+    of the robust loss (which gives outliers less weight) would be too small without outliers, and
+    too large with many outliers.
 
     - `squared_errors`: (R, T) the squared lengths of the errors, at T times of R recordings.
-    - `mask`: (R, T, k) true for each of the k components of an error that is used.
+    - `mask`: (R, T, k) true where a component of an error is used, for k components.
     - `groups`: (R,) the index of the group of each recording.
     """
     half, _ = median_and_density_of_chi2(mask.shape[-1])
@@ -178,10 +178,11 @@ def _most_likely_noise_and_jitter(
     """Return two things: the most likely standard deviation σ (R,) of the noise of a sensor, in the
     unit of the given errors; and the most likely standard deviation τ (R,), s, of its time stamps.
 
-    The k errors of one reading have the covariance matrix `σ² E + τ² u uᵀ`, where E is the unit
-    matrix. The iteration updates τ² and σ² alternately: τ² by Fisher scoring of the squared
-    components of the errors along u, whose mean is `σ² + τ² |u|²`; and σ² by a step of expectation
-    and maximisation (EM).
+    The k errors of one reading have the covariance matrix `σ² E + τ² u uᵀ`. Here E is the unit
+    matrix, and u (k,) the derivative of the errors with respect to the clock offset. The iteration
+    updates τ² and σ² alternately. τ² is updated by Fisher scoring of the squared components of the
+    errors along u; the mean of such a square is `σ² + τ² |u|²`. σ² is updated by a step of
+    expectation and maximisation (EM).
 
     - `errors`: (R, T, k) the errors of a sensor with k channels, at T times of R recordings. They
       are divided by the noise (known, or its present estimate) and weighted by the robust loss.

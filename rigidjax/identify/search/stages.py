@@ -453,7 +453,8 @@ def fit_in_stages(
     - `task`: the model, its noise, the tolerance, and the largest number of steps.
     - `aim`: the cost that the search from another start reached, or zero for none. This search
       ends early if it is not likely to reach this cost.
-    - `watch`: a function that is called with each `Attempt` at a fit to the whole of the records.
+    - `watch`: a function that is called with each `Attempt` (result so far) of a fit to the whole
+      of the records.
     """
     model, noise, *_ = task
     if model.clusters is not None:
@@ -499,8 +500,8 @@ def _fit_windows(
 
     The first searches use the first ninth, then the first third of each window, if this part has
     enough steps (`SHORTEST`), since a prediction over a long time with poor numbers diverges. Then
-    the whole windows are fitted. If this ends with a higher cost than that of the start, the whole
-    windows are fitted once more, from the start.
+    the whole windows are fitted. If the cost at the end is higher than the cost at the starting
+    point x, the whole windows are fitted once more, directly from x.
 
     - `x`: (n,) the free numbers at the start.
     - `task`: the model, its noise, the tolerance, and the largest number of steps.
@@ -533,11 +534,11 @@ def has_unit_noise(reading: Reading) -> bool:
 
 
 def count_of_errors_if_unit_noise(model: Model) -> int:
-    """Return the number of errors of a `model` (readings times components) if no sensor has errors
-    of known size; else 0.
+    """Return the number of errors of a `model` (readings times components) if every sensor has unit
+    noise; else 0.
 
-    The noise of a sensor whose errors are of unknown size is only a unit for these errors
-    (`has_unit_noise`).
+    The noise of a sensor is unit noise if it is only a unit for the errors of the sensor, because
+    the size of these errors is not known (`has_unit_noise`).
     """
     readings = model.records.readings
     return sum(map(count_numbers_read, readings)) if all(map(has_unit_noise, readings)) else 0

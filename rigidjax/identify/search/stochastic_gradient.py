@@ -169,8 +169,8 @@ def _descent_steps(
     """Return three things after several steps of stochastic gradient descent: the free numbers x
     (n,); the state of the optimiser; and an array (steps,) with the misfit before each step.
 
-    Each step uses a batch, a few recordings drawn at random. The misfit is that of the batch,
-    scaled up to the number of all recordings, plus that of the priors.
+    Each step uses a batch, which is a few recordings drawn at random. The misfit of the batch is
+    scaled up to the number of all recordings, and the misfit of the priors is added.
 
     - `x`: (n,) the free numbers before the first step.
     - `optimiser_state`: the state of the optimiser before the first step.
