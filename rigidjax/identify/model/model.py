@@ -687,8 +687,8 @@ def require_single_model(model: PyTree) -> Model:
     shapes = {records.t.shape, *(reading.mask.shape for reading in records.readings)}
     if len(shapes) > 1 or records.t.ndim != 2 or rate.shape != records.t.shape[:1]:
         raise ValueError(
-            "model: wanted one, as Model(recording, …) makes it, got times and masks of shapes "
-            f"{sorted(shapes)}; give many one by one"
+            "model: wanted a single model, as Model(recording, …) makes it, got times and masks of "
+            f"shapes {sorted(shapes)}; give several models one by one"
         )
     _checks.numeric_array(records.t, "model")
     if _checks.is_known(rate):
@@ -912,8 +912,8 @@ def _require_recordings(recordings: Sequence[Any]) -> None:
         lengths = {item.t.shape, *(reading.mask.shape for reading in item.readings)}
         if len(lengths) > 1 or item.t.ndim != 1:
             raise ValueError(
-                "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
-                f"shapes {sorted(lengths)}; for many give a sequence"
+                "recording: wanted a single recording, as Recording(t, …) makes it, got times and "
+                f"masks of shapes {sorted(lengths)}; give several recordings as a sequence"
             )
         _checks.numeric_array(item.t, "recording")
 
