@@ -1,8 +1,9 @@
 """Define a linear function together with a transpose of its own.
 
-The tangent rule of a run is such a function, a JAX primitive that holds the function and its
-transpose. Then `jax.jvp`, `jax.vjp`, `jax.vmap` and forward over reverse mode all work for a loop
-of unknown length; with `jax.custom_vjp` forward mode would not work.
+The function that computes the tangents of a run is such a function. It is called by a JAX primitive
+that holds the function and its transpose. Then `jax.jvp`, `jax.vjp`, `jax.vmap` and forward over
+reverse mode all work for a loop of unknown length; with `jax.custom_vjp` forward mode would not
+work.
 """
 
 from collections.abc import Callable
@@ -28,18 +29,19 @@ _ZERO: Any = ad.Zero
 def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) -> Arrays:
     """Call a function that is linear in some of its arguments, and give it a transpose.
 
-    Reverse mode then calls this transpose, and does not transpose the function itself.
+    Reverse mode then calls `transposed`, and does not transpose `function` itself.
 
     **Arguments:**
 
-    - `function`: a function of the arrays in `given` and those in `tangents`, linear in the latter,
-      which returns a list of arrays.
+    - `function`: a function `(*given, *tangents)` that returns a list of arrays. It is linear in
+      the arrays of `tangents`.
     - `transposed`: a function `(*given, *bars)` that returns the list of the cotangents of
-      `tangents`; `bars` are the cotangents of the results.
-    - `given`, `tangents`: lists of arrays.
+      `tangents`. Here `bars` are the cotangents of the results of `function`.
+    - `given`: a list of arrays, in which the function may be nonlinear.
+    - `tangents`: a list of arrays, in which the function is linear.
 
-    **Returns** the list `function(*given, *tangents)`. Neither function may close over tracers.
-    Derivatives with respect to `given` exist in forward mode only.
+    **Returns** the list `function(*given, *tangents)`. Neither `function` nor `transposed` may
+    close over tracers. Derivatives with respect to `given` exist in forward mode only.
     """
     outs = jax.eval_shape(lambda g, t: function(*g, *t), given, tangents)
     inputs, results = (
@@ -51,12 +53,12 @@ def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) 
 
 
 def known_with_derivatives_of(known: PyTree, recomputed: PyTree) -> PyTree:
-    """Return known numbers, with the derivatives of the same numbers, computed once more.
+    """Return the numbers of `known`, with the derivatives of the numbers of `recomputed`.
 
-    Derivatives of every order are those of `recomputed`. Its values are not used, and may be NaN;
-    its derivatives may be NaN, too.
+    Both trees hold the same numbers, computed in two ways. Derivatives of every order are those of
+    `recomputed`; they may be NaN. The values of `recomputed` are not used, and may be NaN, too.
 
-    - `known`: a tree of arrays, the known numbers.
+    - `known`: a tree of arrays, whose values are returned.
     - `recomputed`: a tree of the same structure, whose arrays have derivatives.
     """
     return jax.tree.map(_array_with_derivatives_of, known, recomputed)
@@ -76,12 +78,12 @@ def _array_with_derivatives_of_jvp(
 
 
 def nan_derivatives_where_not_finite(tree: PyTree, inputs: PyTree) -> PyTree:
-    """Return the numbers of `tree`; those that are not finite get NaN as derivatives.
+    """Return the arrays of `tree`, in which each number that is not finite gets NaN derivatives.
 
-    The derivatives are those with respect to all numbers in `inputs`, in forward and in reverse
-    mode. A state that a run did not reach is set to NaN by `jnp.where`, whose derivative would be
-    0, which is wrong. If such a number is not used, its cotangent is 0, and it does not change the
-    gradient.
+    The derivatives are with respect to all numbers in the tree `inputs`, in forward and in reverse
+    mode. They are needed because a run sets a state that it did not reach to NaN by `jnp.where`,
+    which would give this state the wrong derivative 0. If later code does not use a number that is
+    not finite, the cotangent of this number is 0, and the number does not change the gradient.
     """
     smooth, rest = eqx.partition(tree, eqx.is_inexact_array)
     outs, structure = jax.tree.flatten(smooth)
@@ -91,10 +93,11 @@ def nan_derivatives_where_not_finite(tree: PyTree, inputs: PyTree) -> PyTree:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _with_nan_derivatives(count: int, *numbers: Array) -> Arrays:
-    """Return the first `count` of the arrays `numbers`, some of them with NaN as derivatives.
+    """Return the first `count` of the arrays `numbers`, with NaN derivatives where not finite.
 
-    The values are returned as they are. The other arrays in `numbers` are the inputs: a number that
-    is NaN or infinite gets NaN as its derivative with respect to all of the inputs.
+    The values are returned as they are. The other arrays of `numbers` are inputs, with respect to
+    which derivatives are taken. If a number in a returned array is NaN or infinite, its derivatives
+    with respect to all inputs are NaN.
     """
     return match_batch_axes(list(numbers[:count]), numbers)
 
@@ -123,9 +126,9 @@ _linear_map.multiple_results = True
 
 @_linear_map.def_impl
 def _linear_map_impl(*args: Any, function: Map, **_: Any) -> Arrays:
-    """Return the results of a linear map, a list of arrays: its `function`, called with `args`.
+    """Call the `function` of a linear map with `args`, and return the list of its results.
 
-    This is the rule of the JAX primitive `_linear_map` for known arrays.
+    This is the rule by which JAX evaluates the primitive `_linear_map` for known arrays.
     """
     return function(*args)
 
@@ -144,9 +147,12 @@ def _linear_map_jvp(
 ) -> Any:
     """Return the results of a linear map and the tangents of the results, in forward mode.
 
-    This is the rule of the JAX primitive `_linear_map`. `primals` are the arguments of the map, the
-    arrays that it is linear in after the others; `tangents` are their tangents (`ad.Zero` where
-    there is none). `params` holds the map, its transpose, and the shapes and dtypes of the arrays.
+    This is the rule of the JAX primitive `_linear_map`.
+
+    - `primals`: the arguments of the map. The first `params["number"]` arrays are those in which
+      the map may be nonlinear; in the other arrays it is linear.
+    - `tangents`: the tangents of all arguments; `ad.Zero` for an argument without a tangent.
+    - `params`: a dict with the map, its transpose, and the shapes and dtypes of the arrays.
     """
     number, function = params["number"], params["function"]
     out, parts = _linear_map.bind(*primals, **params), []
@@ -174,7 +180,10 @@ def _linear_map_jvp(
 
 
 def raise_for_missing_transpose(*_: Any) -> Arrays:
-    """Raise `TypeError`: this function stands for the transpose of a map that has no transpose."""
+    """Raise `TypeError`, because reverse mode needs the transpose of a map that has none.
+
+    This function takes the place of the missing transpose.
+    """
     raise TypeError(
         "second derivatives through a solver are forward over reverse: wanted "
         "jax.jacfwd(jax.grad(f)) or jax.hessian(f), got reverse mode over a derivative, such as "
@@ -185,10 +194,13 @@ def raise_for_missing_transpose(*_: Any) -> Arrays:
 def _linear_map_transpose(cotangents: Any, *args: Any, **params: Any) -> Any:
     """Return the cotangents of the arguments of a linear map, in reverse mode.
 
-    This is the rule of the JAX primitive `_linear_map`. `cotangents` are those of the results;
-    `args` are the arguments, of which those that the map is linear in are undefined; `params` holds
-    the map, its transpose, and the shapes and dtypes of the arrays. The arguments that the map is
-    not linear in get `None`.
+    An argument in which the map may be nonlinear gets `None`. This is the rule of the JAX primitive
+    `_linear_map`.
+
+    - `cotangents`: the cotangents of the results; `ad.Zero` for a result without a cotangent.
+    - `args`: the arguments of the map. The first `params["number"]` are arrays in which the map may
+      be nonlinear. In the other arguments the map is linear; JAX passes them as undefined values.
+    - `params`: a dict with the map, its transpose, and the shapes and dtypes of the arrays.
     """
     number = params["number"]
     given = args[:number]
@@ -206,9 +218,12 @@ def _linear_map_transpose(cotangents: Any, *args: Any, **params: Any) -> Any:
 def _linear_map_batching(args: Any, dims: Any, **params: Any) -> Any:
     """Return the results of a linear map for a batch, and the batch axes of the results (all 0).
 
-    This is the rule of the JAX primitive `_linear_map` for `jax.vmap`. `args` are the arguments;
-    `dims` has the batch axis of each argument, or `None` for an argument without one; `params`
-    holds the map, its transpose, and the shapes and dtypes of the arrays.
+    This is the rule of the JAX primitive `_linear_map` for `jax.vmap`.
+
+    - `args`: the arguments of the map.
+    - `dims`: the batch axis of each argument, or `None` for an argument without a batch axis.
+    - `params`: a dict with the map, its transpose, and the shapes and dtypes of the arrays of one
+      element of the batch.
     """
     number = params["number"]
     size = next(a.shape[d] for a, d in zip(args, dims, strict=True) if d is not None)

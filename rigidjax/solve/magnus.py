@@ -42,12 +42,13 @@ def momentum_change_and_turn(
 
     - `slope(t, p)`: the derivative dp/dt.
     - `rate(p)`: the body rate Ω, rad/s, that belongs to `p`.
-    - `t`, `end`, `h`: the times at which the step begins and ends, s, and its length, s.
+    - `t`, `end`, `h`: the times at which the step begins and ends, s, and the length of the step,
+      s.
     - `p`: the momentum, or the body rate, at the time `t`.
 
     The rotation vector of the step is `∫Ω dt + h²/12 Ω(t) × Ω(t+h)`. The integral is computed by
-    Simpson's rule. In this rule the rate at the middle of the step is computed from p there, by the
-    cubic polynomial that has the values of p and dp/dt at both ends of the step. Source: Magnus
+    Simpson's rule, from Ω at the start, the middle and the end of the step. The value of p at the
+    middle is that of the cubic polynomial with the right p and dp/dt at both ends. Source: Magnus
     1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas, Nørsett and Zanna 2000,
     doi:10.1017/S0962492900002154, section 5.
     """
@@ -76,12 +77,13 @@ def momentum_change_and_turn(
 class Magnus4(dfx.AbstractSolver):
     """Solve the rotation of a body, free or under torques of time and body rate, to order 4.
 
-    The steps have a fixed length. At equal steps this method does less work than
+    The steps have a fixed length. With steps of the same length, this method does less work than
     `rigidjax.solvers.RungeKutta4` and has a smaller error; it is the default of
     `rigidjax.batch.rollout`. A step should turn the body by less than a radian. Source: Magnus
     1954, doi:10.1002/cpa.3160070404; see `momentum_change_and_turn`.
 
-    **Raises:** `TypeError` for a torque that depends on the attitude, or another state.
+    **Raises:** `TypeError` for a torque that may depend on the attitude, and for a state that is
+    not an `Attitude`.
 
     >>> import diffrax
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
@@ -125,8 +127,8 @@ class Magnus4(dfx.AbstractSolver):
         way, h = (
             part.astype(y0.omega.dtype) for part in direction_and_length_of_step(terms, t0, t1)
         )
-        # The law has declared that it does not read the attitude. It gets NaN as the attitude, so
-        # that the result is NaN if the law reads the attitude nevertheless.
+        # The torque has declared that it does not read the attitude. It gets NaN as the attitude,
+        # so that the result is NaN if the torque reads the attitude nevertheless.
         nowhere = jnp.full_like(y0.q, jnp.nan)
 
         def slope(t: Any, omega: Triple) -> Triple:
@@ -156,11 +158,11 @@ class Magnus4(dfx.AbstractSolver):
 def require_attitude_equations(
     solver_name: str, field: Any, y0: PyTree, advised_solver: str
 ) -> AttitudeEquations:
-    """Return a vector field after a check that it is that of an attitude and its body rate.
+    """Return the vector field `field`, after a check that the solver `solver_name` can solve it.
 
-    Raise `TypeError` unless `field` is `AttitudeEquations` and the state `y0` is an `Attitude`. The
-    message says that the solver `solver_name` does not fit, and names the solver `advised_solver`
-    to use.
+    The solver needs the field of an attitude and its body rate: raise `TypeError` unless `field` is
+    an `AttitudeEquations` and the state `y0` is an `Attitude`. The message advises the user to take
+    the solver `advised_solver` instead.
     """
     if isinstance(field, AttitudeEquations) and isinstance(y0, Attitude):
         return field
@@ -173,7 +175,8 @@ def require_attitude_equations(
 def require_independent_of_attitude(torque: Any) -> None:
     """Raise `TypeError` for a torque that may depend on the attitude of the body.
 
-    A torque says by its member `feels` that it does not. `None` stands for no torque.
+    A torque states by `feels = HasSpin` that it does not depend on the attitude; without this
+    statement it is refused. `None` stands for no torque, and is accepted.
     """
     if may_read_attitude(torque):
         raise TypeError(

@@ -31,9 +31,9 @@ class _EquationsUnderChangingInertia(eqx.Module):
     """Compute the time derivative of the state of a body whose inertia changes with the time.
 
     It is called with the time t, s, and a state with the body rate Ω. In the returned derivative
-    dΩ̃/dt stands in the place of dΩ/dt. Here Ω̃ = I₀⁻¹ p, rad/s, is a multiple of the momentum
-    p = I(t) Ω, where I(t) is the inertia at the time t and I₀ that of the body: where the inertia
-    jumps, Ω jumps and Ω̃ does not.
+    dΩ̃/dt stands in the place of dΩ/dt. The rate Ω̃ = I₀⁻¹ p, rad/s, is computed from the momentum
+    p = I(t) Ω. Here I(t) is the inertia at the time t, and I₀ is the inertia of `body`, which is
+    constant. When I(t) jumps, Ω jumps, too, but p and Ω̃ do not.
     """
 
     body: Any  # the body with the inertia I₀, an `Inertia` or `MassProperties`
@@ -51,32 +51,33 @@ class _EquationsUnderChangingInertia(eqx.Module):
 
 
 class ByMomentum(eqx.Module):
-    """Compute the time derivative of a state whose inertia changes, and convert between two rates.
+    """Compute the time derivative of the state of a body whose inertia changes with the time.
 
-    A state of the run has the rate Ω̃ = I₀⁻¹ p in the place of the body rate Ω: p = I(t) Ω is the
-    momentum, I(t) the inertia at the time t, and I₀ the inertia of the body that `simulate` was
+    A state of the run has the rate Ω̃ = I₀⁻¹ p in the place of the body rate Ω. Here p = I(t) Ω is
+    the momentum, I(t) the inertia at the time t, and I₀ the inertia of the body that `simulate` was
     given. The method `replace_rate_by_momentum` replaces Ω by Ω̃, and `restore_body_rate` replaces
     Ω̃ by Ω.
     """
 
-    field: Any  # a `_EquationsUnderChangingInertia`, or the `CoupledEquations` of one
+    field: Any  # an `_EquationsUnderChangingInertia`, or a `CoupledEquations` that contains it
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None) -> Any:
         return self.field(t, self.restore_body_rate(t, y))
 
     def replace_rate_by_momentum(self, t: Any, y: PyTree) -> PyTree:
-        """Return the state `y` with its body rate Ω replaced by I₀⁻¹ I(t) Ω, a form of momentum.
+        """Return the state `y`, with its body rate Ω replaced by I₀⁻¹ p, where p is the momentum.
 
-        I(t) is the inertia at the time `t`, s, and I₀ that of the body that `simulate` was given.
+        The momentum is p = I(t) Ω. Here I(t) is the inertia at the time `t`, s, and I₀ is the
+        inertia of the body that `simulate` was given.
         """
         return self._replace_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
 
     def restore_body_rate(self, t: Any, y: PyTree) -> PyTree:
-        """Return the state `y` of the run with its body rate, instead of a form of momentum.
+        """Return the state `y` of the run, with the body rate Ω in the place of its rate w.
 
-        This is the inverse of `replace_rate_by_momentum`: the rate w of `y` becomes
-        Ω = I(t)⁻¹ I₀ w, where I(t) is the inertia at the time `t`, s, and I₀ that of the body that
-        `simulate` was given.
+        The body rate is Ω = I(t)⁻¹ I₀ w. Here I(t) is the inertia at the time `t`, s, and I₀ is the
+        inertia of the body that `simulate` was given. This is the inverse of
+        `replace_rate_by_momentum`.
         """
         return self._replace_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
 
@@ -105,10 +106,12 @@ class ByMomentum(eqx.Module):
 def equations_by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
     """Return the equations of motion by momentum for an inertia that is a function of time.
 
-    In these equations a multiple of the momentum stands in the place of the body rate, so that
-    nothing jumps where the inertia jumps. The result is `None` for an inertia that is constant or
-    depends on more than the time. `body` and `torque` are those of `simulate`; `state0` is the
-    state at the start, with the body rate.
+    In the states of these equations I₀⁻¹ p stands in the place of the body rate, so that the states
+    do not jump when the inertia jumps; p is the momentum and I₀ the inertia of `body`. The result
+    is `None` for an inertia that is constant or that depends on more than the time.
+
+    - `body`, `torque`: the arguments of `simulate` with these names.
+    - `state0`: the state at the start, with the body rate.
     """
     if not isinstance(law := changing_inertia_of_torque(torque), ChangingInertia) or hasattr(
         law.inertia, "feels"
@@ -119,10 +122,11 @@ def equations_by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | N
 
 
 def changing_inertia_of_torque(torque: Any) -> ChangingInertia | None:
-    """Return the `ChangingInertia` of which a torque consists, or `None` if it is another torque.
+    """Return the torque if it is a `ChangingInertia`, or `None` if it is another torque.
 
     A `ChangingInertia` is the law by which the inertia of a body changes with the time; `simulate`
-    takes it in the place of a torque. A `Sum` of this law alone counts, too.
+    takes it in the place of a torque. If the torque is a `Sum` whose only part is a
+    `ChangingInertia`, this part is returned.
     """
     # The argument may also be a scene of particles or `None`, which are no torques.
     parts = parts_of(torque) if isinstance(torque, ChangingInertia | Sum) else ()
@@ -130,10 +134,10 @@ def changing_inertia_of_torque(torque: Any) -> ChangingInertia | None:
 
 
 def with_body_rates(form: ByMomentum | None, ts: Array, ys: PyTree) -> PyTree:
-    """Return the saved states of a run with their body rates.
+    """Return the saved states of a run, with the body rates restored.
 
-    If the inertia is a function of time, the run has used a form of the momentum in the place of
-    the body rate.
+    If the inertia is a function of time, the states of the run have a rate that is computed from
+    the momentum, in the place of the body rate.
 
     - `form`: the equations by momentum of the run; if it is `None`, the states already have the
       body rate and are returned as they are.

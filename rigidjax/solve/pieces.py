@@ -1,11 +1,12 @@
 """Run equal steps on a GPU, several in one kernel, with a reverse mode written by hand.
 
-A kernel with a single step mostly waits for its data. With several steps in each iteration of the
-loop (unrolling), free bodies take three times as many steps a second. In reverse mode unrolling
-does not help, because a backward step has so many numbers that the time of a kernel grows in
-proportion to its length. JAX's transpose of a loop is unrolled as the loop itself, so the backward
-loop is written here by hand, with one step in each iteration. It stores states on two levels (see
-`take_equal_steps_on_gpu`). On a CPU neither the unrolling nor this backward loop saves time.
+A GPU kernel that takes a single step mostly waits for its data. With several steps in each
+iteration of the loop (unrolling), free bodies take three times as many steps a second. In reverse
+mode unrolling does not help, because a backward step has so many numbers that the time of a kernel
+grows in proportion to its number of operations. If a loop is unrolled, JAX also unrolls its
+transpose. The backward loop is therefore written here by hand, with one step in each iteration. It
+stores states on two levels (see `take_equal_steps_on_gpu`). On a CPU neither the unrolling nor this
+backward loop saves time.
 """
 
 import dataclasses
@@ -31,10 +32,10 @@ _LONG, _MOST = 2800, 8
 
 
 def steps_per_piece(count: int) -> int:
-    """Return the number of steps in a piece of a run of `count` steps, about √count.
+    """Return how many steps are in each piece of a run of `count` steps: about √count.
 
-    If `count` has a divisor between √count and 2√count, this divisor is returned: the pieces then
-    contain all steps, and there is no remainder to compile.
+    If `count` has divisors between √count and 2√count, the smallest of them is returned. The pieces
+    then contain all steps, so that no loop for remaining steps has to be compiled.
     """
     root = math.isqrt(count - 1) + 1
     near = [d for d in range(root, min(2 * root, count) + 1) if count % d == 0]
@@ -43,11 +44,12 @@ def steps_per_piece(count: int) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class _StepsInPieces:
-    """Run many equal steps of a function in forward direction, and in reverse mode.
+    """Take many equal steps in forward direction, and run them in reverse mode.
 
-    The steps are divided into pieces of about √N steps, where N is the number of all steps: only
-    the states at the starts of the pieces are stored, and reverse mode computes the states within a
-    piece once more. Constants and states are lists of arrays.
+    The steps are divided into pieces of about √N steps, where N is the number of all steps. Only
+    the states at the starts of the pieces are stored; reverse mode computes the states within a
+    piece once more. A state is a list of arrays, and so are the constants, which are the arrays
+    that the function of a step holds.
     """
 
     # call(constants, y, i) → the state after step number i, which begins with the state y.
@@ -58,11 +60,11 @@ class _StepsInPieces:
     def take_steps(
         self, constants: Arrays, y: Arrays, first: Array, number: int, keep_starts: bool = False
     ) -> tuple[Arrays, Arrays | None]:
-        """Take `number` steps, which begin with step number `first` and the state `y`.
+        """Take `number` steps from the state `y`; the first of them is step number `first`.
 
-        `constants` are the arrays that the function of a step holds. **Returns** two things: the
-        state after the steps; and the states at the starts of these steps, along a new first axis,
-        if `keep_starts` is true, else `None`.
+        `constants` are the arrays that the function of a step holds. **Returns** two things. The
+        first is the state after the steps. If `keep_starts` is true, the second is the states at
+        the starts of these steps, along a new first axis; else it is `None`.
         """
 
         def one(y: Arrays, i: Array) -> tuple[Arrays, Any]:
@@ -76,9 +78,9 @@ class _StepsInPieces:
         """Take all steps from the state `y`, beginning with step number `first`.
 
         `constants` are the arrays that the function of a step holds. **Returns** two things: the
-        state at the end; and the states that `pull_back_all_steps` needs, a pair of the states at
-        the starts of the pieces (along a new first axis) and of the state at the start of the
-        remaining steps after the last piece.
+        state at the end, and a pair that `pull_back_all_steps` needs. The first item of the pair is
+        the states at the starts of the pieces, along a new first axis. The second item is the state
+        after the last piece, from which the remaining steps are taken.
         """
         firsts, length, left = self.divide_into_pieces(first)
 
@@ -99,16 +101,17 @@ class _StepsInPieces:
         starts: tuple[Arrays, Arrays],
         cotangent_of_end: Arrays,
     ) -> tuple[Arrays, Arrays]:
-        """Run all steps in reverse mode, and return the cotangents of constants and start.
+        """Run all steps in reverse mode: return the cotangents of constants and state at the start.
 
         **Arguments:**
 
         - `constants`: the arrays that the function of a step holds.
         - `has_derivative`: for each constant, whether it has a derivative.
         - `first`: the number of the first step.
-        - `starts`: the states that the method `take_all_steps` returned as its second result for
-          this purpose.
-        - `cotangent_of_end`: the cotangent of the state at the end.
+        - `starts`: the pair of states that the method `take_all_steps` returned as its second
+          result. The first item is the states at the starts of the pieces, along a new first axis;
+          the second item is the state after the last piece.
+        - `cotangent_of_end`: the cotangent of the state after all steps.
 
         **Returns** two lists: the cotangents of the constants with a derivative, and the cotangent
         of the state at the start.
@@ -144,11 +147,12 @@ class _StepsInPieces:
         return lax.scan(whole, sums, (rows, firsts), reverse=True)[0]
 
     def divide_into_pieces(self, first: Array) -> tuple[Array, int, int]:
-        """Return how the steps, the first of which has the number `first`, are divided into pieces.
+        """Return how all steps are divided into pieces.
 
-        A piece is a group of steps that follow one another; all pieces have equally many.
-        **Returns** three things: the number of the first step of each piece, an array; how many
-        steps are in a piece; and how many steps, too few for a piece, remain after the last piece.
+        A piece is a group of steps that follow one another; all pieces have equally many steps. The
+        first of all steps has the number `first`. **Returns** three things: an array with the
+        number of the first step of each piece; how many steps are in a piece; and how many steps
+        remain after the last piece, because they are too few for another piece.
         """
         length = steps_per_piece(self.count)
         many, left = divmod(self.count, length)
@@ -160,8 +164,11 @@ def take_equal_steps_on_gpu(
 ) -> Any:
     """Take many equal steps on a GPU, several in one kernel, and return the state after them.
 
-    `step(y, i)` returns the state after step number i, which begins with the state `y`. The first
-    of the `count` steps has the number `first`; `y` is the state before it.
+    - `step`: a function `step(state, i)` that takes step number i from `state`, and returns the
+      state after the step.
+    - `first`: the number of the first step.
+    - `count`: how many steps are taken.
+    - `y`: the state before the first step.
 
     In reverse mode the run is divided into about √count pieces. The states at the starts of all
     pieces are stored; the states within a piece are stored for one piece at a time. Second

@@ -14,7 +14,10 @@ from rigidjax.solve.adaptive_loop import NONFINITE, finite
 
 
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
-    """Interpolate the state in a step by `inner`, and scale its quaternion to length 1."""
+    """Interpolate the state within a step by `inner`, and scale the quaternion to length 1.
+
+    `inner` is the interpolation of the solver that took the step.
+    """
 
     t0: Any
     t1: Any
@@ -28,10 +31,11 @@ class GroupInterpolation(dfx.AbstractLocalInterpolation):
 
 
 class _MakeGroupInterpolation(eqx.Module):
-    """Make the object that interpolates within a step, and keeps the quaternion a unit quaternion.
+    """Make the object that interpolates within a step, and scales the quaternion to length 1.
 
-    Diffrax calls it with the times `t0` and `t1` at which the step begins and ends, s, and with
-    what the solver has stored for dense output, which gives the states within a step.
+    Diffrax calls it with the times `t0` and `t1` at which the step begins and ends, s, and with the
+    arrays that the solver has stored for this step. From these arrays the state at any time within
+    the step (dense output) is computed.
     """
 
     inner_cls: Any = eqx.field(static=True)  # the class of the solver's own interpolation
@@ -114,8 +118,8 @@ class Projected(dfx.AbstractWrappedSolver):
     ) -> Any:
         # Some solvers keep the slope at the end of a step for the next step. This slope belongs to
         # the state before the quaternion was scaled. Also, if one body of a batch needs a new
-        # slope, diffrax computes it for all bodies, so that a body would depend on the others. With
-        # `made_jump=True` the slope is computed anew in every step.
+        # slope, diffrax computes it for all bodies, so that the result of one body would depend on
+        # the other bodies. With `made_jump=True` the slope is computed anew in every step.
         del made_jump
         y1, error, dense, state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, True

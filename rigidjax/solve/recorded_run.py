@@ -1,6 +1,6 @@
-"""Define a run as one function of its arrays, with derivatives in forward and reverse mode.
+"""Define a run as one function of arrays, which has derivatives in forward and in reverse mode.
 
-The run is that of one body or, under `jax.vmap`, that of a batch of bodies.
+The function runs one body or, under `jax.vmap`, a batch of bodies.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,19 +27,21 @@ def run_with_replayed_derivatives(
 ) -> tuple[Array, LoopState]:
     """Run one body, with derivatives that repeat the recorded steps of the run.
 
-    **Returns** two things: the states (K, n) at the K saved times `run.between`, each of n numbers,
-    NaN at times that the run did not reach; and the state of the loop at the end of the run. The
-    states have derivatives with respect to two kinds of inputs: the constants that `smooth`
-    selects, and the fields of the run that `adjoint.Smooth` lists. The derivatives hold the lengths
-    of the steps constant.
+    **Returns** two things: the states (K, n) at the K saved times `run.between`, and the state of
+    the loop at the end of the run. Each state has n numbers, which are NaN at times that the run
+    did not reach. The states have derivatives with respect to two kinds of inputs: the constants
+    that `smooth` selects, and the start, the stops, the saved times and the first state of the run.
+    The derivatives hold the lengths of the steps constant.
 
     **Arguments:**
 
-    - `method`, `run`: the parts and the numbers of the run of one body.
-    - `smooth`: whether each of the `constants` has derivatives.
-    - `constants`: the arrays that the field, the condition and the controller hold.
-    - `controller_states`: the states of controller and progress meter at the start, which bodies
-      may share.
+    - `method`: the tableau of the Runge–Kutta method, and the functions of the run of one body: the
+      vector field, the condition that ends the run, and the step control.
+    - `smooth`: for each of the `constants`, whether it has derivatives.
+    - `constants`: the arrays that the field, the condition and the step control hold.
+    - `controller_states`: the states of step controller and progress meter at the start; all bodies
+      of a batch may share them.
+    - `run`: the arrays of the run of one body: its times and its state at the start.
     """
     arrays_of_bodies, run_tree = jax.tree.flatten(run)
     first, state_tree = jax.tree.flatten(controller_states)
@@ -48,9 +50,10 @@ def run_with_replayed_derivatives(
     shapes = jax.eval_shape(adaptive_loop.pack_loop_state, like)
     trees = run_tree, state_tree
     # `recorded` returns a list of arrays: the states at the saved times; the loop state at the end,
-    # packed into `size` arrays; and the record, which is `size` arrays for its starts, one for its
-    # rows and one for its counts. `states` are the indices of those arrays in the list that have
-    # derivatives. `answer` returns only the first `head` arrays of the list.
+    # packed into `size` arrays; and the record of the steps. The record is `size` arrays for the
+    # starts of its segments, one array for its rows and one for its counts. `states` are the
+    # indices of the arrays in the list that have derivatives. `answer` returns only the first
+    # `head` arrays of the list.
     size = len(shapes)
     states, head = [0, 1, 1 + size, 1 + 2 * size], 1 + size
 
@@ -66,12 +69,14 @@ def run_with_replayed_derivatives(
         tangents: Sequence[Any],
         cotangents_of_inputs: Callable[..., Arrays] | None = None,
     ) -> tuple[Arrays, Arrays]:
-        """Return the results and the record of a run, and the tangents of those that hold states.
+        """Return the results and the record of a run, and the tangents of the states in them.
 
-        Results and record are one list of arrays. `primals` are the inputs of the run, its
-        constants first, and `tangents` their tangents (symbolic zeros where there is none).
-        `cotangents_of_inputs` is the function that computes the cotangents of the inputs in reverse
-        mode; if it is `None`, reverse mode raises an error.
+        Results and record are one list of arrays.
+
+        - `primals`: the inputs of the run, of which its constants are the first.
+        - `tangents`: the tangents of the inputs; a symbolic zero for an input without a tangent.
+        - `cotangents_of_inputs`: the function that computes the cotangents of the inputs in reverse
+          mode. If it is `None`, reverse mode raises an error.
         """
         # A number without a tangent needs no derivative.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
@@ -114,10 +119,10 @@ def _batch_method_over_bodies(
     constants: Arrays,
     arrays_of_bodies: Arrays,
 ) -> tuple[Method, Run, Layout, Arrays]:
-    """Convert a method for one body to a method for arrays whose last axis is the bodies.
+    """Convert a method for one body to a method for arrays whose last axis runs over the bodies.
 
     A method holds the functions of a run: the field, the condition that ends the run, and the step
-    control. If there is one body, the arrays have no such axis.
+    control. If there is only one body, the arrays have no axis for bodies.
 
     **Arguments:**
 
@@ -125,14 +130,14 @@ def _batch_method_over_bodies(
       `control(again, constants, …)`, the step control, take the constants as an argument.
     - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
       progress meter.
-    - `layout`: which arrays have a last axis of bodies.
+    - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
-    - `arrays_of_bodies`: the arrays of the run, with values of each body.
+    - `arrays_of_bodies`: the arrays of a `Run`, in which each body has values of its own.
 
     **Returns** four things: the method for bodies, whose `halt` and `control` already hold the
-    constants; the run, to which the states of controller and progress meter belong; the layout of
-    the constants; and the constants without these states.
+    constants; the run, which now holds the states of controller and progress meter; the layout of
+    the remaining constants; and these constants, from which the states were removed.
     """
     run_tree, state_tree = trees
     run, count = run_tree.unflatten(arrays_of_bodies), len(constants) - state_tree.num_leaves
@@ -169,10 +174,10 @@ def _run_bodies(
     - `method`: the explicit method of one body, with the field and the step control.
     - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
       progress meter.
-    - `layout`: which arrays have a last axis of bodies.
+    - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
-    - `arrays_of_bodies`: the arrays of the run, with values of each body.
+    - `arrays_of_bodies`: the arrays of a `Run`, in which each body has values of its own.
 
     **Returns** a list of arrays: the states at the saved times; the state of the loop at the end;
     and, if `return_record` is true, the record of the steps.
@@ -215,15 +220,15 @@ def _unpack_recorded_run(
     - `method`: the explicit method of one body, with the field and the step control.
     - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
       progress meter.
-    - `layout`: which arrays have a last axis of bodies.
+    - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
     - `arrays_of_bodies`: a list of the arrays of the run, then those of its record, then, in
       forward mode, the tangents of the inputs or, in reverse mode, the cotangents of the results.
 
     **Returns** five things: the method for bodies; the constants; the run; its record; and the
-    tangents or cotangents. The returned constants are only the constants that have a tangent, with
-    one copy for each body; the field of the returned method takes these constants alone.
+    tangents or cotangents. Only the constants that have a tangent are returned, with one copy for
+    each body; the field of the returned method takes only these constants.
     """
     whole = trees[0].num_leaves
     one = method.field
@@ -265,8 +270,9 @@ def _tangents_of_states(
     - `method`: the explicit method of one body, with the field and the step control.
     - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
       progress meter.
-    - `layout`: which arrays have a last axis of bodies.
-    - `constants`: the arrays that the functions of the method hold.
+    - `layout`: which arrays have a last axis that runs over the bodies.
+    - `constants`: the arrays that the functions of the method hold, then the states of controller
+      and progress meter at the start.
     - `arrays_of_bodies`: the arrays of the run, then those of its record, then the tangents of
       the constants and arrays that `has_tangent` selects.
     """
@@ -302,8 +308,9 @@ def _cotangents_of_inputs(
     - `method`: the explicit method of one body, with the field and the step control.
     - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
       progress meter.
-    - `layout`: which arrays have a last axis of bodies.
-    - `constants`: the arrays that the functions of the method hold.
+    - `layout`: which arrays have a last axis that runs over the bodies.
+    - `constants`: the arrays that the functions of the method hold, then the states of controller
+      and progress meter at the start.
     - `arrays_of_bodies`: the arrays of the run, then those of its record, then two cotangents:
       that of the states at the saved times, and that of the state at the end of the run.
     """

@@ -1,4 +1,7 @@
-"""Define an adjoint for diffrax, which runs the explicit methods of this package for any field."""
+"""Define `ReplayAdjoint`, by which diffrax runs the explicit methods of this package.
+
+It takes any vector field.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -35,21 +38,24 @@ _SLIVER = 100
 
 
 class ReplayAdjoint(dfx.AbstractAdjoint):
-    """Run `diffrax.diffeqsolve` on records of its steps, with derivatives in both modes.
+    """Run `diffrax.diffeqsolve`, record its steps, and repeat the recorded steps in derivatives.
 
     It runs any vector field under the explicit methods of `rigidjax.solvers`. The steps are those
-    that the controller asks for. Derivatives repeat the recorded steps, and hold the lengths of the
-    steps constant. `jax.grad`, `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over reverse)
-    work with respect to all inputs: the field and the arrays that it closes over, `args`, the
-    start, t0, t1, the saved times and the `jump_ts` of a `diffrax.ClipStepSizeController`. Under
-    `jax.vmap` the bodies are in the last axis of all arrays of a step, which makes batches several
-    times faster on CPU.
+    that the step controller chooses. Derivatives in forward and reverse mode hold the lengths of
+    the steps constant. `jax.grad`, `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over
+    reverse) work with respect to all inputs: the arrays that the field closes over, `args`, the
+    state at the start, t0, t1, the saved times and the `jump_ts` of a
+    `diffrax.ClipStepSizeController`. Under `jax.vmap` the bodies are in the last axis of all arrays
+    of a step, which makes batches several times faster on CPU.
 
-    **Arguments:** `otherwise` is the adjoint that is used instead for any run that `ReplayAdjoint`
-    cannot do: a run with another solver, `max_steps=None`, `SaveAt(dense=True)` or
-    `SaveAt(steps=…)`; a run with an event whose time is to be found (with a `root_finder`, a real
-    number, or several conditions); and a run whose state has complex numbers or several dtypes. A
-    boolean event without a `root_finder` ends a run under `ReplayAdjoint` itself.
+    **Arguments:** `otherwise` is another adjoint, which is used for any run that `ReplayAdjoint`
+    cannot do:
+
+    - a run with a solver that is no explicit method of `rigidjax.solvers`;
+    - a run with `max_steps=None`, `SaveAt(dense=True)` or `SaveAt(steps=…)`;
+    - a run with an event that has a `root_finder`, a real number as its condition, or several
+      conditions (`ReplayAdjoint` can end a run only by one boolean condition);
+    - a run whose state has complex numbers or several dtypes.
 
     **Raises:** `TypeError` for `jax.grad` of a `jax.grad`: second derivatives are forward over
     reverse.
@@ -125,7 +131,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             t0, _times_where_steps_end(controlled_by, t0, t1), between, y0,
             lax.stop_gradient(first), None if event is None else init_state.result,
         )  # fmt: skip
-        # The condition and the controller, which can end a run, have no derivative.
+        # The condition that ends a run has no derivative, nor has the controller.
         smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
         ys, end = run_with_replayed_derivatives(method, smooth, constants, state, run)
         if order is not None:
@@ -138,20 +144,22 @@ class _Control(NamedTuple):
     """Choose whether an attempted step is accepted, and at which time the next step ends.
 
     It is called for one body. It holds a step controller of diffrax, which decides, and a progress
-    meter, which shows how far the run is.
+    meter, which shows how much of the run is done.
     """
 
-    static: Any  # controller, progress meter and `args`, without their arrays
-    arrays: Callable[[Arrays], Any]  # selects these arrays from the constants of the run
-    tree: Callable[[Array], Any]  # makes the argument of the controller from a vector of numbers
+    static: Any  # controller, progress meter and `args`, without the arrays in them
+    # Selects the arrays of controller, progress meter and `args` from the constants of the run.
+    arrays: Callable[[Arrays], Any]
+    # Makes the state that the controller takes from the vector of the numbers of the state.
+    tree: Callable[[Array], Any]
     order: Any  # the order of the error of a step
 
     def __call__(self, again: bool, constants: Arrays, given: Any, numbers: Any) -> Any:
         """Return the decision of the controller on an attempted step.
 
-        **Returns** five things: whether the step is accepted; the time after the attempt; the time
-        at which the next step is to end; the new states of controller and progress meter; and the
-        result of the run so far.
+        **Returns** five things: whether the step is accepted; the times at which the next step
+        begins and ends; the new states of controller and progress meter; and the result of the run
+        so far.
 
         **Arguments:**
 
@@ -188,11 +196,11 @@ def _can_be_replayed(
     max_steps: int | None,
     state: Any,
 ) -> bool:
-    """Return whether `ReplayAdjoint` itself can do a run; if not, its `otherwise` does the run.
+    """Return whether `ReplayAdjoint` can do a run without its other adjoint, `otherwise`.
 
     It can do a run of an explicit method of this package with a largest number of steps, on a state
-    of one floating-point dtype. It cannot save dense output or every step, and an event must be one
-    condition with truth values that is not refined by a root finder.
+    of one floating-point dtype. It cannot save dense output or every step. An event must have one
+    condition that returns a truth value, and no root finder.
 
     The arguments are those of `diffrax.diffeqsolve`: the `solver`, what is saved (`saveat`), the
     `event` or `None`, and the largest number of steps (`max_steps`) or `None`. `state` is the state
@@ -211,7 +219,7 @@ def _can_be_replayed(
 def _sub_save_ats(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
     """Return a list of the `diffrax.SubSaveAt`s of a `diffrax.SaveAt`.
 
-    Each of them says at which times, and which function of the state, is saved.
+    Each of them says which function of the state is saved, and at which times.
     """
     is_sub = lambda s: isinstance(s, dfx.SubSaveAt)  # noqa: E731
     return [s for s in jax.tree.leaves(saveat.subs, is_leaf=is_sub) if is_sub(s)]
@@ -229,12 +237,14 @@ def _nested_controllers(
 
 
 def _times_where_steps_end(controllers: list[Any], t0: Array, t1: Array) -> Array:
-    """Return in increasing order the times at which steps end, s: those of jumps, and then t1.
+    """Return in increasing order the times at which steps end, s: the times of jumps, and then t1.
 
-    The times at which the field jumps are held by the step `controllers`. `t0` and `t1` are the
-    times at which the run begins and ends. If a `diffrax.ClipStepSizeController` holds a jump that
-    is not after t0, or that is after t1, no step has to end there: the jump is replaced by t0, so
-    that the array keeps its length.
+    - `controllers`: step controllers. The controllers `Stopping` and
+      `diffrax.ClipStepSizeController` hold times at which the field jumps.
+    - `t0`, `t1`: the times at which the run begins and ends, s.
+
+    If a jump of a `ClipStepSizeController` is at or before t0, or after t1, no step has to end at
+    this jump. Its time is replaced by t0, so that the array keeps its length.
     """
     jumps = [c.stops for c in controllers if type(c) is Stopping]
     for c in controllers:
@@ -259,7 +269,8 @@ def _final_diffeqsolve_state(
     - `state`: the state of `diffeqsolve` at the start.
     - `saveat`, `event`, `args`: the arguments of `diffeqsolve` with these names.
     - `make_state`: a function that makes a state of the motion from its n numbers.
-    - `run`: the start of the run, and its stops: the times at which the field jumps, and the end.
+    - `run`: the arrays of the run, among them the time and the state at the start, and the times at
+      which steps end.
     - `saved_times`: (K,) s, the K saved times, those of all `diffrax.SubSaveAt`s joined.
     - `ys`: (K, n) the states, of n numbers each, at the saved times; NaN at times that the run did
       not reach.

@@ -52,9 +52,10 @@ _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 class ClosedFormRun(eqx.Module):
-    """Hold the set-up of a run of a free body in closed form: all but the start and the times.
+    """Hold the set-up of a run of a free body in closed form.
 
-    The cost of a state is the same at any time of the run.
+    The state at the start and the saved times are not part of the set-up. To compute a state takes
+    equally long at any time of the run.
     """
 
     body: Inertia | MassProperties
@@ -63,9 +64,10 @@ class ClosedFormRun(eqx.Module):
 
 
 class DiffraxRun(eqx.Module):
-    """Hold the set-up of a run by diffrax: everything but the start and the times.
+    """Hold the set-up of a run by diffrax.
 
-    The fields without a comment are the arguments of `simulate` with the same names.
+    The state at the start and the saved times are not part of the set-up. The fields without a
+    comment are the arguments of `simulate` with the same names.
     """
 
     body: Inertia | MassProperties | None
@@ -90,8 +92,8 @@ class DiffraxRun(eqx.Module):
         If so, the run uses the time s = σt, which increases along the run: σ is 1, or −1 in a run
         backwards in the time t.
         """
-        # These solvers read attributes of the vector field, which therefore cannot be replaced by a
-        # traced program.
+        # `Magnus4`, `FreeSolver` and the splittings read attributes of the vector field. The field
+        # can therefore not be replaced by a traced program.
         solver = self.solver.solver if isinstance(self.solver, Projected) else self.solver
         reads_field = isinstance(solver, AbstractSplitting | Magnus4 | FreeSolver)
         return self.controller is None and not reads_field
@@ -107,7 +109,10 @@ class DiffraxRun(eqx.Module):
         return explicit and self.controller is None and isinstance(self.adjoint, ReplayAdjoint)
 
     def step_controller(self) -> dfx.AbstractStepSizeController:
-        """Return the step controller, which also ends a run that cannot continue."""
+        """Return the step controller of the run.
+
+        An adaptive controller is wrapped, so that it also ends a run that cannot continue.
+        """
         control = self.controller
         if control is None:
             control = StandardController(self.rtol, self.atol, self.max_step)
@@ -182,18 +187,21 @@ def convert_to_forward_time(
 ) -> tuple[Callable[..., Any], Any, Array, list[Array]]:
     """Convert a run backwards in time to a run forwards in time, which uses the time s = σt.
 
+    All times are in seconds.
+
     **Arguments:**
 
-    - `sign`: σ, 1 or −1 such that s increases along the run; `None` stands for 1.
+    - `sign`: σ, 1 or −1, chosen so that s increases along the run; `None` stands for 1.
     - `field`: the vector field `f(t, y, args)`.
-    - `condition`: a function `(t, y)` that says whether the run ends, or `None`.
-    - `ts`: (T,) the saved times t, s.
+    - `condition`: a function `(t, y)` that returns whether the run ends at the time t, or `None`.
+    - `ts`: (T,) the saved times, values of t.
 
     **Returns** four things: the field as a function `(s, y, sides)`; the condition as a function
-    `(s, y)`, or `None`; the saved times s; and a list with the jump times s of each part of the
-    field that jumps in time. The argument `sides` is a list with one array for each part that
-    jumps: the values of s at which steps end, which may differ from the jump times by some units of
-    round-off; `None` says that steps end exactly at the jump times.
+    `(s, y)`, or `None`; the saved times, values of s; and a list with the jump times, values of s,
+    of each part of the field that jumps in time. The argument `sides` is a list with one array for
+    each part that jumps: the values of s at which steps end because of the jumps of this part. They
+    may differ from the jump times by some units of round-off. If `sides` is `None`, steps end
+    exactly at the jump times.
     """
     time = partial(_multiply_by_direction, sign)
 
@@ -213,10 +221,13 @@ def solve(
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     """Compute the motion of one body from the state `state0`, at the times `ts` (T,), s.
 
-    `setup` holds the body, the torque and how the motion is solved. **Returns** three things: the
-    states at `ts`, with a leading time axis, NaN at times that the run did not reach; the dict
-    `Solution.stats` with the numbers of steps; and the result of diffrax, which says whether the
-    run reached the end, or why not.
+    `setup` holds the body, the torque and the way in which the motion is solved.
+
+    **Returns** three things:
+
+    - the states at `ts`, with a leading time axis; NaN at times that the run did not reach;
+    - the dict with the numbers of steps, which becomes the `stats` of the `Solution`;
+    - the result of diffrax, which says that the run reached the last time, or why it did not.
     """
     # One `jit` encloses everything, because a single operation outside of `jit` takes as long as a
     # hundred steps.
@@ -224,7 +235,7 @@ def solve(
     if isinstance(setup, ClosedFormRun):
         ys, stats, result = _solve_in_closed_form(setup, state0, ts)
     else:
-        # If the torque has states of its own, they are integrated together with the body's.
+        # If the torque has states of its own, they are integrated together with that of the body.
         state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
         scene: Any = scene_of_force(setup.torque) if isinstance(state0, Point) else None
         watch = Ends(scene) if hasattr(scene, "ends") else None
@@ -306,9 +317,10 @@ _NONFINITE_WORDS = (
 
 
 def _message_of_too_short_step(time_dtype: Any) -> str:
-    """Return the message of the error for a run that wanted a step shorter than time resolves.
+    """Return the error message for a run that needs a step too short for the precision of the time.
 
-    `time_dtype` is the dtype of the times, which sets the shortest step; the message names it.
+    `time_dtype` is the dtype of the times, which sets the shortest step; the message names this
+    dtype.
     """
     gap = np.spacing(np.asarray(1e9, time_dtype))
     return (
@@ -319,10 +331,10 @@ def _message_of_too_short_step(time_dtype: Any) -> str:
 
 
 def raise_unless_complete(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
-    """Return the states `ys` of a run; raise an error with a readable message if it ended early.
+    """Return the states `ys` of a run; raise a readable error if the run ended early.
 
-    `result` is the result of diffrax, which says why the run ended; `torque` is the torque, which
-    decides on the advice in the message. The end by an event is no error.
+    `result` is the result of diffrax, which says why the run ended. `torque` is the torque of the
+    run, on which the advice in the message depends. A run that an event ended raises no error.
     """
     if changing_inertia_of_torque(torque) is not None:
         ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
@@ -382,7 +394,7 @@ def _rerun_and_return_end(
     return *end, stats["num_steps"]
 
 
-# If the next step is shorter than this part of the mean step, the run makes no more progress.
+# If the next step is shorter than this fraction of the mean step, the run makes no more progress.
 _STUCK = 1e-2
 
 
@@ -391,9 +403,12 @@ def explain_max_steps_error(
 ) -> RuntimeError:
     """Return the error of a failed run, with a better message if the run used up all its steps.
 
-    The message then says which time was reached, and why. `setup` holds the body, the torque and
-    the solver of the run, `state0` is its state at the start, `ts` (T,), s, are its saved times,
-    and `error` is the error that the run raised.
+    The better message says which time the run reached, and why it came no further.
+
+    - `setup`: the body, the torque and the solver of the run.
+    - `state0`: the state at the start of the run.
+    - `ts`: (T,) s, the saved times of the run.
+    - `error`: the error that the run raised.
     """
     if _MANY_STEPS not in str(error) or not isinstance(setup, DiffraxRun):
         return error
@@ -453,8 +468,8 @@ def raise_if_scene_ended_run(scene: Any, ys: Any, stats: dict[str, Any], ts: Arr
     - `scene`: the scene of the particle; its method `end_words(t, state)` gives the sentence of the
       message that says why the run ended.
     - `ys`: the states at the saved times, which are returned.
-    - `stats`: a dict with `ended` (whether the scene ended the run), `end_time`, s, and
-      `end_state`.
+    - `stats`: a dict with three items: `ended` is whether the scene ended the run; `end_time`, s,
+      and `end_state` are the time and the state at which it ended the run.
     - `ts`: (T,) s, the saved times.
     """
     ended, advice = stats["ended"], "; give throw=False to keep what came before it"

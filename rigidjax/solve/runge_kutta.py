@@ -34,29 +34,29 @@ class Step(NamedTuple):
 
 
 class Stages(NamedTuple):
-    """Hold the s stages of a step and the state at its end; a slope is a value of the field."""
+    """Hold the s stages of a step, and the state at the end of the step."""
 
-    times: Array  # (s, *bodies) s
+    times: Array  # (s, *bodies) the times of the stages, in seconds
     places: Array  # (n, s, *bodies) the states at which the field is evaluated
-    slopes: Array  # (n, s, *bodies)
+    slopes: Array  # (n, s, *bodies) the values dy/dt of the field at the stages
     end: Array  # (n, *bodies) the state at the end of the step
-    number: Any  # the number of stages that were computed
+    number: Any  # how many of the stages were computed
 
 
 class Weights(NamedTuple):
     """Hold the numbers of a Runge–Kutta method as arrays over its s stages.
 
-    First come the stages of a step, then those that only dense output needs, which is the state at
-    any time within the step.
+    The stages of a step come first, then the stages that only dense output needs. Dense output is
+    the state at any time within the step.
     """
 
     a: Array  # (s, s) the weights of the slopes in the state of each stage
     b: Array  # (s,) the weights of the slopes in the state at the end of the step
     c: Array  # (s,) the times of the stages, from 0 at the start of the step to 1 at its end
     last: Array  # (s,) whether c is 1
-    dense: Array  # (r, s) the rows of dense output
+    dense: Array  # (r, s) the weights of the slopes in the r coefficients of dense output
     errors: Array  # (1 or 2, s) the weights of the slopes in the estimates of the error
-    plain: int  # the number of stages of a step without dense output
+    plain: int  # how many stages a step without dense output has
 
 
 def arrays_of_tableau(tableau: Tableau, dtype: Any) -> Weights:
@@ -77,10 +77,11 @@ def arrays_of_tableau(tableau: Tableau, dtype: Any) -> Weights:
 
 
 def _weighted_sum_of_slopes(weights: Array, slopes: Array) -> Array:
-    """Return the weighted sum Σ w_i k_i of the slopes of a step over its s stages i, (n, …).
+    """Return the weighted sum Σ w_i k_i of the slopes k_i at all stages i of a step, (n, …).
 
-    `slopes` (n, s, …) are the slopes k_i = dy/dt, the n values of the field at each stage;
-    `weights` are the w_i. If there are fewer slopes than weights, the last weights are left out.
+    `slopes` (n, s, …) are the slopes at s stages. A slope is dy/dt, the n values of the field at a
+    stage. `weights` are the w_i. If there are fewer slopes than weights, the last weights are left
+    out.
     """
     weights = weights[: slopes.shape[1]]
     return jnp.sum(weights.reshape(1, -1, *[1] * (slopes.ndim - 2)) * slopes, 1)
@@ -97,8 +98,9 @@ def stages(
     - `field`: the vector field `(constants, t, y)`, and `constants` the list of its arrays.
     - `step`: the times, the length and the state (n, *bodies) at the start of the step.
     - `dense`: whether the stages for dense output (the state within the step) are computed, too. If
-      it is traced and false, the arrays have places for these stages: the time and state in these
-      places are those at the start of the step, and the slopes are 0.
+      `dense` is a traced truth value, the arrays have places for these stages in any case. If its
+      value is false, these places hold the time and the state at the start of the step, and 0 as
+      the slope.
 
     The quaternion of the state at the end is not scaled to length 1.
     """
@@ -149,9 +151,9 @@ def _stage(
 def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
     """Return the coefficients of dense output within a step of one body, as rows (r, n).
 
-    Dense output is the state of n numbers at any time within the step; `change_within_step`
-    computes it from these r rows F0, F1, …. The length of the step is already multiplied into the
-    rows.
+    Dense output is the state, n numbers, at any time within the step. `change_within_step` computes
+    its change since the start of the step from the r rows F0, F1, …. The rows already contain the
+    length of the step as a factor.
 
     - `tableau`: the numbers of the method.
     - `field`: the vector field `(constants, t, y)`, which is called with no constants.
@@ -172,9 +174,10 @@ def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Arr
 def change_within_step(theta: Array, rows: Array) -> Array:
     """Return the change of the state since the start of a step, at a time within the step.
 
-    It is θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))), where `theta` is θ, the part of the step
-    that has passed, from 0 to 1, and `rows` are F0, F1, …. The sum of this value and the state at
-    the start of the step is dense output: Hairer, Nørsett and Wanner (1993), II.6.
+    The change is θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))). Here `theta` is θ, the fraction of
+    the step that has passed, from 0 to 1, and `rows` are F0, F1, …. The state at the start of the
+    step plus this change is the state at the time within the step. Source: Hairer, Nørsett and
+    Wanner (1993), II.6.
     """
     total = jnp.zeros((), rows.dtype)
     for i in reversed(range(rows.shape[0])):
@@ -185,11 +188,14 @@ def change_within_step(theta: Array, rows: Array) -> Array:
 def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) -> Array:
     """Return an estimate of the error of each number of the state after a step, (n, *bodies).
 
-    `tableau` holds the numbers of the method; `h` (*bodies) is the length of the step, s; `slopes`
-    (n, s, *bodies) are the slopes at its s stages. If the tableau has two estimates, e5 of order 5
-    and e3 of order 3, they are combined to e5 |e5|/√(|e5|² + 0.01 |e3|²), which falls as h⁸ with
-    the length h of the step (Hairer, Nørsett and Wanner 1993, II.10). The norms |e5| and |e3| are
-    taken over each array of the state alone; `sizes` are the sizes of these arrays.
+    - `tableau`: the numbers of the method.
+    - `sizes`: how many numbers each array of the state has.
+    - `h`: (*bodies) the length of the step, in seconds.
+    - `slopes`: (n, s, *bodies) the slopes at the s stages of the step.
+
+    If the tableau has two estimates, e5 of order 5 and e3 of order 3, they are combined to
+    e5 |e5|/√(|e5|² + 0.01 |e3|²), which is proportional to h⁸ for short steps (Hairer, Nørsett and
+    Wanner 1993, II.10). The norms |e5| and |e3| are taken over each array of the state separately.
     """
     dtype, ones = slopes.dtype, [1] * (slopes.ndim - 2)
     # All sums over stages are computed in one operation, because for one body each separate sum

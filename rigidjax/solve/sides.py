@@ -2,8 +2,8 @@
 
 Steps end at stops, the times at which a part of the torque jumps. If two parts jump at the same
 time, two stops are made, one slightly after the other. In the short step between the two stops, the
-first part has its value after the jump, and the second part its value before the jump. The
-derivatives with respect to the two jump times are then separate.
+part with the earlier stop has its value after the jump, and the part with the later stop its value
+before the jump. The derivatives with respect to the two jump times are then separate.
 """
 
 from typing import Any
@@ -30,12 +30,15 @@ _CONSTANT_PIECES = (Held, Pulses)
 class Sided(eqx.Module):
     """Evaluate a torque law on the correct side of its jumps in time.
 
-    A step that ends at a jump needs the value before the jump; a step that begins there needs the
-    value after it. `law` is the law, which is called with the time and, for a torque, with the
-    state and the body. `jumps` (n,), s, are the times at which the law jumps. `stops` (n,), s, are
-    the times at which steps end for these jumps, at most some units of round-off later or earlier;
-    `None` says that the stops are equal to the jumps. `sign` is the direction of time: 1, −1 in a
-    run backwards, or `None` for 1.
+    A step that ends at a jump needs the value of the law before the jump. A step that begins at a
+    jump needs the value after the jump.
+
+    - `law`: the law, which is called with the time and, if it is a torque, with the state and the
+      body.
+    - `jumps`: (n,) s, the times at which the law jumps.
+    - `stops`: (n,) s, the times at which steps end because of these jumps. They differ from the
+      jumps by at most some units of round-off; `None` says that they are equal to the jumps.
+    - `sign`: the direction of time: 1, −1 in a run backwards, or `None` for 1.
     """
 
     law: Any
@@ -62,7 +65,8 @@ class Sided(eqx.Module):
     def time_on_correct_side(self, t: Any) -> Any:
         """Return the time, s, with which the law is called at the time `t` of the run, s.
 
-        It is `t`, or the nearest time on the correct side of a jump.
+        It is `t` itself, unless `t` is on the wrong side of a jump. In this case it is the nearest
+        time on the correct side of the jump.
         """
         if self.sign is None and self.stops is None:
             return t
@@ -102,11 +106,12 @@ class Constant(eqx.Module):
 
 
 def hold_piecewise_constant_laws_at(field: Any, time: Array) -> Any:
-    """Return the field with each law of constant pieces (`Held`, `Pulses`) constant at its value at
-    `time`, s.
+    """Return a vector field in which each law of constant pieces keeps its value at `time`, s.
 
-    The returned field depends on time only through laws that may change between their jumps. A
-    straight line (`Linear`) is one of them: a law may be a short pulse as a function of its value.
+    Laws of constant pieces are `Held` and `Pulses`, which are constant between their jumps. The
+    returned field depends on time only through laws that change between their jumps. `Linear`,
+    whose pieces are straight lines, stays as it is: another law may read the value of a `Linear`,
+    and may give a short pulse while this value passes through a small range.
     """
     has_pieces = lambda node: isinstance(node, _CONSTANT_PIECES)  # noqa: E731
     constant = lambda node: Constant(node, time) if has_pieces(node) else node  # noqa: E731
@@ -116,9 +121,10 @@ def hold_piecewise_constant_laws_at(field: Any, time: Array) -> Any:
 def _declares_jumps(node: Any) -> bool:
     """Return whether a part of a vector field is a law that declares that it jumps in time.
 
-    A law is a torque, or a function of time, in the field. `node` is any part of the tree of the
-    field. A law of this package declares jumps if its class can jump by itself and it has at least
-    one jump time; a law of a user does if it has the member `jump_times`, even if that is empty.
+    `node` is any part of the tree of the field. A law is a torque, or a function of time, in the
+    field. A law of this package declares jumps if its class has jumps of its own (not only those of
+    a law inside it) and the law has at least one jump time. A law that a user has written declares
+    jumps if it has the member `jump_times`, even if this array is empty.
     """
     if isinstance(node, type) or not hasattr(node, "jump_times"):
         return False
@@ -130,7 +136,8 @@ def _declares_jumps(node: Any) -> bool:
 def declared_jumps(field: Any) -> list[Array]:
     """Return a list with the jump times, s, of each part of a vector field that jumps in time.
 
-    `field` is the vector field, a tree of which these parts are torque laws or functions of time.
+    `field` is the vector field, a tree whose parts may be torque laws or functions of time. A part
+    without jump times has no entry in the list.
     """
     parts = filter(_declares_jumps, jax.tree.leaves(field, is_leaf=_declares_jumps))
     return [jumps for part in parts if (jumps := jnp.asarray(jump_times_of(part))).shape[0]]
@@ -141,10 +148,14 @@ def evaluate_on_correct_sides(
 ) -> Any:
     """Return a vector field in which each part is evaluated on the correct side of its jumps.
 
-    Each part of `field` that declares jumps in time is wrapped in a `Sided` law. `sign` is the
-    direction of time: 1, −1 in a run backwards, or `None` for 1. `stop_times` is a list with one
-    array for each part that has jumps, in the order of `declared_jumps`: the times, s, at which
-    steps end for these jumps. `None` says that these times are equal to the jumps.
+    Each part that declares jumps in time is wrapped in a `Sided` law, unless it has states of its
+    own.
+
+    - `field`: the vector field, a tree of parts.
+    - `sign`: the direction of time: 1, −1 in a run backwards, or `None` for 1.
+    - `stop_times`: a list with one array for each part that has jumps, in the order of
+      `declared_jumps`: the times, s, at which steps end because this part jumps. `None` says that
+      steps end exactly at the jump times.
     """
     stops = iter(stop_times or ())
 

@@ -45,7 +45,7 @@ _EITHER_MODE = (type(None), dfx.ForwardMode, dfx.RecursiveCheckpointAdjoint)
 # When reverse mode repeats a step, the step may be rounded differently. At a tolerance below
 # `_TIGHT`, close to round-off, the length of the step then differs, too: at a tolerance of 1e-13
 # this changed a gradient by 2e-4 of its value. With 4096 checkpoints the start of every step is
-# stored, except in longer runs.
+# stored, except in runs of more than 4096 steps.
 _TIGHT, _EVERY_STEP = 1e-10, dfx.RecursiveCheckpointAdjoint(checkpoints=4096)
 
 
@@ -85,10 +85,10 @@ def simulate(
       (`jump_times`). Steps also end where it compares the time with a value that no state changes
       (`jnp.where(t < te, …)`): these times are found before the run, and have derivatives. Steps do
       not end where the torque switches by the state, and the derivative of such a switch is lost:
-      end the run there by an `event`, and begin another one. The states of a torque's own
-      (`rigidjax.torques.AbstractTorque`) are in `own` of the solution. For a `Point` the torque is
-      a scene of `rigidjax.scenes`, a `MovingFrame`, or a force per mass `(t, state, None) → (3,)`,
-      m/s².
+      end the run there by an `event`, and begin another one. If a torque has states of its own
+      (`rigidjax.torques.AbstractTorque`), they are in `own` of the solution. For a `Point` the
+      torque is a scene of `rigidjax.scenes`, a `MovingFrame`, or a force per mass
+      `(t, state, None) → (3,)`, m/s².
     - `solver`: any `diffrax.AbstractSolver`; a wrapper keeps attitudes unit quaternions, at every
       step and every saved time. `None` is the cheapest accurate choice, for any number of saved
       times: the closed form (`rigidjax.exact`) for a free body, else
@@ -101,15 +101,16 @@ def simulate(
       and other values do not compile again. Scale `atol` to the smallest number that matters. The
       closed form uses neither.
     - `accuracy`: how far the states may be from the exact motion, given in the place of tolerances.
-      For rotations it is an angle, rad; for all else it is relative to the largest value in the
-      run. Two or more cheap runs find the tolerance. `sol.error` is then known without more runs.
-      If `sol.error` exceeds the accuracy (chaos, round-off), a `UserWarning` says from which time
-      on; under `jit` look at `sol.error.relative`.
-    - `dt0`, `stepsize_controller`: the first step, s, and the step controller, if the tolerances
-      are not enough: `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`, for example.
-    - `max_step`: the longest step, s. Steps could pass over a short event in a law, such as a
-      smooth bump or a switch by the state: give half of the shortest one. The closed form takes no
-      steps; a `stepsize_controller` has its own limit.
+      For a rotation it is an angle, rad; for any other array of the state it is relative to the
+      largest length of this array in the run. Two or more cheap runs find the tolerance. The
+      `error` of the solution is then known without more runs. If it exceeds the accuracy (chaos,
+      round-off), a `UserWarning` says from which time on; under `jit` look at `error.relative`.
+    - `dt0`: the length of the first step, s. With `None` it is chosen by the tolerances.
+    - `stepsize_controller`: a step controller of diffrax in the place of tolerances. Fixed steps of
+      0.01 s, for example, are `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
+    - `max_step`: the longest step, s. Steps could pass over a short change in a torque, such as a
+      smooth bump or a switch by the state: give half of the length of the shortest one. The closed
+      form takes no steps; a `stepsize_controller` has its own limit.
     - `adjoint`: how derivatives are taken, as in diffrax. For the explicit methods of
       `rigidjax.solvers` the default `None` is `rigidjax.solvers.ReplayAdjoint()`: `jax.grad`,
       `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over reverse) work, as in closed form,
@@ -118,20 +119,21 @@ def simulate(
       known to be below 1e-10. With these solvers give `diffrax.ForwardMode()` for `jax.jacfwd`. If
       you need only `jax.jacfwd` of a body, `diffrax.ForwardMode()` is faster than the default; it
       is not faster for a particle with few saved times.
-    - `event`: a condition `(t, state, body) → scalar`, or an `Event` of one: the run ends at its
-      first zero. `event_time` and `event_state` of the solution are exact to the tolerances, and
-      have first and second derivatives with respect to all numbers, also those of the condition;
-      later `ys` are NaN, and `result` is `event_occurred`. If the condition has no zero,
-      `event_time` and `event_state` are NaN and the run goes to its end. Events are for the closed
-      form and the explicit methods of `rigidjax.solvers`; with a solver of diffrax, call
-      `diffrax.diffeqsolve` with a `diffrax.Event`.
+    - `event`: a condition `(t, state, body) → scalar`, or an `Event` with such a condition. The run
+      ends at the first zero of the condition. `event_time` and `event_state` of the solution are
+      accurate to the tolerances, and have first and second derivatives with respect to all numbers,
+      also the numbers in the condition. The states `ys` at times after the event are NaN, and
+      `result` is `event_occurred`. If the condition has no zero, `event_time` and `event_state` are
+      NaN, and the run goes to its end. Events are for the closed form and the explicit methods of
+      `rigidjax.solvers`; with a solver of diffrax, call `diffrax.diffeqsolve` with a
+      `diffrax.Event`.
     - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
-    - `throw`: whether a run that fails raises an error. With `False` nothing in a run, and no bad
-      start in a batch, raises one: `result` gives the reason; the states that are not reached are
-      NaN, as are their derivatives; and the other bodies of a batch get the same bits as without
-      the bad one. The motion of an invalid traced body (with a mass that is not positive, or
-      moments of no real body) is NaN, and its `result` is `nonfinite_input`. Known wrong numbers
-      are refused in any case.
+    - `throw`: whether a run that fails raises an error. With `False` neither a failed run nor a bad
+      start in a batch raises an error, and `result` gives the reason. The states that the run did
+      not reach are NaN, as are their derivatives. The other bodies of a batch get the same bits as
+      without the body that failed. The motion of an invalid traced body (with a mass that is not
+      positive, or moments of no real body) is NaN, and its `result` is `nonfinite_input`. Wrong
+      numbers that are not traced raise an error in any case.
 
     **Returns** a `Solution`. A second call with other numbers of the same shapes does not compile
     again. Source: the equations of Newton and Euler (notes, eqs 50, 79, 84).
@@ -203,10 +205,13 @@ def _solver_of_run(
 ) -> dfx.AbstractSolver:
     """Return the solver that a run uses, one that keeps attitudes unit quaternions.
 
-    If `solver` is `None`, the fastest solver is returned that works with the other three arguments:
-    `adjoint`, how derivatives are taken, or `None` for the default; `event`, a condition at whose
-    first zero the run ends, or `None`; and `max_steps`, the largest number of steps, or `None` for
-    no limit. A solver of diffrax is wrapped, so that each step scales its quaternion to length 1.
+    If `solver` is `None`, the result is the fastest solver that works with the other arguments. A
+    solver of diffrax is wrapped, so that each step scales the quaternion of the state to length 1.
+
+    - `solver`: the solver that the user gave, or `None`.
+    - `adjoint`: how derivatives are taken; `None` is the default way.
+    - `event`: a condition at whose first zero the run ends, or `None`.
+    - `max_steps`: the largest number of steps; `None` is no limit.
     """
     if solver is None:
         # If the user asks for forward mode alone, diffrax computes the tangents together with the
@@ -251,11 +256,12 @@ def _solve_to_accuracy(
 
     - `setup`: the body, the torque and the solver of the run.
     - `event`: a condition `(t, state, body) → scalar` at whose first zero the run ends, an `Event`
-      of one, or `None`.
+      with such a condition, or `None`.
     - `state0`: the state at the time `times[0]`.
     - `times`: (T,) s, the times at which states are saved.
-    - `accuracy`: the largest error that is allowed at the saved times: rad for rotations; for any
-      other array of the state, a part of its largest length in the run.
+    - `accuracy`: the largest error that is allowed at the saved times. For a rotation it is an
+      angle, rad; for any other array of the state it is a fraction of the largest length of this
+      array in the run.
     """
     found, run, search = solve_to_accuracy(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
@@ -277,7 +283,7 @@ def _solve_run(
 
     - `setup`: the body, the torque and how the motion is solved, a `ClosedFormRun` or `DiffraxRun`.
     - `event`: a condition `(t, state, body) → scalar` at whose first zero the run ends, an `Event`
-      of one, or `None`.
+      with such a condition, or `None`.
     - `state0`: the state at the time `times[0]`.
     - `times`: (T,) s, the times at which states are saved.
     - `solved_run`: what `solve` returned for this run, if it is already known; else `None`.

@@ -1,4 +1,4 @@
-"""Hold the result of a run; its drift, growth of errors and error are computed when read."""
+"""Hold the result of a run, and compute its drift, error and growth of errors on demand."""
 
 import dataclasses
 import warnings
@@ -41,9 +41,9 @@ class Solution(eqx.Module, Generic[State]):
     - `event_time`, s, and `event_state`: the time and the state at the event. Both are NaN if the
       event did not occur, and `None` if no event was given. The state has the type of `state0`;
       under a law with states of its own it is a `Coupled`.
-    - `own`: a tuple of the states of the laws that have states of their own, each with a leading
-      time axis, or `None`. They are in the order of the laws; a law inside another one comes before
-      it.
+    - `own`: a tuple with the states of each law that has states of its own, with a leading time
+      axis; `None` if no law has any. The order is that of the laws; a law inside another law comes
+      before the outer law.
 
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
     >>> sol = rj.simulate(body, start, [0.0, 1.0, 2.0])
@@ -85,8 +85,9 @@ class Solution(eqx.Module, Generic[State]):
         """Return the drift of each quantity that the motion conserves, relative to its size.
 
         See `rigidjax.drift`. The quantities may be the energy, the angular momentum in the world
-        frame or its component along gravity; the body and its torque decide which there are, and
-        for a `Point` its scene. Zero is best.
+        frame, or the component of the angular momentum along gravity. Which of them the motion
+        conserves depends on the body and the torque or, for a `Point`, on its scene. A drift of
+        zero is best.
         """
         if "drift" in self.stats:
             return self.stats["drift"]
@@ -104,8 +105,8 @@ class Solution(eqx.Module, Generic[State]):
         have no correct digit, and gradients through these states mean nothing: a `UserWarning`
         names the first such time. In this case end the run earlier, or fit shorter recordings.
 
-        Source: the largest finite-time Lyapunov exponent is the logarithm of the growth over t
-        (Eckmann and Ruelle 1985, doi:10.1103/RevModPhys.57.617).
+        Source: the largest finite-time Lyapunov exponent is the logarithm of the growth, divided by
+        t − t₀ (Eckmann and Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
         found = _growth_of_small_errors(self._setup, self.ts, self._states)
         rtol = None
@@ -134,11 +135,12 @@ class Solution(eqx.Module, Generic[State]):
         with changed last digits of body, torque and start (in closed form, also of the times). A
         `UserWarning` names the time after which nothing is known, as in chaos.
 
-        A torque that depends on the time is also sampled at 16 384 times, in each part of the run
-        at one saved state. Adaptive steps of the second run end at a pulse that these samples show;
-        without this both runs might pass over the pulse. Three kinds of pulses are not seen: one
-        between two samples; one that the torque has at other states only; and, under fixed steps,
-        one that falls between their stages.
+        A torque that depends on the time is also sampled, because both runs might pass over a short
+        pulse of the torque. In each of 32 parts of the run it is sampled at 512 times, always at
+        one saved state of this part. If the samples show a pulse, an adaptive step of the second
+        run ends at the pulse. Three kinds of pulses are not seen: a pulse between two samples; a
+        pulse that the torque has at other states only; and, under fixed steps, a pulse between the
+        stages of the steps.
 
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.5, 1.0])
         >>> law = rj.torques.Damping([0.1, 0.1, 0.1])
@@ -154,10 +156,12 @@ class Solution(eqx.Module, Generic[State]):
     def transition_matrix(self) -> Float[Array, "times n n"]:
         """Return ∂ state(t) / ∂ state(t₀) at each of `ts`, on the tangent spaces of the states.
 
-        Rows and columns are small changes of Ω for a `Spin` (n = 3); of δθ, Ω for an `Attitude`
-        (6); of x, v, δθ, Ω for a `Rigid` (12); and of x, v for a `Point` (6). The three numbers δθ,
-        rad, are a turn in body axes, q ⊗ exp(½δθ). The columns are forward-mode derivatives, NaN at
-        times that the run did not reach. The derivatives are those of a run that no event ends.
+        Row i is the change of number i of the state at the time t, and column j is a small change
+        of number j at the start t₀. These numbers are Ω for a `Spin` (n = 3); δθ, Ω for an
+        `Attitude` (n = 6); x, v, δθ, Ω for a `Rigid` (n = 12); and x, v for a `Point` (n = 6). The
+        three numbers δθ, rad, are a small turn in body axes, which changes q to q ⊗ exp(½δθ). The
+        columns are forward-mode derivatives, NaN at times that the run did not reach. If an event
+        ended the run, the derivatives are those of the run without the event.
 
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
         >>> rj.simulate(body, start, [0.0, 2.0]).transition_matrix()[1, 2].tolist()
@@ -191,17 +195,18 @@ class Solution(eqx.Module, Generic[State]):
 
     @property
     def _states(self) -> Any:
-        """Return the states at the saved times, with those of the torque if it has some.
+        """Return the states of the body at the saved times, with the torque's own states, if any.
 
-        A torque with states of its own is, for example, one that follows a filtered signal.
+        A torque that follows a filtered signal, for example, has states of its own.
         """
         return self.ys if self.own is None else Coupled(self.ys, self.own)
 
 
 def store_error_and_warn(sol: Solution, error: Error, accuracy: Any) -> Solution:
-    """Return a solution that stores its known error; warn if the error exceeds the accuracy.
+    """Return the solution `sol` with its `error` stored; warn if the error exceeds the accuracy.
 
-    `accuracy` is the error that the user allows, rad for rotations, else relative.
+    `accuracy` is the error that the user allows. For a rotation it is an angle, rad; for any other
+    array of the state it is a fraction of the largest length of this array in the run.
     """
     _warn_if_error_exceeds(error, accuracy, "simulate: the accuracy cannot be had")
     return dataclasses.replace(sol, _error=error)
@@ -210,8 +215,9 @@ def store_error_and_warn(sol: Solution, error: Error, accuracy: Any) -> Solution
 def _warn_if_error_exceeds(error: Error, limit: Any, message_start: str) -> None:
     """Warn if the error of a run exceeds a limit, and name the first time at which it does.
 
-    `limit` is the largest allowed error: rad for rotations, and for any other array of the state a
-    part of its largest length in the run. `message_start` is the beginning of the message.
+    `limit` is the largest allowed error. For a rotation it is an angle, rad; for any other array of
+    the state it is a fraction of the largest length of this array in the run. `message_start` is
+    the beginning of the message.
     """
     if not _checks.is_known((error, limit)) or not np.any(np.asarray(error.relative) > limit):
         return
@@ -249,9 +255,9 @@ def _transition_matrix(
     """Return the derivatives (T, n, n) of the states at all times with respect to the first state.
 
     `setup` holds the body, the torque and the solver; `ys` are the states at the T times `ts` (T,),
-    s. A small change of a state has n numbers: all its arrays joined, where a rotation vector, rad,
-    stands for the change of a quaternion. A row is one of these numbers at a time, and a column one
-    of them at the start.
+    s. A small change of a state has n numbers: the changes of all its arrays, joined. For a
+    quaternion the change is a rotation vector, rad. A row is one of the n numbers at a saved time,
+    and a column is one of the n numbers at the start.
     """
     # The run must not raise an error, and it must be differentiable in forward mode.
     plain = isinstance(setup, DiffraxRun) and not setup.records_steps_for_derivatives
@@ -269,12 +275,12 @@ def _transition_matrix(
 def _growth_of_small_errors(
     setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any
 ) -> Float[Array, " times"]:
-    """Return by which factor a small error at the start can have grown at each saved time, (T,).
+    """Return the largest factor by which a small error at the start grows until each saved time.
 
-    The factor is the largest singular value of ∂y(t)/∂y(t₀), where t₀ is the start and each array
-    of the state y is divided by its largest length in the run: the growth of the worst error.
-    `setup` holds the body, the torque and the solver; `ys` are the states at the times `ts` (T,),
-    s.
+    The factor is the largest singular value of ∂y(t)/∂y(t₀). Here t₀ is the time at the start, and
+    y is the state, in which each array is divided by its largest length in the run. `setup` holds
+    the body, the torque and the solver; `ys` are the states at the times `ts` (T,), s. The result
+    has one factor for each time, (T,).
     """
     start = jax.tree.map(lambda leaf: leaf[0], ys)
     each = parts_by_name(start, jnp.ones(dimension(start), ts.dtype)).values()

@@ -103,7 +103,8 @@ SRKN11 = _symmetric_composition(
 class PrincipalFrame(NamedTuple):
     """Hold the principal axes of a body, and the inertia and its inverse along these axes.
 
-    In both matrices the off-diagonal entries are zero, but they have tangents that are not zero.
+    The off-diagonal entries of both matrices are zero. Derivatives hold the axes fixed: if the
+    inertia changes, these entries have tangents that are not zero.
     """
 
     moments: SymmetricEntries  # the inertia, kg m²
@@ -112,7 +113,7 @@ class PrincipalFrame(NamedTuple):
 
 
 def principal_frame_of_tensor(tensor: Array) -> PrincipalFrame:
-    """Return the principal axes of a body, with its inertia and the inverse along these axes.
+    """Return the principal axes of a body, and the inertia and its inverse along these axes.
 
     `tensor` (3, 3) is the inertia in body axes, kg m².
     """
@@ -130,8 +131,9 @@ def body_rate_along_axes(inverse: SymmetricEntries, momentum: Triple) -> Triple:
     """Return the body rate Ω = I⁻¹Π along the principal axes, three numbers, rad/s.
 
     `momentum` is Π along these axes, three numbers, N m s. `inverse` has the six entries (11, 22,
-    33, 12, 13, 23) of I⁻¹, the inverse of the inertia. The off-diagonal entries are zero, but they
-    have tangents.
+    33, 12, 13, 23) of I⁻¹, the inverse of the inertia along these axes. The off-diagonal entries
+    are zero, and the value does not use them; but they may have tangents, which the derivative
+    uses.
     """
     return inverse[0] * momentum[0], inverse[1] * momentum[1], inverse[2] * momentum[2]
 
@@ -197,8 +199,9 @@ class Splitting2(AbstractSplitting):
 
     This solver is for long runs with fixed steps, under torques that are small against the free
     motion and depend on time and attitude, not on the body rate. With fixed steps the error of the
-    energy stays bounded; with an adaptive controller it does not. There is no error estimate. The
-    attitudes of dense output are unit quaternions, and are as accurate as the order of the method.
+    energy stays bounded; with an adaptive controller it does not. There is no error estimate.
+    Within a step (dense output) the attitudes are unit quaternions, and are accurate to the order
+    of the method.
 
     Source: Strang's splitting (1968), doi:10.1137/0705041, with the free flow of
     `rigidjax.exact.free_body`.
@@ -215,10 +218,11 @@ class Splitting2(AbstractSplitting):
 
 
 class Splitting4(AbstractSplitting):
-    """Solve the rotation to order 4: a step has seven kicks by the torque and six exact free
-    motions.
+    """Solve the rotation to order 4 by seven kicks and six exact free motions in each step.
 
-    This solver is for long runs with fixed steps, under torques that `Splitting2` can take.
+    A kick is a sudden change of the momentum by the torque. This solver is for long runs with fixed
+    steps, under torques that are small against the free motion and depend on time and attitude, not
+    on the body rate.
 
     Source: Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, method SRKN6b.
 
@@ -230,10 +234,11 @@ class Splitting4(AbstractSplitting):
 
 
 class Splitting6(AbstractSplitting):
-    """Solve the rotation to order 6: a step has twelve kicks by the torque and eleven exact free
-    motions.
+    """Solve the rotation to order 6 by twelve kicks and eleven exact free motions in each step.
 
-    This solver is for long runs with fixed steps, under torques that `Splitting2` can take.
+    A kick is a sudden change of the momentum by the torque. This solver is for long runs with fixed
+    steps, under torques that are small against the free motion and depend on time and attitude, not
+    on the body rate.
 
     Source: Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, method SRKN11b.
 
@@ -245,11 +250,12 @@ class Splitting6(AbstractSplitting):
 
 
 def principal_frame_of_field(field: Any, y0: Any) -> PrincipalFrame:
-    """Return the principal axes of the body of a vector field, with the inertia along them.
+    """Return the principal axes of the body to which a vector field belongs.
 
-    `field` are the equations of an attitude, and `y0` is the `Attitude` at the start, whose dtype
-    the result has. Raise `TypeError` for any other field or state, and for a torque that reads the
-    body rate.
+    The result also holds the inertia and its inverse along these axes. `field` is the vector field,
+    an `AttitudeEquations`, and `y0` is the `Attitude` at the start; the result has the dtype of
+    `y0`. Raise `TypeError` for any other field or state, and for a torque that may read the body
+    rate.
     """
     # If the torque reads the body rate, a kick is no exact flow, and the order would fall to 1.
     torque = require_attitude_equations("Splitting", field, y0, "DormandPrince8").euler.torque
@@ -295,7 +301,7 @@ def change_in_splitting_step(
     - `composition`: the weights of the method.
     - `field`: the equations of the attitude, which hold the torque and the inertia.
     - `frame`: the principal axes of the body, and the inertia along them.
-    - `t`, `h`: the time at the start of the step, and its length, s.
+    - `t`, `h`: the time at the start of the step, s, and the length of the step, s.
     - `state`: the pair of the quaternion q (4,) and the momentum Π at the start; Π is three numbers
       along the principal axes, N m s.
 
@@ -360,8 +366,8 @@ def _quintic_coefficients(
       a run backwards.
     - `y0`, `y1`: the states at the start and at the end of the step.
 
-    **Returns** a tree like the state, whose arrays (5, …) have the five coefficients in the form
-    that `runge_kutta.change_within_step`, which evaluates the polynomial, takes.
+    **Returns** a tree like the state, whose arrays (5, …) hold the five coefficients. The function
+    `runge_kutta.change_within_step` evaluates the polynomial from these coefficients.
     """
     way, length = direction_and_length_of_step(terms, t0, t1)
     h = way * length
@@ -374,8 +380,8 @@ def _quintic_coefficients(
 
     (f0, s0), (f1, s1) = slopes(t0, y0), slopes(t1, y1)
 
-    # In a run backwards in time diffrax uses −t as the time. The sign of first derivatives then
-    # changes, which the sign of `h` does; second derivatives keep their sign.
+    # In a run backwards in time diffrax uses −t as the time. First derivatives then change their
+    # sign; here `h` changes its sign instead. Second derivatives keep their sign.
     def rows(a: Array, b: Array, k: Array, m: Array, u: Array, v: Array) -> Array:
         step = jnp.asarray(h, a.dtype)
         rise, second, third = cubic_coefficients(b - a, step, k, m)

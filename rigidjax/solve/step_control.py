@@ -27,7 +27,10 @@ NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
 
 
 def _make_property_of_controller(attribute: str) -> Any:
-    """Define a property that reads an `attribute`, by its name, of the step controller inside."""
+    """Define a property that reads an attribute of the step controller `self.controller`.
+
+    `attribute` is the name of the attribute.
+    """
     return property(lambda self: getattr(self.controller, attribute))
 
 
@@ -38,7 +41,8 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
     and Wanner (1993), II.4: after an accepted step, the next step may be shorter.
     `diffrax.PIDController` never shortens the step after an accepted step: on Arenstorf's orbit at
     a tolerance of 1e-13 it rejects 85 of 477 steps. On this orbit, which is periodic,
-    `StandardController` rejects 29 of 420 steps, and the error after one period is a third.
+    `StandardController` rejects 29 of 420 steps, and its error after one period is a third of that
+    of `PIDController`.
 
     **Arguments:** `rtol` and `atol` are the tolerances; `dtmax` is the longest step, or `None`.
 
@@ -109,9 +113,10 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
 class Watched(dfx.AbstractAdaptiveStepSizeController):
     """Wrap an adaptive step controller so that a run that cannot continue ends at once.
 
-    A run ends if its start has no finite derivative, or if the step after a rejected one would be
-    shorter than a few units of round-off of the time. The result is `RESULTS.nonfinite` after NaN
-    or infinity, else `RESULTS.dt_min_reached`. (`diffrax.PIDController` goes on until `max_steps`.)
+    A run ends if the state at the start, or its time derivative, is not finite. It also ends if the
+    step after a rejected step would be shorter than a few units of round-off of the time. The
+    result is `RESULTS.nonfinite` after NaN or infinity, else `RESULTS.dt_min_reached`.
+    (`diffrax.PIDController` goes on until `max_steps`.)
 
     **Arguments:** `controller` is any adaptive controller of diffrax.
 
@@ -172,9 +177,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     def _first_step(self, y: PyTree, slope: PyTree, order: RealLike) -> Array:
         """Choose the length of the first step of a run, s, by the sizes of the state and its slope.
 
-        `y` is the state at the start, `slope` its time derivative, and `order` the order of the
-        error estimate: the error of a step grows as this power of its length. The length is 0 or
-        NaN if the state or its derivative is not finite.
+        `y` is the state at the start, and `slope` is the time derivative of this state. `order` is
+        the order p of the error estimate: the error of a step of length h grows as h^p. The
+        returned length is 0 or NaN if the state or the slope is not finite.
         """
         y, tree = ravel_pytree(y)
         scale = self.atol + self.rtol * jnp.abs(y)
@@ -188,8 +193,8 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     def _shortest_resolvable_step(self, t: ArrayLike, smallest_time: ArrayLike) -> Array:
         """Return the length of the shortest step that the resolution of the time allows, s.
 
-        It is 8 units of round-off of the time `t`, s, or of `smallest_time`, s, if |t| is smaller
-        than this.
+        It is 8 units of round-off of the time `t`, s. If |t| is smaller than `smallest_time`, s, it
+        is 8 units of round-off of `smallest_time`.
         """
         return 8 * jnp.finfo(jnp.result_type(t)).eps * jnp.maximum(jnp.abs(t), smallest_time)
 
@@ -210,8 +215,8 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         )
         unit = self._shortest_resolvable_step(left, least)
         stuck = ~keep & ~(right - left > unit)
-        # If even the shortest possible step has NaN, a still shorter step might have none. The
-        # reason given is then that no step is short enough.
+        # If even the shortest possible step gives NaN, a still shorter step might not give NaN. The
+        # result then says that no step is short enough.
         short = finite(y_error) | (t1 - t0 <= unit)
         why = dfx.RESULTS.where(short, dfx.RESULTS.dt_min_reached, NONFINITE)
         why = dfx.RESULTS.where(stuck & (result == dfx.RESULTS.successful), why, result)
@@ -223,8 +228,8 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
 
     A step that reaches a stop ends at the last floating-point number before the stop. The next step
     begins at the stop. It is at least as long as the previous step would have been without the
-    stop. (`diffrax.ClipStepSizeController` continues with the length of the step that was cut
-    short, so that each stop costs several short steps.)
+    stop. (`diffrax.ClipStepSizeController` chooses the next step by the length of the step that was
+    cut short at the stop, so that each stop costs several short steps.)
 
     **Arguments:** `controller` is any adaptive controller of diffrax; `stops` (J,) are times in
     increasing order.

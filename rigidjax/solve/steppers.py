@@ -42,15 +42,17 @@ _MANY = 10_000
 
 
 class Stepper(NamedTuple):
-    """Hold what takes fixed steps of one body: numbers y for its state, and their change in a step.
+    """Hold the functions that take fixed steps of one body.
 
-    A step goes from the time `t` to the time `end`, s, and has the length `h`, s. The numbers y
-    stand for the state, from which they may differ: they may be the momentum in the place of the
-    body rate. `inputs` are the values of the torque's inputs during the step, or `None`.
+    They work on numbers y, which stand for the state of the body. The numbers may differ from the
+    state: for example, they may hold the momentum in the place of the body rate. A step goes from
+    the time `t` to the time `end`, s, and has the length `h`, s. `inputs` are the values of the
+    torque's inputs during the step, or `None`.
     """
 
     initial_numbers: Any  # the numbers y at the start, which stand for the state there
-    change: Callable[[Any, Any, Any, Any, Any], Any]  # (t, end, h, y, inputs of the law or None)
+    # change(t, end, h, y, inputs): the change of the numbers y in a step.
+    change: Callable[[Any, Any, Any, Any, Any], Any]
     state_of_numbers: Callable[[Any], Any]  # the state that the numbers y stand for
     delays: tuple[tuple[str, Array], ...] = ()  # name and delay, s, of each delayed input
 
@@ -61,10 +63,11 @@ class Stepper(NamedTuple):
 class Carrying(NamedTuple):
     """Take the fixed steps of the stepper `of`, and carry the rounding errors of the sums along.
 
-    Each step computes the rounding error of the addition of the change to y, and the next step adds
-    this error to its change. The round-off of n steps then grows as √n, not as n. The rounding
-    error is carried along with the numbers y, and has no derivative. Source: Kahan 1965,
-    doi:10.1145/363707.363723; Dekker 1971, doi:10.1007/BF01397083, for |change| ≤ |y|.
+    Each step adds a change to the numbers y. It also computes the rounding error of this sum, which
+    the next step adds to its own change. The round-off of n steps then grows as √n, not as n. The
+    rounding error is carried along with the numbers y, and has no derivative. It is exact if
+    |change| ≤ |y|. Source: Kahan 1965, doi:10.1145/363707.363723; Dekker 1971,
+    doi:10.1007/BF01397083.
     """
 
     of: Stepper
@@ -97,15 +100,15 @@ AnyStepper = Stepper | Carrying
 
 
 def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) -> AnyStepper:
-    """Return the object that takes fixed steps of a vector field by a method, a `Stepper`.
+    """Return the object that takes fixed steps of a vector field by a method.
 
     **Arguments:**
 
     - `solver`: a method of `rigidjax.solvers`; `None` stands for the cheapest one.
     - `field`: the vector field `f(t, y, args)` of one body.
     - `y0`: the state at the start.
-    - `count`: the number of steps. If it is at least 10 000 or is traced, the stepper is a
-      `Carrying`, which also carries the rounding errors of the sums along.
+    - `count`: the number of steps. If it is at least 10 000 or is traced, the result is a
+      `Carrying`, which also carries the rounding errors of the sums along; else it is a `Stepper`.
     """
     stepper = _stepper_without_delays(solver, field, y0)._replace(delays=tuple(delays_of(field)))
     return Carrying(stepper) if not isinstance(count, int) or count >= _MANY else stepper
@@ -125,10 +128,12 @@ def cheapest_method_of_order_4(field: Callable[..., Any]) -> Magnus4 | RungeKutt
 def _stepper_without_delays(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
     """Return the object that takes fixed steps of a vector field by a method, without delays.
 
-    The caller adds the inputs of the torque that are delayed. `solver` is a method of
-    `rigidjax.solvers` (`None`: the one whose steps cost least), `field` the vector field
-    `f(t, y, args)`, and `y0` the state at the start. Raise `TypeError` if the method cannot take
+    The caller adds the delays of the torque's inputs. Raise `TypeError` if the method cannot take
     fixed steps of this field.
+
+    - `solver`: a method of `rigidjax.solvers`; `None` stands for the one whose steps cost least.
+    - `field`: the vector field `f(t, y, args)`.
+    - `y0`: the state at the start.
     """
     turning = _inertia_and_torque(field, y0)
     solver = cheapest_method_of_order_4(field) if solver is None else solver
@@ -161,7 +166,7 @@ def _stepper_without_delays(solver: Any, field: Callable[..., Any], y0: Any) -> 
 class _InertiaAndTorque(NamedTuple):
     """Hold the inertia and the torque of a body that only turns, and does not move in space.
 
-    The inertia has the dtype of the body rate in the state of the body.
+    The inertia has the same dtype as the body rate in the state.
     """
 
     inertia: Inertia
@@ -172,9 +177,9 @@ class _InertiaAndTorque(NamedTuple):
 def _inertia_and_torque(field: Any, y0: Any) -> _InertiaAndTorque | None:
     """Return the inertia and the torque of a body that only turns, or `None` for other motions.
 
-    `field` is the vector field of the body, dy/dt as a function of time and state, and `y0` its
-    state at the start. Another motion is, for example, that of a body that also moves in space, or
-    of one whose torque has states of its own.
+    `field` is the vector field of the body, dy/dt as a function of time and state, and `y0` is the
+    state at the start. The result is `None`, for example, if the body also moves in space, or if
+    the torque has states of its own.
     """
     euler = field.euler if isinstance(field, AttitudeEquations) else field
     if not isinstance(euler, EulerEquations) or not isinstance(y0, Spin | Attitude):
@@ -189,11 +194,11 @@ def _inertia_and_torque(field: Any, y0: Any) -> _InertiaAndTorque | None:
 def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
     """Return the object that takes fixed steps of a free body by Magnus' method of order 4.
 
-    `body` is the inertia, and `state0` the state at the start. The numbers that the object carries
-    from step to step are the quaternion of the turn since the start and the angular momentum Π,
-    quaternion and momentum along the principal axes of the body. Derivatives hold these axes fixed:
-    when the inertia changes, its entries off the diagonal, which are zero, have tangents that are
-    not zero.
+    `body` is the inertia, and `state0` the state at the start. The object carries seven numbers
+    from step to step: the quaternion of the turn since the start, and the angular momentum Π. The
+    vector of the quaternion and Π have components along the principal axes of the body. Derivatives
+    hold these axes fixed: when the inertia changes, the off-diagonal entries of the inertia along
+    the axes, which are zero, have tangents that are not zero.
     """
     frame = splitting.principal_frame_of_tensor(body.tensor)
     weights, axes = frame.weights, frame.axes
@@ -255,8 +260,8 @@ def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
     """Return the object that takes fixed steps by Magnus' method, under a torque.
 
     The torque may read the time and the body rate, not the attitude. `turning` holds the inertia
-    and the torque of the body, and `state0` is the state at the start. The numbers that the object
-    carries from step to step are the quaternion and the angular momentum in body axes.
+    and the torque of the body, and `state0` is the state at the start. From step to step the object
+    carries the quaternion of the attitude, and the angular momentum in body axes.
     """
     body, weights, torque = turning
     start, rate = split_into_scalars(state0), partial(matvec, weights)
@@ -332,13 +337,12 @@ def _stepper_of_slope_function(
     **Arguments:**
 
     - `solver`: the Runge–Kutta method.
-    - `slope_for_inputs`: a function: `slope_for_inputs(inputs)` returns, for the values of the
-      inputs that the torque reads in this step, the function of `(t, y)` that gives dy/dt.
+    - `slope_for_inputs`: a function such that `slope_for_inputs(inputs)(t, y)` is dy/dt. Here
+      `inputs` are the values of the torque's inputs during the step.
     - `initial_numbers`: the numbers y at the start, a tuple of scalars that stand for the state.
     - `state_of_numbers`: a function that returns the state for the numbers y.
-    - `example_state`: a state with the structure, shapes and dtypes of the state for which the
-      numbers y stand one by one. By it the quaternion among these numbers is found and scaled to
-      length 1.
+    - `example_state`: a state whose arrays have as many numbers as y, in the same order. It shows
+      which of the numbers y are a quaternion, which is scaled to length 1.
     """
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
@@ -352,9 +356,11 @@ def _stepper_of_slope_function(
 def _change_to_unit_length(y: Atoms, change: Atoms, example_state: Any) -> Atoms:
     """Return the change of a state in a step, after which the quaternion has the length 1.
 
-    `y` are the numbers of the state before the step, a tuple of scalars, and `change` the changes
-    of these numbers, of which those of the quaternion are corrected. `example_state` is a state
-    whose arrays the numbers form, in order. If it has no quaternion, `change` is returned as it is.
+    - `y`: the numbers of the state before the step, a tuple of scalars.
+    - `change`: the changes of these numbers in the step. The changes of the quaternion are
+      corrected; the other changes are returned as they are.
+    - `example_state`: a state whose arrays have as many numbers as `y`, in the same order. It shows
+      which numbers are the quaternion. If it has none, nothing is corrected.
     """
     if not isinstance(motion_of(example_state), HasAttitude):
         return change
@@ -382,10 +388,14 @@ def _change_to_unit_length(y: Atoms, change: Atoms, example_state: Any) -> Atoms
 def _stepper_of_splitting(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
     """Return the object that takes fixed steps of a splitting: free motions and kicks in turn.
 
-    A kick adds the torque times a part of the step to the momentum, at a fixed attitude. `solver`
-    is the splitting method, `field` the equations of motion of a body under a torque that reads
-    the time and the attitude, and `state0` the state at the start. The numbers that the object
-    carries from step to step are the quaternion and the angular momentum along the principal axes.
+    A kick adds a weight times the torque times the length of the step to the momentum, at a fixed
+    attitude. From step to step the object carries the quaternion of the attitude, and the angular
+    momentum along the principal axes of the body.
+
+    - `solver`: the splitting method.
+    - `field`: the equations of motion of a body under a torque that reads the time and the
+      attitude.
+    - `state0`: the state at the start.
     """
     # No step converts the momentum Π to Ω = I⁻¹Π and back, so that |Π| drifts only by the round-off
     # of the free motion.

@@ -1,4 +1,7 @@
-"""Find all stops, times at which steps end: declared jumps, and switches of the traced field."""
+"""Find all stops, which are the times at which steps end because the vector field jumps there.
+
+A law may declare its jumps; other jumps are found as switches in the traced field.
+"""
 
 import warnings
 from collections.abc import Callable
@@ -27,7 +30,7 @@ from rigidjax.solve.switching_times import (
 
 
 def warn_of_unsearchable_jumps(analysis: Analysis) -> None:
-    """Warn of each line of a law that may jump at times that cannot be found before the run.
+    """Warn of each line of a law whose result may jump at times that are not found before the run.
 
     `analysis` holds these lines, and the switches that were found in the traced vector field.
     """
@@ -41,10 +44,13 @@ def warn_of_unsearchable_jumps(analysis: Analysis) -> None:
 
 
 class TracedProgram(NamedTuple):
-    """Hold a traced function, to be called as `call(constants, *args)` with arrays as constants."""
+    """Hold a traced function, which is called as `call(constants, *args)`.
+
+    The constants are the JAX arrays that the function closes over.
+    """
 
     closed: ClosedJaxpr
-    tree: Any  # the structure of its result
+    tree: Any  # the tree structure of the result of the function
 
     @property
     def jax_constants(self) -> Arrays:
@@ -52,9 +58,9 @@ class TracedProgram(NamedTuple):
         return [c for c in self.closed.consts if eqx.is_array(c)]
 
     def replace_jax_constants(self, jax_arrays: Arrays) -> Arrays:
-        """Return all constants of the traced function, after a replacement of its JAX arrays.
+        """Return a list of all constants of the traced function, with new JAX arrays.
 
-        `jax_arrays` replace the JAX arrays among these constants, in order; NumPy arrays stay.
+        `jax_arrays` replace the JAX arrays among the constants, in order; NumPy arrays are kept.
         """
         arrays = iter(jax_arrays)
         return [next(arrays) if eqx.is_array(c) else c for c in self.closed.consts]
@@ -65,10 +71,11 @@ class TracedProgram(NamedTuple):
 
 
 def trace_program(function: Callable[..., Any], *examples: Any) -> TracedProgram:
-    """Return a function after it was traced, with the arrays that it closes over as an argument.
+    """Trace a function, so that the arrays that it closes over become an argument.
 
-    `examples` are examples of its arguments, of which only shapes and dtypes count. The result is
-    called as `call(constants, *args)`.
+    `examples` are examples of the arguments of the function, of which only shapes and dtypes count.
+    The returned `TracedProgram` is called as `call(constants, *args)`, where `constants` are the
+    JAX arrays that the function closes over.
     """
     closed, out = jax.make_jaxpr(function, return_shape=True)(*examples)
     return TracedProgram(closed, jax.tree.structure(out))
@@ -77,11 +84,12 @@ def trace_program(function: Callable[..., Any], *examples: Any) -> TracedProgram
 def extract_constants(
     functions: list[Callable[..., Any]], *examples: Any
 ) -> tuple[list[Callable[..., Any]], Arrays]:
-    """Return several functions, with the arrays that they close over (constants) as an argument.
+    """Trace several functions, so that the arrays that they close over become an argument.
 
-    `examples` are examples of the arguments, which all functions share. **Returns** two lists: the
-    functions, to be called as `f(constants, *args)`; and the constants of all functions, which each
-    of them takes.
+    `examples` are examples of the arguments, which are the same for all functions. **Returns** two
+    lists. The first is the functions, which are called as `f(constants, *args)`. The second is the
+    constants: the arrays that any of the functions closes over. Each function takes this whole
+    list.
     """
     programs = [trace_program(function, *examples) for function in functions]
     ends = np.cumsum([0, *(len(program.jax_constants) for program in programs)])
@@ -94,24 +102,30 @@ def extract_constants(
 
 
 class ProgramWithStops(NamedTuple):
-    """Hold a field with the times `stops` at which its steps end, where it jumps or has a kink."""
+    """Hold a vector field, and the `stops`: the times at which it jumps or has a kink.
+
+    Steps end at the stops.
+    """
 
     field: Callable[..., Array]  # (constants, t, y)
     constants: Arrays
     smooth: int  # only the first `smooth` constants may have derivatives
     stops: Array  # (k,), s, in order
-    over: Array | None  # whether a part switches more often than the arrays can store
+    # Whether a part of the field switches more often than the arrays can store; `None` if no part
+    # was found to switch.
+    over: Array | None
 
 
 def program_with_stops(
     function: Callable[..., Array], declared_jumps: list[Array], t0: Array, t1: Array, y: Array
 ) -> ProgramWithStops:
-    """Return a vector field with all times at which steps must end, because the field jumps there.
+    """Return a vector field, with all times at which steps end because the field jumps there.
 
     **Arguments:**
 
-    - `function`: the field `(t, y, *sides)`. If several parts of it declare jumps, it gets as
-      `sides` one array for each part: the times, s, at which steps end for the jumps of the part.
+    - `function`: the field `(t, y, *sides)`. If several parts of the field declare jumps, `sides`
+      has one array for each of these parts: the times, s, at which steps end because this part
+      jumps.
     - `declared_jumps`: a list with the jump times, s, of each part of the field that declares
       jumps.
     - `t0`, `t1`: the start and the end of the run, s.
@@ -137,7 +151,8 @@ def program_with_stops(
     over, most = found.over, MOST + sum(times.shape[0] for times in declared)
     if stops.shape[0] > most:
         stops, over = stops[:most], over | (stops[most] < t1)
-    # The values at the switches are one array, because a loop that carries many arrays is slower.
+    # The arrays that describe the switches are joined to one array, because a loop that carries
+    # many arrays is slower.
     places = lax.stop_gradient((own, found._replace(times=own[:0])))
     one, unpacked = ravel_pytree(jax.tree.map(lambda leaf: leaf.astype(t0.dtype), places))
     more, field = [*(sides if likes else []), one], replace_comparisons_by_stops(analysis)

@@ -3,15 +3,16 @@
 A law that a user writes, such as `jnp.where(t < self.te, push, 0.0)`, declares no `jump_times`, but
 the traced program of the field contains its comparison. If the comparison depends on the time but
 not on the state, the times at which its result changes are found before the run, by halving
-intervals. This also finds a very short firing, because the comparison of two linear functions of
-time, or of a function that only rises or only falls with a constant, changes only once. The steps
-of the run end at these times, called stops. During the run the comparison is not evaluated: its
-result is chosen by the stops that the step has passed. The result therefore does not depend on
-rounding, and two comparisons that change at the same time are treated separately.
+intervals. This finds even the ends of a very short pulse, because many comparisons change only
+once: a comparison of two linear functions of time does, and a comparison of a constant with a
+function of time that only rises or only falls. The steps of the run end at the times found, which
+are called stops. During the run the comparison is not evaluated: its result follows from the stops
+that the step has passed. The result therefore does not depend on rounding, and two comparisons that
+change at the same time are treated separately.
 
 The switching function g of a comparison is the difference of its two operands. It is a function of
 the time t and of the constants p of the field. The equation `g(p, t) = 0` defines the switching
-time as an implicit function of p, and gives its derivatives.
+time t as an implicit function of p, and gives the derivatives of this time.
 """
 
 import os
@@ -30,28 +31,30 @@ from jax.extend.source_info_util import summarize
 
 from rigidjax.solve.batching import Arrays
 
-# The name of the scope of a part that declares its jumps; no switch is searched for inside it.
+# The name of the scope of a law that declares its jumps; no switch is searched for inside this
+# scope.
 DECLARED = "rigidjax_declared_jumps"
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 
 # `COMPARISONS`: primitives whose result changes when the first operand becomes equal to the second.
 # `_LEVELS`: primitives whose result changes when the first operand (for `rem` the quotient of the
-# two operands) passes a whole number. `sign`, which changes when its operand passes zero, is in
-# `_may_jump`.
+# two operands) passes a whole number. `sign`, whose result changes when its operand passes zero, is
+# in neither set; the function `_may_jump` adds it.
 COMPARISONS = {"lt", "le", "gt", "ge", "lt_to", "le_to"}
 _LEVELS = {"floor", "ceil", "round", "convert_element_type", "rem"}
 # Primitives whose result has a kink when two operands become equal or, for `abs`, when the operand
 # passes zero.
 KINKS = {"max", "min", "abs", "clamp"}
-# Primitives whose result may jump, but at values of the operands that are not searched for: they
-# choose or order elements of an array, or work on the bits of a number.
+# Primitives whose result may jump, but whose jumps are not searched for, because they choose or
+# order elements of an array, or work on the bits of a number.
 _CHOICES = {"argmax", "argmin", "sort", "top_k", "bitcast_convert_type", "nextafter"}
 # Primitives whose content cannot be read.
 _OPAQUE = {"pure_callback", "io_callback", "custom_call", "ffi_call"}
-# Primitives whose result is not constant between its jumps (as a saw tooth).
+# Primitives whose result jumps, but is not constant between its jumps, like a saw tooth.
 _SAWS = {"rem", "atan2", "sort", "top_k", "nextafter"}
-# `_CALLS`: calls whose body is written out in the flat program. `_WHOLE`: calls that stay one
-# equation of the flat program; switches are still searched for in their bodies.
+# A flat program is a traced function as one list of equations. `_CALLS`: calls whose body is
+# written out in the flat program. `_WHOLE`: calls that stay one equation of the flat program; their
+# bodies are nevertheless searched for switches.
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2"}
 _WHOLE = {"cond", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
 # `_LINEAR`: primitives that are linear in all operands together. `_PRODUCTS`: primitives that are
@@ -68,14 +71,16 @@ _MONOTONE = {
     "asinh", "atan",
 }  # fmt: skip
 # How a value depends on the time. `CONSTANT`: not at all. `PIECES`: it is constant except for
-# jumps, at which another value jumps, too. `STRAIGHT`: it is a linear function of the time.
-# `MONOTONE`: it only rises or only falls. `BENT`: in any other way.
+# jumps. `STRAIGHT`: it is a linear function of the time. `MONOTONE`: it only rises or only falls.
+# `BENT`: in any other way.
 CONSTANT, PIECES, STRAIGHT, MONOTONE, BENT = range(5)
 
 MOST = 64  # the largest number of switching times of one law, or of one `floor`, `round`, …
-_FEW = 32  # a comparison of more elements than this is treated as a table, not a switch
+_FEW = 32  # a comparison of more elements than this is treated as a table, not as a switch
 _FEW_KINKS = 3  # steps do not end at the kinks of an operation that has more kinks than this
-NEAR = 16  # the number of places between grid points where a bent switch is searched for
+# A switch whose operand depends on the time as `BENT` is searched for on a grid of times. Between
+# grid points, changes are searched for in this many places.
+NEAR = 16
 
 
 class Equation(NamedTuple):
@@ -108,7 +113,7 @@ class Program(NamedTuple):
 
     equations: list[Equation]  # the equations, in the order of evaluation
     constants: list[int]  # the values that are constants of the traced function
-    inner: dict[int, Any]  # the constants of inner calls, by their numbers
+    inner: dict[int, Any]  # the constants of inner calls; the keys are the integers of these values
     inputs: list[int]  # the values that are arguments of the function
     output: Any  # the value that the function returns
 
@@ -127,9 +132,10 @@ class Switch(NamedTuple):
 
     @property
     def most_changes_if_monotonic(self) -> int:
-        """Return how often an element can change at most while its operand only rises or falls.
+        """Return how many changes of an element are stored if its operand is monotonic in time.
 
-        It is 1 for a comparison, and `MOST` for a function such as `floor`.
+        It is 1 for a comparison, which then changes only once. A function such as `floor` may
+        change any number of times; at most `MOST` of its changes are stored.
         """
         return MOST if self.equation.primitive_name in _LEVELS else 1
 
@@ -165,11 +171,11 @@ class Analysis(NamedTuple):
 
     program: Program
     switches: list[Switch]
-    # Kinks that are so many that no steps end at them; their times only help in the search for bent
-    # switches.
+    # Operations with so many kinks that no steps end at them. The times of the kinks only help in
+    # the search for the changes of bent switches (`BENT`).
     kinks: list[Switch]
-    by_state: list[str]  # the lines that switch by the state
-    unseen: list[str]  # the lines that may switch at times that cannot be searched for
+    by_state: list[str]  # the lines of code whose result switches at values of the state
+    unseen: list[str]  # the lines of code that may switch at times that cannot be searched for
 
 
 def _inner_programs(params: dict[str, Any]) -> Iterator[tuple[Jaxpr, Sequence[Any]]]:
@@ -189,7 +195,7 @@ def _inner_programs(params: dict[str, Any]) -> Iterator[tuple[Jaxpr, Sequence[An
 def _primitive_name(eqn: Any) -> str:
     """Return the name of an equation's primitive, or "searchsorted" for `jnp.searchsorted`.
 
-    - `eqn`: an equation of a `Jaxpr`, or an `Equation`, which holds one.
+    - `eqn`: an equation of a `Jaxpr`, or an `Equation` of this module.
     """
     called = eqn.params.get("name")
     return "searchsorted" if called == "searchsorted" else eqn.primitive.name
@@ -225,9 +231,9 @@ def _may_jump(name: str, params: dict[str, Any], dtypes: list[Any]) -> bool:
 
 
 def _may_have_kink(name: str, dtypes: list[Any]) -> bool:
-    """Return whether the result of an equation may have a kink while its operands have none.
+    """Return whether the result of an equation may have a kink although its operands have none.
 
-    At a kink, such as that of `abs` at 0, the slope jumps and the value does not.
+    At a kink the slope jumps and the value does not; `abs`, for example, has a kink at 0.
 
     - `name`: the name of its primitive, such as "abs".
     - `dtypes`: the dtypes of its operands.
@@ -260,8 +266,8 @@ def _contains_switch(jaxpr: Jaxpr, with_kinks: bool = False) -> bool:
 def flatten_traced_function(traced: ClosedJaxpr) -> Program:
     """Return a traced function as one flat list of equations, in which calls are written out.
 
-    The bodies of calls that cannot be written out, such as `cond`, are in the list after the call,
-    so that switches in them are found.
+    A call such as `cond` cannot be written out, and stays one equation. The equations of its body
+    follow it in the list, so that switches among them are found.
 
     - `traced`: the traced function f(t, y, …).
     """
@@ -309,8 +315,7 @@ def time_dependence_of(equation: Equation, operand_dependences: list[int]) -> in
     (only rising or only falling), or `BENT` (in any other way).
 
     - `equation`: the equation.
-    - `operand_dependences`: for each operand one of these values, which says how the operand
-      depends on the time.
+    - `operand_dependences`: how each operand depends on the time, as one of the same five values.
     """
     operands = operand_dependences
     timed, name = [d for d in operands if d != CONSTANT], equation.primitive_name
@@ -337,11 +342,11 @@ def time_dependence_of(equation: Equation, operand_dependences: list[int]) -> in
 
 
 def find_switches(traced_field: ClosedJaxpr) -> Analysis | None:
-    """Return the switches of a traced field f(t, y, …), or `None` if it has nothing that switches.
+    """Return the switches of a traced field f(t, y, …), or `None` if nothing in it can switch.
 
     A switch is an equation, such as the comparison `t < 1`, whose result jumps or has a kink at
-    times that do not depend on the state. Only the equations are looked at: the times are found
-    later, in the module `switching_times`.
+    times that do not depend on the state. This function finds the equations; the module
+    `switching_times` finds the times.
 
     - `traced_field`: the field after tracing, whose first two arguments are the time and the state.
     """
@@ -358,7 +363,8 @@ def find_switches(traced_field: ClosedJaxpr) -> Analysis | None:
         degrees.update(dict.fromkeys(equation.outputs, time_dependence_of(equation, operands)))
         if stateful:
             of_state.update(equation.outputs)
-        # A value that is constant between the times of other switches needs no search of its own.
+        # If all operands are constant except for jumps, the result changes only at these jumps.
+        # Their times are searched for at the equations that cause them.
         timed = max(operands, default=CONSTANT) > PIECES
         if (
             not (timed or stateful)
@@ -395,9 +401,9 @@ def _is_of_this_package(equation: Equation) -> bool:
 def _may_switch(equation: Equation) -> bool:
     """Return whether the result of the equation `equation` may jump or have a kink.
 
-    At a kink the slope jumps and the value does not. The answer is yes for each equation that
-    contains a program, such as `cond`, because there may be a jump inside this program.
-    The answer is also yes for an equation whose content cannot be read, such as a callback.
+    At a kink the slope jumps and the value does not. The answer is also yes for an equation that
+    contains a program, such as `cond`, because there may be a jump inside this program, and for an
+    equation whose content cannot be read, such as a callback.
     """
     name = equation.primitive_name
     jumps = _may_jump(name, equation.params, equation.dtypes) or _may_have_kink(
@@ -424,7 +430,7 @@ def _may_hide_switches(equation: Equation) -> bool:
 def _switch_of(
     program: Program, equation: Equation, operand_dependences: list[int], jumps: bool
 ) -> Switch:
-    """Return an equation as a `Switch`, which says how often, and in which way, its result changes.
+    """Return an equation as a `Switch`, which says how the result of the equation changes in time.
 
     - `program`: the program that contains the equation.
     - `equation`: the equation, whose result depends on the time but not on the state.
@@ -465,12 +471,14 @@ def evaluator(
 
     - `program`: the program, in which each value is identified by an integer.
     - `wanted`: the values to be returned: integers, or literals.
-    - `replaced`: a dict whose keys are the integers of outputs whose equations are not evaluated,
-      and whose values are objects with two members: `result(read, inputs)` returns the output, and
-      `needed_inputs` lists the inputs of the equation that `result` needs. `None` replaces nothing.
+    - `replaced`: a dict of equations that are not evaluated, or `None` for none. The key is the
+      integer of the output of the equation. The value is an object that computes this output: its
+      method `result(read, inputs)` returns the output, where `read(i)` is the value with the
+      integer i and `inputs` are the arguments of the program. Its member `needed_inputs` lists the
+      inputs of the equation that `result` reads.
 
-    **Returns** a function of `(constants, *inputs)`, the constants and the arguments of the
-    program, that returns the list of wanted values.
+    **Returns** a function `(constants, *inputs)` that returns the list of the wanted values. Its
+    arguments are the constants of the program and the arguments of the program.
     """
     replaced = replaced or {}
     needed, equations = {i for i in wanted if not isinstance(i, Literal)}, []

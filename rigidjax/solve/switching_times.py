@@ -1,10 +1,12 @@
 """Locate the times at which a traced field switches, and evaluate the field between them.
 
-If the switching function g of a switch (see the module `switching`) only rises or only falls in
-time, the switch changes once, and its time is found by halving the interval from the start to the
-end of the run. Any other switch is called bent. Its changes are searched for on a grid of times,
-and also between grid points where g comes closest to zero. The equation `g(p, t) = 0` defines each
-time as an implicit function of the constants p of the field, and gives its derivatives.
+A switch is an equation of the field, such as the comparison `t < 1`, whose result changes at times
+that do not depend on the state. Its switching function g is the difference of its operands. If g
+only rises or only falls in time, the switch changes once. The time of this change is found by
+halving the interval from the start to the end of the run. Any other switch is called bent. Its
+changes are searched for on a grid of times, and also between grid points, where g comes closest to
+zero. The equation `g(p, t) = 0` defines the time t of each change as an implicit function of the
+constants p of the field, and gives the derivatives of this time.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +34,9 @@ from rigidjax.solve.switching import (
 )
 
 _HALVINGS = {"float64": 62, "float32": 36}
-_GRID = 4096  # the number of points of the grid on which a bent switch is searched for
+# The changes of a bent switch, whose switching function may rise and fall, are searched for on a
+# grid of this many times.
+_GRID = 4096
 
 
 def _switching_function_of_operands(
@@ -42,10 +46,14 @@ def _switching_function_of_operands(
 
     A switch is an equation, such as the comparison `t < 1`, whose result changes at certain times.
     The switching function is the difference of its two operands, here t − 1, and the result changes
-    where this function is zero. `clamp` has two switching functions, the differences of its number
-    from the two bounds; that of `abs` or `sign` is the operand. For functions such as `floor` it is
-    the operand (for `rem` the quotient of the two operands), and the result changes where it passes
-    a whole number.
+    where this function is zero. Other equations have other switching functions:
+
+    - `clamp` has two: the differences between its number and the two bounds.
+    - For `abs` and `sign` it is the operand.
+    - For functions such as `floor` it is the operand, and for `rem` it is the quotient of the two
+      operands. The result changes where the switching function passes a whole number.
+
+    **Arguments:**
 
     - `switch`: the equation.
     - `first_operand`: its first operand.
@@ -72,10 +80,10 @@ def _piecewise_constant_value(switch: Switch, first_operand: Any, *others_and_re
     - `others_and_result`: its other operands, followed by its result.
 
     **Returns** an array (m,), with one value for each of the m elements, such as those of a
-    comparison of arrays. The value is the result of the equation, with three exceptions: for `rem`
-    it is the whole part of the quotient of the operands; for `searchsorted`, and for operations
-    with a kink, such as `max`, it is whether the switching function (the difference of the
-    operands, for `abs` the operand) is positive.
+    comparison of arrays. The value is the result of the equation, with three exceptions. For `rem`
+    it is the whole part of the quotient of the operands. For `searchsorted`, and for operations
+    with a kink, such as `max`, it is whether the switching function is positive. The switching
+    function is the difference of the operands or, for `abs`, the operand.
     """
     name, x, rest = switch.equation.primitive_name, first_operand, others_and_result
     if name in KINKS | {"searchsorted"}:
@@ -91,10 +99,12 @@ class SwitchingTimes(NamedTuple):
     """
 
     times: Array  # (k,) s, with derivatives; the end of the run at a place where nothing changes
-    element: Array  # (k,) the element of the switch
-    change: Array  # (k,) the change of the element's value
-    first: Arrays  # for each switch the values of its elements at the start
-    outputs: Arrays  # the results of searches among edges at the start; empty for other switches
+    element: Array  # (k,) the index of the element that changes
+    change: Array  # (k,) the change of the element's value, 0 at a place where nothing changes
+    first: Arrays  # for each switch, the values of its elements at the start of the run
+    # For each switch, its result at the start of the run if it is a `searchsorted`, else an empty
+    # array.
+    outputs: Arrays
     over: Array  # whether an element changes more often than it has places
 
 
@@ -137,40 +147,43 @@ class _TimedSwitch(NamedTuple):
 
         For a comparison the switching function is the difference of the operands, and the element
         changes where this function is zero. For a function such as `floor` it is the operand, and
-        the element changes where it passes a whole number.
+        the element changes where the operand passes a whole number.
         """
         return _switching_function_of_operands(self.switch, *self.operands_and_result(t)).astype(
             t.dtype
         )
 
     def values_of_one_element(self, t: Array, element: Array | np.ndarray) -> Array:
-        """Return the value of one element at each of the times t (k,), s: (k,).
+        """Return the value of one element at each of k times, an array (k,).
 
         The value of an element, such as 0 or 1 for a comparison, is constant except where the
         element changes.
 
-        - `element`: (k,) the index of the element, for each time.
+        - `t`: (k,) s, the times.
+        - `element`: (k,) for each time, the index of the element.
         """
         return self._at_each_time(self.element_values, t, element)
 
     def switching_function_of_one_element(self, t: Array, element: Array | np.ndarray) -> Array:
-        """Return the switching function of one element at each of the times t (k,), s: (k,).
+        """Return the switching function of one element at each of k times, an array (k,).
 
         For a comparison the switching function is the difference of the operands, and the element
         changes where this function is zero. For a function such as `floor` it is the operand, and
-        the element changes where it passes a whole number.
+        the element changes where the operand passes a whole number.
 
-        - `element`: (k,) the index of the element, for each time.
+        - `t`: (k,) s, the times.
+        - `element`: (k,) for each time, the index of the element.
         """
         return self._at_each_time(self.switching_functions, t, element)
 
     def _at_each_time(
         self, function: Callable[[Array], Array], t: Array, element: Array | np.ndarray
     ) -> Array:
-        """Return one number of the array `function(t)` at each time: (k,) for the times t (k,), s.
+        """Return the number that a function has for one element, at each of k times: an array (k,).
 
-        - `function`: returns one number for each element of the switch at a time ().
-        - `element`: (k,) the index of the element whose number is returned, for each time.
+        - `function`: a function of one time that returns one number for each element of the switch.
+        - `t`: (k,) s, the times.
+        - `element`: (k,) for each time, the index of the element whose number is returned.
         """
         if self.switch.size == 1:
             return jax.vmap(lambda t: function(t).reshape(()))(t)
@@ -226,18 +239,19 @@ def find_switching_times(
 def _times_of_monotonic_switches(
     timed_switches: list[_TimedSwitch], start: Array, end: Array
 ) -> list[_ChangesOfSwitch]:
-    """Return the times at which switches change whose switching functions only rise or only fall.
+    """Return the times at which monotonic switches change.
 
     A switch is an equation, such as the comparison `t < 1`, with one or more elements. Its
-    switching function, here t − 1, is the function of time that shows where the result changes:
-    where it is zero or, for functions such as `floor`, where it passes a whole number.
+    switching function is here t − 1. The result changes where the switching function is zero or,
+    for functions such as `floor`, where the switching function passes a whole number. A switch is
+    monotonic if its switching function only rises or only falls in time.
 
     - `timed_switches`: the switches.
     - `start`, `end`: the times between which changes are searched for, s.
 
-    **Returns** for each switch four things: k times (k,), s; the elements (k,) that change at them;
-    the changes (k,) of their values, 0 at a time at which nothing changes; and whether there are
-    more than these k changes, so that some are missing.
+    **Returns** for each switch four things: k times (k,), s; the elements (k,) that change at these
+    times; the changes (k,) of the values of these elements, 0 at a time at which nothing changes;
+    and whether some changes are missing, because an element changes more often than can be stored.
     """
     starts, rises, elements, levels = [], [], [], []
     for one in timed_switches:
@@ -269,21 +283,22 @@ def _times_of_monotonic_switches(
 def _times_of_nonmonotonic_switch(
     timed_switch: _TimedSwitch, start: Array, end: Array, other_times: list[Array]
 ) -> _ChangesOfSwitch:
-    """Return the times at which a switch changes whose switching function may rise and fall.
+    """Return the times at which a nonmonotonic switch changes.
 
     A switch is an equation, such as the comparison `t < 1`, with one or more elements. Its
-    switching function, here t − 1, is the function of time that shows where the result changes:
-    where it is zero or, for functions such as `floor`, where it passes a whole number. The changes
-    are searched for on a grid of times.
+    switching function is here t − 1. The result changes where the switching function is zero or,
+    for functions such as `floor`, where the switching function passes a whole number. A switch is
+    nonmonotonic if its switching function may rise and fall. The changes are searched for on a grid
+    of times.
 
     - `timed_switch`: the switch.
     - `start`, `end`: the times between which changes are searched for, s.
     - `other_times`: arrays of times, s, at which other switches change. The grid includes these
       times.
 
-    **Returns** four things: k times (k,), s; the elements (k,) that change at them; the changes
-    (k,) of their values, 0 at a time at which nothing changes; and whether there are so many
-    changes (more than 64 on the grid) that some are missing.
+    **Returns** four things: k times (k,), s; the elements (k,) that change at these times; the
+    changes (k,) of the values of these elements, 0 at a time at which nothing changes; and whether
+    there are more than 64 changes on the grid, so that some are missing.
     """
     before = jnp.concatenate(other_times) if other_times else jnp.zeros(0, start.dtype)
     low, high, element, over = _intervals_with_one_change(
@@ -296,8 +311,8 @@ def _times_of_nonmonotonic_switch(
     there = value != base
     t, moves = _differentiable_times(timed_switch, jnp.where(there, t, end), element, there)
     if other_times:
-        # If the switch changes because an operand jumps, the time of the change is the time of the
-        # jump.
+        # If the switch changes because an operand jumps, the time of the change is the time at
+        # which the operand jumps; this is one of the other times, which may have derivatives.
         near, still = jnp.argmin(jnp.abs(before[None] - t[:, None]), 1), lax.stop_gradient(t)
         same = jnp.abs(before[near] - still) <= 8 * jnp.finfo(t.dtype).eps * jnp.abs(still)
         t = jnp.where(there & ~moves & same, before[near], t)
@@ -313,9 +328,9 @@ def _intervals_with_one_change(
     - `start`, `end`: the times between which changes are searched for on a grid, s.
     - `other_times`: (j,) s, times at which other switches change. The grid includes these times.
 
-    **Returns** four things: the starts (k,) of the intervals, s; their ends (k,), s; the index (k,)
-    of the element for each interval; and whether the grid shows more than 64 changes, so that some
-    of them are in no interval.
+    **Returns** four things: the starts (k,) of the intervals, s; the ends (k,) of the intervals, s;
+    for each interval the index (k,) of the element; and whether the grid shows more than 64
+    changes, so that some changes are in no interval.
     """
     size, dtype = timed_switch.switch.size, start.dtype
     grid = start + (end - start) * jnp.linspace(0.0, 1.0, max(256, _GRID // size), dtype=dtype)
@@ -381,8 +396,8 @@ def _bisect(
     - `levels`: the sizes (k,) of the changes: an element has changed when its value differs from
       its base by at least its level.
 
-    **Returns** a list of arrays (k,), s; if nothing changes in an interval, the time is the end of
-    the interval.
+    **Returns** a list with one array (k,), s, for each switch: the times of the changes in its k
+    intervals. If nothing changes in an interval, the time is the end of the interval.
     """
 
     def half(_: Any, edges: Any) -> Any:
@@ -419,8 +434,9 @@ def _differentiable_times(
     - `element`: (k,) the index of the element that changes at each time.
     - `has_change`: (k,), whether the element does change at each time.
 
-    **Returns** two things: the times (k,), s; and for each time whether it has derivatives. It has
-    none if the switching function stands still there, or jumps because an operand jumps.
+    **Returns** two things: the times (k,), s; and for each time whether it has derivatives. A time
+    has no derivatives if the slope of the switching function is zero at this time, or if the
+    switching function jumps there because an operand jumps.
     """
     degree = timed_switch.switch.time_dependence
     still, moves, slope, here = (
@@ -439,8 +455,8 @@ def _differentiable_times(
         rise = here - lax.stop_gradient(here)
         t = t - jnp.where(moves, rise / jnp.where(moves, slope, 1), 0)
     if degree == BENT:
-        # If the switch changes because an operand jumps, the switching function jumps over zero,
-        # and the time is no implicit function given by it.
+        # If the switch changes because an operand jumps, the switching function jumps over zero.
+        # The equation "switching function = 0" then does not define the time of the change.
         beside = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
         step, eps = jnp.abs(slope) * (still - beside), jnp.finfo(t.dtype).eps
         jump = jnp.abs(here - timed_switch.switching_function_of_one_element(beside, element))
@@ -449,10 +465,10 @@ def _differentiable_times(
 
 
 class _ResultFromStops(NamedTuple):
-    """Compute the result of an equation that switches from the stops that the run has passed.
+    """Compute the result of a switch by counting which stops the run has passed.
 
-    The equation is a comparison, such as `t < 1`, or a function such as `floor`. The stops are the
-    times at which steps end because the result of the equation changes there.
+    A switch is an equation: a comparison, such as `t < 1`, or a function such as `floor`. The stops
+    are the times at which steps end because the result of the equation changes there.
     """
 
     switch: Switch
@@ -468,12 +484,12 @@ class _ResultFromStops(NamedTuple):
         return [] if self.switch.stores_all_changes else self.switch.equation.inputs
 
     def result(self, read_input: Callable[[Any], Any], field_arguments: tuple[Any, ...]) -> Array:
-        """Return the result of the equation at a time, which follows from the stops passed by then.
+        """Return the result of the equation at a time, by the stops that are not after this time.
 
         - `read_input`: a function that returns the value of an input of the equation.
-        - `field_arguments`: the arguments of the field. The first is the time, s; the last is
-          a pair of the stops, s, and the `SwitchingTimes`, which hold by how much the result
-          changes at each stop.
+        - `field_arguments`: the arguments of the field. The first is the time, s. The last is a
+          pair of two things: the stops, s, and the `SwitchingTimes`, which say by how much the
+          result changes at each stop.
         """
         equation, (stops, found) = self.switch.equation, field_arguments[-1]
         past = field_arguments[0] >= stops[self.places]
@@ -505,7 +521,7 @@ def replace_comparisons_by_stops(analysis: Analysis) -> Callable[..., Array]:
     """Return a vector field whose comparisons with the time are replaced by stops.
 
     The stops are the times at which the results of these comparisons change; steps end at the
-    stops. The result of a comparison depends on whether a step has passed its stop.
+    stops. The result of a comparison then follows from the stops that the run has passed.
 
     - `analysis`: the program of the field, and its switches, which are these comparisons.
 
@@ -525,15 +541,15 @@ def replace_comparisons_by_stops(analysis: Analysis) -> Callable[..., Array]:
 def separate_equal_times(times: Array, t0: Array, t1: Array) -> tuple[Array, Array]:
     """Return the times at which steps end (stops), in order, with equal times moved slightly apart.
 
-    Two stops at the same time are moved apart by some units of round-off. Two jumps at the same
-    time then have a very short step between them, so that each jump has its own derivative.
+    Two stops at the same time are moved apart by some units of round-off. Between two jumps at the
+    same time the run then takes a very short step, so that each jump time has its own derivative.
 
     - `times`: (k,) s, the times of jumps, in any order.
     - `t0`, `t1`: the start and the end of the run, s. A time outside of the run is replaced by the
       nearer of the two.
 
-    **Returns** two things: the stops (k,) in order, s; and for each of the `times` its stop (k,),
-    s.
+    **Returns** two things: the stops (k,), s, in order; and an array (k,), s, with the stop that
+    belongs to each of the `times`.
     """
     inside = (times > t0) & (times < t1)
     t = jnp.where(inside, times, jnp.where(times <= t0, t0, t1))

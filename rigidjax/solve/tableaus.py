@@ -19,13 +19,15 @@ class Tableau(NamedTuple):
     - `order`: the order of the solution.
     - `c`, `a`: the nodes and the weights of the stages after the first.
     - `b`: the weights of the solution.
-    - `errors`: the weights of one or two error estimates, that of higher order first. In them the
-      stage `len(a) + 1` is the derivative at the end of the step.
-    - `extra_c`, `extra_a`: the nodes and the weights of the stages that only dense output needs;
-      their numbers follow that of the derivative at the end of the step.
-    - `dense`: the weights, over all these stages, of the corrections to the cubic through both ends
-      of the step and their slopes. Their basis is θ²(1−θ)², θ³(1−θ)², θ³(1−θ)³, …, where θ is the
-      part of the step that has passed, from 0 to 1 (Hairer, Nørsett and Wanner 1993, II.6).
+    - `errors`: the weights of one or two error estimates, the one of higher order first. In these
+      weights the stage number `len(a) + 1` is the derivative at the end of the step.
+    - `extra_c`, `extra_a`: the nodes and the weights of the stages that only dense output needs.
+      The first of them has the number `len(a) + 2`.
+    - `dense`: the weights of dense output, which is the state at any time within the step. Dense
+      output is a cubic polynomial in θ plus corrections. Here θ is the fraction of the step that
+      has passed, from 0 to 1. The cubic has the right state and slope at both ends of the step. The
+      corrections are multiples of θ²(1−θ)², θ³(1−θ)², θ³(1−θ)³, …. Each row has the weights of the
+      slopes of all stages in one of these multiples (Hairer, Nørsett and Wanner 1993, II.6).
     """
 
     order: int
@@ -39,7 +41,7 @@ class Tableau(NamedTuple):
 
 
 def _parse_tableau_rows(text: str) -> tuple[Row, ...]:
-    """Return the rows of a Butcher tableau that are written as a text of `stage:weight` pairs.
+    """Return the rows of a Butcher tableau from a text of `stage:weight` pairs.
 
     A row holds the weights of the slopes at the stages of a Runge–Kutta method in one sum, such as
     the sum for the state at a later stage. A semicolon separates two rows. Each row is a dict
@@ -62,9 +64,10 @@ def _sparse_row(row: np.ndarray) -> Row:
     return {i: float(w) for i, w in enumerate(row) if w != 0}
 
 
-# Kutta's method of 1901. The error estimate is the difference from a second result, in which the
-# slope at the end of the step takes the place of the fourth stage. The second result fulfils all
-# conditions up to order 3; it has Σ b a c² = 7/72, where order 4 needs 1/12.
+# Kutta's method of 1901. The error estimate is the difference between the result of the method and
+# a second result, in which the slope at the end of the step takes the place of the fourth stage.
+# The second result fulfils all conditions up to order 3; its sum Σ b_i a_ij c_j² is 7/72, where
+# order 4 needs 1/12.
 KUTTA4 = Tableau(
     order=4,
     c=(0.5, 0.5, 1.0),

@@ -25,7 +25,7 @@ from rigidjax.rotation.validation import rotation_tolerance
 def checked_body_state_and_times(
     body: Any, state0: Any, ts: Any, torque: Any, throw: bool
 ) -> tuple[Any, Any, Array]:
-    """Check the body, the start and the times of a run, and return the three in one precision.
+    """Return the body, the state at the start and the times of a run, after a check of all three.
 
     **Arguments:**
 
@@ -91,12 +91,14 @@ def require_compatible_types(body: Any, state0: Any, torque: Any) -> None:
 
 
 def _refuse_inertial_law_in_moving_frame(torque: Any) -> None:
-    """Raise `TypeError` if a torque contains both a law that needs the absolute body rate and the
-    law `BodyInFrame`, with which the body is solved in a moving frame.
+    """Raise `TypeError` if a torque needs the absolute body rate but also has a `BodyInFrame`.
 
-    In a moving frame of axes, such as that of an orbit, the body rate of a state is relative to the
-    frame. `torque` is a torque law, a function of time, state and body, which may consist of
-    several laws.
+    The absolute body rate is the rate relative to an inertial frame. The law `BodyInFrame` is for a
+    body in a moving frame, such as that of an orbit, where the state has the body rate relative to
+    this frame. A torque may therefore not contain both a `BodyInFrame` and a law that needs the
+    absolute body rate. Such a law is a `ChangingInertia`, or a law with an internal momentum.
+
+    - `torque`: the torque law, which may consist of several laws.
     """
 
     def within(law: Any) -> list[Any]:
@@ -129,8 +131,8 @@ def common_dtype(tree: Any, name: str) -> Any:
 def warn_of_unknown_inertia_scale(body: Any, torque: Any) -> None:
     """Warn if a torque in N m acts on a body whose inertia is known only up to a factor.
 
-    A torque that grows in proportion to the inertia, such as the gravity gradient, needs no
-    warning. `torque` is the torque law, or `None` for a free body.
+    The gravity gradient without harmonics needs no warning, because it is proportional to the
+    inertia. `torque` is the torque law, or `None` for a free body.
     """
     relative = isinstance(body, Inertia) and body.scale is not None
     alike = isinstance(torque, GravityGradient) and not torque.harmonics
@@ -145,9 +147,9 @@ def warn_of_unknown_inertia_scale(body: Any, torque: Any) -> None:
 def _advice_to_make_body_of_numbers(numbers: Any, moves: bool = False) -> str:
     """Return the end of an error message, for a user who gave bare numbers in the place of a body.
 
-    It says how to make a body of the `numbers`: an `Inertia` or, if `moves` is true because the
-    body also moves in space, a `MassProperties`. If `numbers` is not an array, a list or a tuple,
-    the text is empty.
+    The text says how to make a body from the `numbers`. The body is a `MassProperties` if `moves`
+    is true (it also moves in space), else an `Inertia`. If `numbers` is not an array, a list or a
+    tuple, the text is empty.
     """
     if not isinstance(numbers, (list, tuple, np.ndarray, jax.Array)):
         return ""
@@ -158,10 +160,10 @@ def _advice_to_make_body_of_numbers(numbers: Any, moves: bool = False) -> str:
 
 
 def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
-    """Return a body after a check of its mass and inertia: NaN if no real body can have them.
+    """Return a body after a check that a real body can have its mass and inertia.
 
-    If `throw` is true, an impossible body raises an error instead; an impossible body whose numbers
-    are known raises it in any case.
+    The numbers of an impossible body become NaN. If `throw` is true, or if the numbers are not
+    traced, an impossible body raises an error instead.
     """
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
@@ -171,9 +173,10 @@ def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
 def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     """Return the relative and the absolute tolerance of a run, after a check.
 
-    A tolerance of `None` gets the value that suits the `dtype` of the run. Raise `ValueError` for
-    tolerances that are not positive. If the dtype cannot reach a known `rtol`, warn, and return the
-    smallest `rtol` that it can reach.
+    A tolerance of `None` gets the value that suits the `dtype` of the run. Traced tolerances are
+    not checked. Raise `ValueError` if `rtol` is not positive, if `atol` is negative, or if one of
+    them is not finite. If `rtol` is smaller than the dtype can reach, warn, and return the smallest
+    `rtol` that the dtype can reach.
     """
     double = dtype == jnp.float64
     usual = (1e-9, 1e-12) if double else (2e-5, 1e-7)
@@ -268,9 +271,9 @@ def checked_first_step(dt0: Any, times: Array) -> Array:
 def checked_start(state0: Any, throw: bool) -> Any:
     """Return the state at the start of a run after a check.
 
-    The state must be that of one body, finite, with a unit quaternion if it has one; an invalid
-    state raises an error. With `throw=False` a traced quaternion whose length is not 1 becomes NaN
-    instead, and traced numbers that are not finite are left as they are.
+    The state must be that of one body, with finite numbers; a quaternion must have the length 1. An
+    invalid state raises an error. With `throw=False` a traced quaternion whose length is not 1
+    becomes NaN instead, and traced numbers that are not finite are left as they are.
     """
     wanted = "Spin, Attitude or Rigid, or Point without a body"
     _checks.require_unbatched_instance(
@@ -299,16 +302,16 @@ def checked_start(state0: Any, throw: bool) -> Any:
 
 
 def _error_or_nan_if_bad(value: Array, bad: Any, message: str, throw: bool) -> Array:
-    """Return an array after a check: raise an error if it is bad, or make it NaN in a batch.
+    """Return an array after a check: if it is bad, raise an error, or return NaN in its place.
 
     **Arguments:**
 
     - `value`: the array that was checked.
     - `bad`: whether the array is bad, a truth value, which may be traced.
     - `message`: the message of the error.
-    - `throw`: whether a bad array raises an error even if `bad` is traced. With `False` it becomes
-      NaN in this case, because one bad body in a batch must not end the runs of the other bodies.
-      If `bad` is known, a bad array raises an error in any case.
+    - `throw`: whether a bad array raises an error even if `bad` is traced. With `False` and a
+      traced `bad`, NaN is returned, because one bad body in a batch must not end the runs of the
+      other bodies. If `bad` is not traced, a bad array raises an error in any case.
     """
     if throw or _checks.is_known(bad):
         return _checks.error_if(value, bad, message)
