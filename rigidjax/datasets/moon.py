@@ -32,8 +32,8 @@ CITATION = "Folkner, Williams & Boggs 2009, IPN Progress Report 42-178"
 DAY = 86400.0
 # The gravitational constant, m³/(kg s²). Masses in kg depend on this value, but no motion does.
 _G = 6.6743e-11
-# The Julian date of the start of the ephemeris, the length of a block, days, and the number of
-# blocks.
+# _FIRST is the Julian date of the start of the ephemeris, _BLOCK the length of a block of the
+# ephemeris, days, and _BLOCKS the number of blocks.
 _FIRST, _BLOCK, _BLOCKS = 2414992.5, 32, 3426
 # The Julian year, 28 June 1969, at which DE421's constants give the motion of the Moon and its
 # core.
@@ -47,10 +47,13 @@ class Moon(eqx.Module):
     date 2451545.0. The tables begin at least ten days before `first` and end at least ten days
     after `last`.
 
-    **Fields:** `earth`, `sun` Chebyshev tables of the positions of Earth and Sun relative to the
-    Moon, m, ICRF; `angles` a Chebyshev table of the 3-1-3 Euler angles (φ, θ, ψ) of the Moon, rad,
-    body → ICRF; `constants` the constants of DE421, by name, in the units of DE421 (au, day, km);
-    `first` the argument.
+    **Fields:**
+
+    - `earth`, `sun`: Chebyshev tables of the positions of Earth and Sun relative to the Moon, m,
+      ICRF.
+    - `angles`: a Chebyshev table of the 3-1-3 Euler angles (φ, θ, ψ) of the Moon, rad, body → ICRF.
+    - `constants`: the constants of DE421, by name, in the units of DE421 (au, day, km).
+    - `first`: the argument `first`.
 
     **Raises:** `ModuleNotFoundError` without the package; `ValueError` for years outside of 1900
     to 2199, or not in order.
@@ -119,8 +122,8 @@ class Moon(eqx.Module):
         """Return the inertia of the Moon, kg m², with the oblateness J2 of DE421.
 
         **Arguments:** `beta` β = (C − A)/B and `gamma` γ = (B − A)/C, with the principal moments A
-        ≤ B ≤ C; by default the values of DE421. With `core` the result is the inertia of the mantle
-        alone, for use with `torque(core=True)`.
+        ≤ B ≤ C; `None` for the values of DE421; `core` whether a liquid core turns in the mantle,
+        so that the result is the inertia of the mantle alone, for use with `torque(core=True)`.
         """
         c = self.constants
         b = jnp.asarray(c["LBET"] if beta is None else beta)
@@ -131,8 +134,8 @@ class Moon(eqx.Module):
         return whole - self._core_inertia if core else whole
 
     def chart(self, *, core: bool = False) -> AbstractBodyChart:
-        """Return a chart for a fit: a map from two free numbers, for β and γ, to the inertia that
-        `body` returns.
+        """Return a chart for a fit: a map from two free numbers, for β = (C − A)/B and γ = (B −
+        A)/C with the principal moments A ≤ B ≤ C, to the inertia that `body` returns.
         """
         return _BetaGammaChart(self, core)
 
@@ -141,13 +144,17 @@ class Moon(eqx.Module):
     ) -> Torque:
         """Return the torque of Earth and Sun on the Moon.
 
-        **Arguments:** `degree` the highest degree of the Moon's gravity field that the Earth acts
-        on, 2 to 4; `tide` whether the Earth and the spin deform the Moon; `core` whether a liquid
-        core turns in the mantle; `figure` whether the Earth is oblate. DE421 gives the core's
-        angular velocity at `EPOCH`; the initial value, at `first`, is integrated from `EPOCH` with
-        the mantle moving as in the ephemeris. **Raises:** `ValueError` for a core in float32
-        (unless `first` is `EPOCH`): a time of decades, in s, has rounding errors of minutes in
-        float32.
+        **Arguments:**
+
+        - `degree`: the highest degree of the Moon's gravity field that the Earth acts on, 2 to 4.
+        - `tide`: whether the Earth and the spin deform the Moon.
+        - `core`: whether a liquid core turns in the mantle.
+        - `figure`: whether the Earth is oblate.
+
+        DE421 gives the core's angular velocity at `EPOCH`. The value at `first`, with which the
+        torque begins, is integrated from `EPOCH` while the mantle moves as in the ephemeris.
+        **Raises:** `ValueError` for a core in float32 (unless `first` is `EPOCH`): a time of
+        decades, in s, has rounding errors of minutes in float32.
         """
         c = self.constants
         rows = []
@@ -156,9 +163,9 @@ class Moon(eqx.Module):
             rows.append(self._mass * self._radius**n * jnp.array([-c[f"J{n}M"], *pairs]))
         earths = [(self._mu_earth, 0.0)]
         if figure:
-            # Two negative masses on the z axis, one Earth radius from the centre, give the Earth's
-            # J2. The z axis is that of the ICRF; precession turns the Earth's axis away from it by
-            # 0.1° in 20 years.
+            # Two negative masses on the z axis, each one Earth radius from the centre on either
+            # side of it, give the Earth's J2. The z axis is that of the ICRF; precession turns the
+            # Earth's axis away from it by 0.1° in 20 years.
             few, radius = -0.5 * c["J2E"] * self._mu_earth, 1e3 * c["AE"]
             earths = [(self._mu_earth - 2 * few, 0.0), (few, radius), (few, -radius)]
         law: Any = Sum(
@@ -181,8 +188,10 @@ class Moon(eqx.Module):
 
     @property
     def _core_inertia(self) -> Inertia:
-        """Return the inertia of the liquid core, kg m². Its largest moment is a fraction of the
-        Moon's largest moment, and the core is flattened; fraction and flattening are from DE421.
+        """Return the inertia of the liquid core, kg m².
+
+        The largest moment of the core is a fraction of the Moon's largest moment, and the core is
+        flattened. DE421 gives the fraction and the flattening.
         """
         c = self.constants
         share, flat = c["IFAC"] * self.body().tensor[2, 2], 1 - c["COBLAT"]
@@ -197,7 +206,9 @@ class Moon(eqx.Module):
 
     @property
     def _mu_earth(self) -> float:
-        """Return the gravitational parameter G m of the Earth, m³/s²."""
+        """Return the gravitational parameter of the Earth, m³/s²: the gravitational constant times
+        the mass of the Earth.
+        """
         c = self.constants
         return self._si_per_au3_day2 * c["GMB"] * c["EMRAT"] / (1 + c["EMRAT"])
 
@@ -217,8 +228,8 @@ class _BetaGammaChart(AbstractBodyChart):
     a fit.
 
     Here β = (C − A)/B and γ = (B − A)/C for the principal moments A ≤ B ≤ C, and β*, γ* are the
-    values of DE421. **Fields:** `moon` the ephemeris with the constants; `core` whether the inertia
-    is that of the mantle alone, without a liquid core.
+    values of DE421. **Fields:** `moon` the ephemeris, which has the constants of DE421; `core`
+    whether the inertia is that of the mantle alone, without a liquid core.
     """
 
     size: ClassVar[int] = 2
@@ -250,9 +261,14 @@ class _LiquidCore(eqx.Module):
 
     The core acts on the mantle by friction at the boundary and by the flattening of the boundary.
     The state of this torque, `own` in its methods, is the angular velocity of the core (3,), rad/s,
-    mantle frame. **Fields:** `state0` (3,) the initial angular velocity of the core; `tensor` (3,
-    3) the inertia of the core, kg m²; `friction` the torque of friction divided by the difference
-    of the two angular velocities, N m s; `gravity` the torque of Earth and Sun on the whole Moon.
+    mantle frame. **Fields:**
+
+    - `state0`: (3,) the initial angular velocity of the core, in rad/s, mantle frame.
+    - `tensor`: (3, 3) the inertia of the core, in kg m².
+    - `friction`: the torque of friction divided by the difference of the angular velocities of core
+      and mantle, in N m s.
+    - `gravity`: the torque of Earth and Sun on the whole Moon.
+
     Source: Folkner and others 2014 (DE430), section III; Williams and others 2001, Lunar rotational
     dissipation in solid body and molten core, JGR 106:27933.
     """
@@ -316,12 +332,13 @@ def _core_angular_velocity_at(core: _LiquidCore, year: float) -> Float[Array, "3
 def _integrate_core_velocity(
     field: _CoreAcceleration, initial_velocity: Array, ends: Float[Array, "2"]
 ) -> Float[Array, "3"]:
-    """Return the angular velocity (3,) of the Moon's liquid core at the last time, rad/s, mantle
-    frame.
+    """Return the angular velocity (3,) of the Moon's liquid core at the end of an integration,
+    rad/s, mantle frame.
 
     - `field`: the time derivative of the angular velocity, with the mantle as in the ephemeris.
-    - `initial_velocity`: (3,) the angular velocity at the first time.
-    - `ends`: (2,) the first and the last time, s; the last may be earlier.
+    - `initial_velocity`: (3,) the angular velocity at the time at which the integration begins.
+    - `ends`: (2,) the time at which the integration begins and the time at which it ends, s; the
+      second may be earlier than the first.
     """
     steps = dfx.PIDController(rtol=1e-12, atol=1e-12 * jnp.max(jnp.abs(initial_velocity)))
     first = jnp.sign(ends[1] - ends[0]) * jnp.minimum(DAY, jnp.abs(ends[1] - ends[0]))
@@ -341,8 +358,8 @@ def _shift_along_z(positions: Chebyshev, z: float) -> Chebyshev:
 
 
 def _subdivide_chebyshev_intervals(coefficients: np.ndarray, parts: int) -> np.ndarray:
-    """Return the Chebyshev coefficients of the same functions on shorter intervals: each interval
-    is divided into equal parts.
+    """Return the Chebyshev coefficients of given functions on shorter intervals: each interval is
+    divided into equal parts.
 
     - `coefficients`: (intervals, k, terms) the coefficients of k functions on each interval, where
       `terms` is the number of coefficients of a function.

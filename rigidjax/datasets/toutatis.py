@@ -71,8 +71,8 @@ def recording() -> Recording:
     when = [datetime.fromisoformat(row[0]) for row in OBSERVATIONS]
     t = np.array([(moment - when[0]).total_seconds() for moment in when])
     angles = jnp.asarray(np.radians([row[1:4] for row in OBSERVATIONS]))
-    # The matrix of the published angles takes ecliptic to body coordinates. The same three angles
-    # in the order of eq 31 of the notes give its transpose M, body → ecliptic.
+    # The matrix of the published angles maps ecliptic to body coordinates. The same three angles in
+    # the order of eq 31 of the notes give the transpose of this matrix, body → ecliptic.
     attitudes = [euler.to_quaternion(a, sequence="ZXZ") for a in angles]
     rates = np.radians([row[4:7] for row in OBSERVATIONS]) / DAY
     sensor = AttitudeSensor(np.radians(ATTITUDE_NOISE_DEG))
@@ -81,7 +81,7 @@ def recording() -> Recording:
 
 
 def model() -> Model:
-    """Return the model of a free body in principal axes, with a robust loss.
+    """Return the model of Toutatis as a free body in principal axes, with a robust loss.
 
     The loss grows linearly with the size of an outlier, not quadratically.
 
@@ -114,9 +114,9 @@ def _momentum_direction(body: Inertia, state: Attitude) -> Float[Array, "2"]:
 def rows(fit: Fit) -> list[Row]:
     """Return the periods and the direction of the angular momentum as rows for `report.table`.
 
-    **Arguments:** `fit` of `model()`. **Returns** rows (name, value, low, high, unit), where low
-    and high are the ends of the 95 % interval: two periods, days, and the ecliptic longitude and
-    latitude (J2000) of the angular momentum, degrees.
+    **Arguments:** `fit` the fit of the model that `model()` returns. **Returns** rows (name, value,
+    low, high, unit), where low and high are the ends of the 95 % interval: two periods, days, and
+    the ecliptic longitude and latitude (J2000) of the angular momentum, degrees.
     """
 
     def rows_of_quantities(

@@ -36,17 +36,22 @@ def family(
     *,
     hold: str = "x",
 ) -> PeriodicOrbit:
-    """Return the members of the family of `orbit` at which the coordinate `hold` has the given
+    """Return the members of the family of `orbit` at which the quantity `hold` has the given
     `values`.
 
-    The members are computed one after another: the last member and the tangent of the family there
-    predict the next member, which Newton's method corrects as in `periodic_orbit`.
+    The members are computed one after another. From each member, the tangent of the family predicts
+    the next member. Newton's method then corrects the prediction as in `periodic_orbit`.
 
-    **Arguments:** `orbit` a `PeriodicOrbit` near the first member; `values` (N,), each near the
-    value before it; `hold` `"x"`, `"z"`, `"vy"` or `"period"`, a quantity that must be monotone
-    along the family (use `follow` past a fold). **Returns** a `PeriodicOrbit` with a leading axis
-    N. It can be differentiated with respect to μ and `values` in forward and reverse mode; the
-    derivatives are exact (implicit function theorem). **Raises:** `ValueError`
+    **Arguments:**
+
+    - `orbit`: a `PeriodicOrbit` near the first member.
+    - `values`: (N,) the values of `hold`, each near the value before it.
+    - `hold`: `"x"`, `"z"`, `"vy"` or `"period"`, a quantity that must be monotone along the family
+      (use `follow` past a fold).
+
+    **Returns** a `PeriodicOrbit` with a leading axis N. It can be differentiated with respect to
+    the numbers of the scene (such as the mass ratio μ) and `values` in forward and reverse mode;
+    the derivatives are exact (implicit function theorem). **Raises:** `ValueError`
     (`EquinoxRuntimeError` under `jit`) with the first value at which Newton's method found no
     member.
 
@@ -75,9 +80,12 @@ def family(
 
 
 def _is_lost(start: Array, numbers: Array, residuals: Array) -> Bool[Array, " members"]:
-    """Return booleans (N,), one for each of the N members of a family of periodic orbits: whether
-    Newton's method failed there, or went to an orbit of less than half or more than twice the
-    period of the member before it.
+    """Return whether Newton's method lost a family of periodic orbits at each of N members, as
+    booleans (N,).
+
+    The family is lost at a member if Newton's method failed there. It is also lost if the period of
+    the member is less than half or more than twice the period of the member before it, since
+    Newton's method then went to another orbit.
 
     - `start`: (4,) the numbers x, z, v_y, T/2 of the orbit before the first member: its position,
       its velocity and half of its period T, where it crosses y = 0 at a right angle.
@@ -123,7 +131,7 @@ def _members_at_values(
     method.
 
     - `scene`: the equations of motion.
-    - `start`: (4,) the numbers of an orbit near the first member.
+    - `start`: (4,) the numbers x, z, v_y, T/2 of an orbit near the first member.
     - `held_values`: (N,) the values of the number that each member must have.
     - `index`: the index, 0 to 3, of the number that is held, which is the same for all members.
     - `tolerance`: the largest residual of a member.
@@ -132,8 +140,8 @@ def _members_at_values(
     still = jax.tree.map(lambda n: lax.stop_gradient(n) if eqx.is_array(n) else n, scene)
 
     def next_member(previous: Array, value: Scalar) -> tuple[Array, tuple[Array, Array]]:
-        # The start of Newton's method is not differentiated: the converged orbit does not depend on
-        # the start.
+        # The starting point of Newton's method is not differentiated: the converged orbit does not
+        # depend on this point.
         previous, aim = lax.stop_gradient(previous), lax.stop_gradient(value)
         guess = previous[free] + _derivative_along_family(still, previous, index) * (
             aim - previous[index]
@@ -152,13 +160,13 @@ def _members_at_values(
 def family_slope(
     scene: "AbstractReversible", orbit: PeriodicOrbit, *, hold: str = "x"
 ) -> PeriodicOrbit:
-    """Return the derivative of an orbit's start and period along its family, with respect to
-    `hold`.
+    """Return the derivative of an orbit's start and period, along its family, with respect to the
+    quantity `hold`.
 
-    **Arguments:** `orbit` a member of the family; `hold` as in `family`. **Returns** a
-    `PeriodicOrbit` that holds derivatives: `.period` is d period/d hold, for example. The
-    derivatives are exact (implicit function theorem). **Raises:** `ValueError` at a fold of the
-    family in `hold`.
+    **Arguments:** `orbit` a member of the family; `hold` one of `"x"`, `"z"`, `"vy"` and
+    `"period"`. **Returns** a `PeriodicOrbit` that holds derivatives: `.period` is d period/d hold,
+    for example. The derivatives are exact (implicit function theorem). **Raises:** `ValueError` at
+    a fold of the family in `hold`.
 
     >>> hill, start = rj.orbits.hill(), rj.Point([0.3, 0, 0], [0.0, 1.6, 0])
     >>> orbit = hill.periodic_orbit(rj.orbits.PeriodicOrbit(start, 1.2))
@@ -218,13 +226,19 @@ def follow(
 ) -> PeriodicOrbit:
     """Return the next `count` members of a family, at fixed steps of arclength, past its folds.
 
-    The method is pseudo-arclength continuation in (x, z, v_y, T/2): it goes a `step` along the
-    tangent of the family, then corrects by Newton's method across the tangent (Keller 1977, in
-    Applications of Bifurcation Theory).
+    The method is pseudo-arclength continuation in the four numbers x, z, v_y, T/2: position,
+    velocity and half of the period T, where an orbit crosses y = 0 at a right angle. It goes a
+    `step` along the tangent of the family, then corrects by Newton's method across the tangent
+    (Keller 1977, in Applications of Bifurcation Theory).
 
-    **Arguments:** `orbit` a member, which is not returned; `step` the arclength from each member to
-    the next, negative for the opposite direction; `count` the number of members; `rising` `"x"`,
-    `"z"`, `"vy"` or `"period"`, the quantity that grows in the first step if `step` is positive.
+    **Arguments:**
+
+    - `orbit`: a member, which is not returned.
+    - `step`: the arclength from each member to the next, negative for the opposite direction.
+    - `count`: the number of members.
+    - `rising`: `"x"`, `"z"`, `"vy"` or `"period"`, the quantity that grows in the first step if
+      `step` is positive.
+
     **Returns** a `PeriodicOrbit` with a leading axis; to differentiate a member, give it to
     `periodic_orbit` first. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) with the
     number of members found before the family was lost.
@@ -326,18 +340,23 @@ def bifurcation(
 ) -> PeriodicOrbit:
     """Return the member between two members of a family at which a stability index equals `value`.
 
-    Where an index is 1, a family of the same period branches off, or the family has a fold. Where
-    an index is −1, a family of twice the period branches off; where an index is cos(2πp/q), with
-    whole p and q, a family of q times the period. For planar Lyapunov orbits `index` 1 belongs to
-    motion out of the plane, and the halo orbits branch off where this index is 1.
+    At a member with an index of 1 a family of the same period branches off, or the family has a
+    fold. At an index of −1 a family of twice the period branches off. At an index of cos(2πp/q),
+    with whole numbers p and q, a family of q times the period branches off. For planar Lyapunov
+    orbits `index` 1 belongs to motion out of the plane, and the halo orbits branch off where this
+    index is 1.
 
-    **Arguments:** `orbit`, `other` two members near each other, with `value` between their
-    stability indices; `index` 0 or 1, an index into `stability_indices`; `value` the wanted
-    stability index; `hold` the quantity that the search varies along the family, `"x"`, `"z"`,
-    `"vy"` or `"period"`. The search runs in Python, not under `jit`. Source: Howell 1984,
-    doi:10.1007/BF01358403; Robin and Markellos 1980, doi:10.1007/BF01231183. **Raises:**
-    `ValueError` if `value` does not lie between the two stability indices, or if the indices are
-    complex.
+    **Arguments:**
+
+    - `orbit`, `other`: two members near each other, with `value` between their stability indices.
+    - `index`: 0 or 1, an index into the result of `stability_indices`.
+    - `value`: the wanted stability index.
+    - `hold`: the quantity that the search varies along the family, `"x"`, `"z"`, `"vy"` or
+      `"period"`.
+
+    The search runs in Python, not under `jit`. Source: Howell 1984, doi:10.1007/BF01358403; Robin
+    and Markellos 1980, doi:10.1007/BF01231183. **Raises:** `ValueError` if `value` does not lie
+    between the two stability indices, or if the indices are complex.
     """
     from scipy.optimize import brentq
 

@@ -31,11 +31,11 @@ def smallest_accurate_distance(dtype: DTypeLike) -> float:
 class ThreeBody(AbstractReversible):
     """Describe a particle under two bodies on circular orbits; `orbits.cr3bp(mu)` makes it.
 
-    The axes rotate, with the origin at the common centre of mass, the first body (mass 1 − μ) at
-    (−μ, 0, 0), the second (mass μ) at (1 − μ, 0, 0). The units are the distance between the bodies,
-    the total mass of the bodies, and 1/(angular rate of the bodies); hence the period of the bodies
-    is 2π. **Fields:** `mu` the mass ratio μ; `radii` (2,) the radii of the bodies, at which a run
-    ends by a collision.
+    The axes rotate about the common centre of mass, which is the origin. The first body (mass 1 −
+    μ) is at (−μ, 0, 0), the second body (mass μ) at (1 − μ, 0, 0). The units are the distance
+    between the bodies, the total mass of the bodies, and 1/(angular rate of the bodies); hence the
+    period of the bodies is 2π. **Fields:** `mu` the mass ratio μ; `radii` (2,) the radii of the
+    bodies: a run ends by a collision when the particle is closer to a body than its radius.
 
     >>> scene = cr3bp(0.5)
     >>> [float(r) for r in scene.distances(jnp.array([0.0, 0.0, 0.0]))]
@@ -46,7 +46,7 @@ class ThreeBody(AbstractReversible):
     radii: Float[Array, "2"]
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """Return d²x/dt² (3,), rotating axes (notes, eq 91).
+        """Return the acceleration d²x/dt² (3,) of the particle, rotating axes (notes, eq 91).
 
         It is the sum of the attraction of both bodies and the centrifugal and Coriolis
         accelerations.
@@ -64,8 +64,8 @@ class ThreeBody(AbstractReversible):
     def potential(self, x: Vector) -> Scalar:
         """Return the potential U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ at the position `x` (3,).
 
-        r₁ and r₂ are the distances from the two bodies. The acceleration without Coriolis is +∇U
-        (Szebehely 1967, sec. 1.5, where U has an additional constant).
+        r₁ and r₂ are the distances from the two bodies. The acceleration without the Coriolis
+        acceleration is +∇U (Szebehely 1967, sec. 1.5, where U has an additional constant).
         """
         x = _checks.array_of_shape(x, (3,), "x")
         r1, r2 = self.distances(x)
@@ -104,8 +104,9 @@ class ThreeBody(AbstractReversible):
         xs: Float[ArrayLike, " columns"] | Sequence[float],
         ys: Float[ArrayLike, " rows"] | Sequence[float],
     ) -> Float[Array, "rows columns"]:
-        """Return 2U on a grid of the plane z = 0; a particle with Jacobi's constant C stays where
-        2U ≥ C.
+        """Return 2U, twice the `potential` U, on a grid of the plane z = 0.
+
+        A particle with Jacobi's constant C stays where 2U ≥ C.
 
         **Arguments:** `xs` (columns,), `ys` (rows,) the coordinates x and y of the grid.
         `matplotlib.pyplot.contour(xs, ys, grid, levels=[C])` draws the curve of zero velocity
@@ -128,8 +129,8 @@ class ThreeBody(AbstractReversible):
     def approach(
         self, t: ScalarLike, state: Point
     ) -> tuple[Float[Array, "distances=2"], Float[Array, "collision_distances=2"]]:
-        """Return two arrays (2,): the distances from both bodies; and the distances that count as a
-        collision.
+        """Return two arrays (2,) for the two bodies: the distance of the particle from each body;
+        and the distance that counts as a collision with this body.
         """
         gaps = jnp.stack(self.distances(state.x))
         return gaps, jnp.maximum(
@@ -154,9 +155,10 @@ class ThreeBody(AbstractReversible):
         """Return the six exponents λ of small motions e^{λt} about an equilibrium point with z = 0.
 
         **Arguments:** `x` (3,) the equilibrium, such as a row of `lagrange_points`. The equilibrium
-        is stable to first order if no λ has a positive real part: L4 and L5 are for μ below Routh's
-        value ½(1 − √(23/27)), and L1–L3 never are. Motions in the plane obey λ⁴ + (4 − U_xx − U_yy)
-        λ² + U_xx U_yy − U_xy² = 0, motions along z obey λ² = U_zz (Szebehely 1967, sec. 5.2).
+        is stable to first order if no λ has a positive real part: L4 and L5 are stable for μ below
+        Routh's value ½(1 − √(23/27)), and L1–L3 are never stable. For motions in the plane λ⁴ + (4
+        − U_xx − U_yy) λ² + U_xx U_yy − U_xy² = 0, and for motions along z λ² = U_zz, where U_xx and
+        so on are the second derivatives of the `potential` U at `x` (Szebehely 1967, sec. 5.2).
 
         >>> moon = rj.orbits.cr3bp(0.0121505856)
         >>> bool((moon.exponents(moon.lagrange_points[3]).real < 1e-12).all())
@@ -176,7 +178,7 @@ class ThreeBody(AbstractReversible):
         `periodic_orbit`.
 
         **Arguments:** `point` 1, 2 or 3; `amplitude` along x, in the scene's unit. Source:
-        `richardson.orbit_guess`.
+        Richardson 1980, doi:10.1007/BF01229511 (third order).
         """
         return richardson.orbit_guess(self.mu, point, amplitude, None)
 
@@ -222,7 +224,8 @@ class Hill(AbstractReversible):
 
     The rotating axes are centred on the small body, with x away from the large body. The unit of
     length is μ^{1/3} times the distance between the bodies, with the mass ratio μ; the unit of time
-    is 1/(angular rate of the bodies). **Field:** `radius` of the small body.
+    is 1/(angular rate of the bodies). **Field:** `radius` the radius of the small body, in the unit
+    of length.
 
     >>> scene = hill()
     >>> float(scene.acceleration(0.0, Point([1.0, 0, 0], [0.0, 0, 0]))[0])  # 3 x − x/r³
@@ -232,7 +235,11 @@ class Hill(AbstractReversible):
     radius: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """Return d²x/dt² (3,): 2 v_y + 3x − x/r³, −2 v_x − y/r³, −z − z/r³, with r = |x|."""
+        """Return the acceleration (3,) of the particle at the position (x, y, z): 2 v_y + 3x −
+        x/r³, −2 v_x − y/r³, −z − z/r³.
+
+        Here r is the distance from the small body.
+        """
         x, y, z = components(state.x)
         vx, vy, _ = components(state.v)
         square = x * x + y * y + z * z
@@ -240,7 +247,9 @@ class Hill(AbstractReversible):
         return jnp.stack([2 * vy + 3 * x - pull * x, -2 * vx - pull * y, -z - pull * z])
 
     def jacobi_constant(self, state: Point) -> Scalar:
-        """Return Jacobi's constant C = 3x² − z² + 2/r − |v|², with r = |x| (Hill 1878).
+        """Return Jacobi's constant C = 3x² − z² + 2/r − |v|² (Hill 1878).
+
+        Here r is the distance from the small body.
 
         >>> float(Hill(jnp.asarray(0.0)).jacobi_constant(Point([1.0, 0, 0], [0.0, 0, 0])))
         5.0
@@ -268,11 +277,13 @@ class Hill(AbstractReversible):
 
 
 def hill(radius: ScalarLike = 0.0) -> Hill:
-    """Return the scene of Hill's problem, the limit of `cr3bp(mu)` as μ → 0 in units of μ^{1/3}.
+    """Return the scene of Hill's problem, the limit of `cr3bp(mu)` as the mass ratio μ → 0.
 
-    **Arguments:** `radius` of the small body, in units of μ^{1/3} times the distance between the
-    bodies; a run ends when the particle comes closer. Source: Hill 1878, doi:10.2307/2369430;
-    Szebehely 1967, sec. 10.4.
+    The unit of length in this limit is μ^{1/3} times the distance between the bodies.
+
+    **Arguments:** `radius` the radius of the small body, in units of μ^{1/3} times the distance
+    between the bodies. A run ends when the particle comes closer to the small body than its radius.
+    Source: Hill 1878, doi:10.2307/2369430; Szebehely 1967, sec. 10.4.
 
     >>> hill().lagrange_points[1].round(12).tolist()
     [0.693361274351, 0.0, 0.0]

@@ -49,15 +49,18 @@ def periodic_orbit(
 ) -> PeriodicOrbit:
     """Return the periodic orbit near `guess`, by differentiable correction.
 
-    The method finds orbits that are symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and
-    most others in use. Such an orbit crosses the plane at a right angle (y = v_x = v_z = 0) twice a
-    period T. Newton's method changes three of (x, z, v_y, T/2) at the first crossing until y, v_x,
-    v_z vanish at T/2.
+    The method finds orbits that are symmetric about the xz-plane: Lyapunov orbits, halo orbits,
+    Arenstorf's orbits, and most other orbits in use. Such an orbit crosses the plane at a right
+    angle (y = v_x = v_z = 0) twice a period T. Newton's method changes three of (x, z, v_y, T/2) at
+    the first crossing until y, v_x, v_z vanish at T/2.
 
-    **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right angle;
-    `hold` the quantity that stays fixed, `"x"`, `"z"`, `"vy"` or `"period"`, and so selects one
-    orbit of the family (use `"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` the
-    largest accepted |y|, |v_x|, |v_z| at the half period, by default 1e-12 (1e-4 in float32).
+    **Arguments:**
+
+    - `guess`: a `PeriodicOrbit(state, period)` whose state crosses the xz-plane at a right angle.
+    - `hold`: the quantity that stays fixed, `"x"`, `"z"`, `"vy"` or `"period"`, and so selects one
+      orbit of the family (use `"x"` for Lyapunov orbits, `"z"` for halo orbits).
+    - `tolerance`: the largest accepted |y|, |v_x| and |v_z| after half a period; `None` for 1e-12
+      (1e-4 in float32).
 
     **Returns** a `PeriodicOrbit`. It can be differentiated, in forward and reverse mode, with
     respect to the numbers of the scene (μ) and the held quantity: the derivatives come from the
@@ -82,8 +85,8 @@ def periodic_orbit(
     words += "hold another of x, z, vy, period, or loosen the tolerance"
     unknown = _checks.error_if(unknown, bad, words)
     corrected = insert_held(unknown, numbers[index], index)
-    # A half period of zero solves the equations for every start: Newton's method must not end
-    # there.
+    # A half period of zero solves the equations for every starting point: Newton's method must not
+    # end there.
     ratio = corrected[3] / numbers[3]
     words = "periodic_orbit: Newton's method went from the guess to an orbit of less than half or "
     words += "more than twice its period; start nearer"
@@ -92,8 +95,8 @@ def periodic_orbit(
 
 
 def index_of_held(hold: str) -> int:
-    """Return the index, 0 to 3, in (x, z, v_y, T/2) of the quantity `hold`: `"x"`, `"z"`, `"vy"` or
-    `"period"`.
+    """Return the index, 0 to 3, of the quantity `hold` (`"x"`, `"z"`, `"vy"` or `"period"`) among
+    the numbers x, z, v_y, T/2 of an orbit, where T is its period.
     """
     return _NAMES.index(_checks.require_option(hold, _NAMES, "hold"))
 
@@ -131,11 +134,14 @@ def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
 
 def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> Float[Array, "4"]:
     """Return the four numbers x, z, v_y, T/2 (4,) of a periodic orbit from three unknown numbers
-    and one that is held.
+    and one number that is held.
 
-    - `unknown`: (3,) the three numbers, in their order.
-    - `held_value`: the fourth number.
-    - `index`: the place, 0 to 3, of the fourth number.
+    The numbers are position, velocity and half of the period T, where the orbit crosses y = 0 at a
+    right angle.
+
+    - `unknown`: (3,) the three unknown numbers, in the order x, z, v_y, T/2.
+    - `held_value`: the number that is held.
+    - `index`: the place, 0 to 3, of the held number among the four numbers.
     """
     parts = list(unknown)
     parts.insert(index, held_value)
@@ -240,8 +246,9 @@ def value_and_jacobian(f: Callable[[Array], Array], x: Array) -> tuple[Array, Ar
 def newton_root(f: Callable[[Array], Array], start: Array, tolerance: float) -> Array:
     """Return a zero (n,) of the function `f` near the point `start` (n,), by Newton's method.
 
-    The steps end when all |f| are below a tenth of `tolerance`, or after `MAX_STEPS` steps. `f`
-    returns as many values (n,) as it has unknowns.
+    The method ends after the first step that began at a point where all values of |f| are at most a
+    tenth of `tolerance`, or after `MAX_STEPS` steps. `f` returns as many values (n,) as it has
+    unknowns.
     """
 
     def is_unfinished(carry: tuple[Array, Array, Array | int]) -> Array:
@@ -278,7 +285,7 @@ def _compiled_correction(
     - `scene`: the equations of motion.
     - `unknown`: (3,) the values of the other three numbers, from which Newton's method starts.
     - `held_value`: the number that is held.
-    - `index`: its place, 0 to 3, among the four numbers.
+    - `index`: the place, 0 to 3, of the held number among the four numbers.
     - `tolerance`: the largest accepted residual.
     """
     return correct_orbit(index, float(tolerance), scene, unknown, held_value)

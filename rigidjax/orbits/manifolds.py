@@ -27,8 +27,8 @@ from rigidjax.solve.run import Ends
 if TYPE_CHECKING:
     from rigidjax.orbits.reversible_scene import AbstractReversible
 
-# These are the signs of x, y, z, vx, vy, vz in the mirror image, y → −y and t → −t, of a motion.
-# The image is a motion, too.
+# The mirror image of a motion, y → −y and t → −t, is a motion, too. These are the signs by which it
+# multiplies x, y, z, vx, vy, vz.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 Branch = Literal["stable", "unstable"]
 # A manifold starts at a point of the orbit that is computed with these tolerances of a step.
@@ -41,11 +41,15 @@ _ITERATIONS = 12
 class Manifold(eqx.Module):
     """Hold motions that start near a periodic orbit, or approach it.
 
-    **Fields:** `ts` (T,) times since the start near the orbit, in the scene's unit, negative for a
-    stable manifold; `states` a `Point` with axes (N, T), one motion for each phase, NaN after a
-    collision; `phases` (N,) the points of the orbit at which the motions start, in periods since
-    `orbit.state`; `multiplier` λ, the factor by which a small distance from the orbit grows in one
-    period along the manifold.
+    **Fields:**
+
+    - `ts`: (T,) the times since the motions were near the orbit, in the scene's unit; negative for
+      a stable manifold.
+    - `states`: a `Point` with axes (N, T), one motion for each phase; NaN after a collision.
+    - `phases`: (N,) the points of the orbit near which the motions start or end, in periods since
+      `orbit.state`.
+    - `multiplier`: λ, the factor by which a small distance from the orbit, along the manifold, is
+      multiplied in one period; |λ| > 1 for an unstable manifold, |λ| < 1 for a stable one.
 
     >>> ts, phases = jnp.array([0.0, 0.1]), jnp.array([0.0])
     >>> states = Point(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)))
@@ -63,9 +67,10 @@ def unstable_direction(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Ar
     """Return two things: the real multiplier λ of an orbit with the largest |λ|; and its unit
     eigenvector (6,).
 
-    λ is an eigenvalue of the `monodromy` matrix and follows from its traces; inverse iteration and
-    one bordered linear solve give the eigenvector. Both results are NaN if no real multiplier has
-    |λ| > 1.
+    The multipliers are the eigenvalues of the `monodromy` matrix, the state-transition matrix over
+    one period. λ is computed from the traces of this matrix and of its square; inverse iteration
+    and one bordered linear solve give the eigenvector. Both results are NaN if no real multiplier
+    has |λ| > 1.
     """
     index = continuation.stability_indices(monodromy)
     real = jnp.abs(index.imag) <= 1e-6 * jnp.abs(index)
@@ -114,7 +119,15 @@ def manifold_point(
     period.
 
     An error is raised for another `branch` or `side`, and for an orbit whose state does not cross
-    the plane y = 0 at a right angle. The arguments are those of `_compiled_manifold_point`.
+    the plane y = 0 at a right angle.
+
+    - `scene`: the equations of motion.
+    - `orbit`: the unstable periodic orbit.
+    - `phase`: the point of the orbit, in periods since `orbit.state`.
+    - `branch`: `"stable"` or `"unstable"`, the manifold.
+    - `side`: 1 for the half of the manifold that goes to larger x at `orbit.state`, −1 for the
+      opposite half.
+    - `distance`: the distance of the returned state from the orbit, in (x, v).
     """
     _checks.require_option(branch, ("stable", "unstable"), "branch")
     if isinstance(side, bool) or side not in (1, -1):
@@ -183,11 +196,13 @@ def manifold(
     - `distance`: the distance between the start of each motion and the orbit, in (x, v). The error
       of the manifold is of the order of the square of this distance.
 
-    The start lies off the orbit in the direction of the eigenvector of the monodromy matrix with
-    the largest multiplier, moved along the orbit by the transition matrix. The stable manifold is
-    the mirror image, in y → −y, of the unstable manifold. **Returns** a `Manifold`. Source: Koon,
-    Lo, Marsden and Ross 2011, Dynamical Systems, the Three-Body Problem and Space Mission Design,
-    sec. 7.4. **Raises:** `ValueError` for an orbit without a real multiplier of size above 1.
+    Each motion starts at the given distance from a point of the orbit. The direction at
+    `orbit.state` is the eigenvector of the monodromy matrix with the largest multiplier; the
+    state-transition matrix maps this vector to the other points of the orbit. The stable manifold
+    is the mirror image, in y → −y, of the unstable manifold. **Returns** a `Manifold`. Source:
+    Koon, Lo, Marsden and Ross 2011, Dynamical Systems, the Three-Body Problem and Space Mission
+    Design, sec. 7.4. **Raises:** `ValueError` for an orbit without a real multiplier of size above
+    1.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
@@ -219,13 +234,13 @@ def manifold_start(
     side: int = 1,
     distance: ScalarLike = 1e-5,
 ) -> Point:
-    """Return the state near the orbit at which the motion of a manifold with the given phase
-    starts.
+    """Return the state, near an orbit, at which the motion of a stable or unstable manifold with
+    the given phase starts.
 
-    **Arguments:** `phase` the point of the orbit, in periods since `orbit.state`, any number; the
-    remaining arguments as for `manifold`. The result can be differentiated in forward mode, with
-    respect to `phase`, the orbit and the scene's numbers; with such derivatives Newton's method
-    finds connections between orbits.
+    **Arguments:** `phase` the point of the orbit, in periods since `orbit.state`, any number;
+    `orbit`, `branch`, `side` and `distance` as for `manifold`. The result can be differentiated in
+    forward mode, with respect to `phase`, the orbit and the scene's numbers; with such derivatives
+    Newton's method finds connections between orbits.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
@@ -268,7 +283,8 @@ def _manifold_trajectories(
     turn = branch == "stable"
 
     def mirror_if_stable(state: Point) -> Point:
-        # The mirror image of the stable manifold is integrated forwards in time.
+        # A motion on the stable manifold is replaced by its mirror image, which is integrated
+        # forwards in time.
         return Point(state.x * mirror[:3], state.v * mirror[3:]) if turn else state
 
     def trajectory(start: Point) -> Point:

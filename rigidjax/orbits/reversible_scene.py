@@ -19,7 +19,7 @@ from rigidjax.orbits.differential_correction import PeriodicOrbit
 class AbstractReversible(AbstractScene):
     """Define a scene whose equations do not change under (t, y) → (−t, −y).
 
-    Such scenes are `ThreeBody` and `Hill`.
+    Here t is the time and y the second coordinate. Such scenes are `ThreeBody` and `Hill`.
 
     An orbit that crosses the xz-plane at a right angle twice is then periodic (Roy and Ovenden
     1955, doi:10.1093/mnras/115.3.296).
@@ -29,8 +29,8 @@ class AbstractReversible(AbstractScene):
     def approach(
         self, t: ScalarLike, state: Point
     ) -> tuple[Float[Array, " distances"], Float[Array, " collision_distances"]]:
-        """Return two arrays (k,): the distances from the k bodies; and the distances that count as
-        a collision.
+        """Return two arrays (k,) for the k bodies: the distance of the particle from each body; and
+        the distance that counts as a collision with this body.
         """
 
     @abc.abstractmethod

@@ -28,8 +28,10 @@ def lagrange_points(mu: Scalar) -> Float[Array, "5 3"]:
 
 
 def collinear_point_distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Return three distances of collinear equilibrium points from bodies, in units of the distance
-    between the bodies: of L1 and of L2 from the second body; and of L3 from the first body.
+    """Return three distances in units of the distance between the two bodies: of L1 from the second
+    body; of L2 from the second body; and of L3 from the first body.
+
+    L1, L2 and L3 are the equilibrium points on the line through the bodies.
 
     `mu` is the mass ratio μ of the second body, 0 < μ ≤ ½.
     """
@@ -52,9 +54,9 @@ def _polynomial_root_near(coefficients: list[Scalar], start: Scalar) -> Scalar:
     """Return a root of a polynomial by seven steps of Newton's method.
 
     - `coefficients`: the coefficients, that of the highest power first.
-    - `start`: a number near the root. The estimates of the distances of the equilibrium points L1,
-      L2, L3 with which `collinear_point_distances` starts are so near to the roots, for every mass
-      ratio, that seven steps are enough.
+    - `start`: a number near the root. `collinear_point_distances` starts with estimates of the
+      distances of the equilibrium points L1, L2, L3. For every mass ratio these estimates are so
+      near to the roots that seven steps are enough.
     """
 
     def newton_step(_: object, x: Scalar) -> Scalar:
@@ -72,11 +74,11 @@ def orbit_guess(
     """Return an approximate orbit about L1, L2 or L3 (`point` 1, 2 or 3) that starts on the
     xz-plane.
 
-    Either `along_x`, the amplitude of a planar Lyapunov orbit, or `along_z`, the amplitude of a
-    halo orbit, whose sign selects the branch, is a number; the other argument is `None`. The
-    amplitude is small compared with the distance from the point to the nearer body. `mu` is the
-    mass ratio μ of the second body. Source: Richardson 1980, Celest. Mech. 22, 241,
-    doi:10.1007/BF01229511, at the phase τ = 0.
+    For a planar Lyapunov orbit `along_x` is its amplitude along x, and `along_z` is `None`. For a
+    halo orbit `along_z` is its amplitude along z, whose sign selects the branch, and `along_x` is
+    `None`. The amplitude must be small compared with the distance from the point to the nearer
+    body. `mu` is the mass ratio μ of the second body. Source: Richardson 1980, Celest. Mech. 22,
+    241, doi:10.1007/BF01229511, where the orbit has the phase τ = 0 at its start.
     """
     if point not in (1, 2, 3):
         raise ValueError(f"point: wanted 1, 2 or 3, a collinear point, got {point}")
@@ -145,8 +147,10 @@ def _checked_amplitude(value: ScalarLike | None) -> Scalar:
 
 
 def _potential_coefficient(mu: Scalar, point_distance: Scalar, point: int, n: int) -> Scalar:
-    """Return the coefficient c_n, for the power `n` of the distance, of the expansion of the
-    potential of the three-body problem about a collinear equilibrium point.
+    """Return the coefficient c_n of the power `n` of the distance in the expansion of a potential
+    about a collinear equilibrium point.
+
+    The potential is that of the three-body problem.
 
     The unit of length of the expansion is the distance of the point from the nearer body. Source:
     Richardson 1980, eq 8.

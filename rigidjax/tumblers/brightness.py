@@ -34,7 +34,7 @@ def ellipsoid(
 
     **Arguments:**
 
-    - `semi_axes`: (3,) along x, y, z, m.
+    - `semi_axes`: (3,) the semi-axes along x, y and z, m.
     - `sun`, `observer`: (3,) directions from the body to sun and observer, body frame, of any
       length.
     - `scattering`: the scattering law, `LommelSeeliger()` (also for `None`), `Geometric()` or
@@ -69,14 +69,19 @@ def mesh(
     """Return the brightness of a convex body, m², as the sum `Σ f(μ₀, μ) area` over its lit and
     visible faces.
 
-    For a body that is not convex it is the brightness without shadows. It is differentiable in the
-    vertices and directions; a face that the light (or the line of sight) just grazes has the
-    derivative of a dark face, which is zero. Source: Kaasalainen and Torppa 2001, Icarus 153:24,
-    doi:10.1006/icar.2001.6673.
+    Here f is the scattering law, and μ₀ and μ are the cosines of the angles of incidence and
+    emission.
+
+    For a body that is not convex the result is the brightness without shadows. The result is
+    differentiable in the vertices and directions. If the light or the line of sight just grazes a
+    face, the face counts as dark, and its derivatives are zero. Source: Kaasalainen and Torppa
+    2001, Icarus 153:24, doi:10.1006/icar.2001.6673.
 
     **Arguments:**
 
-    - `vertices`, `faces`: as for `rigidjax.shapes.mesh`.
+    - `vertices`: (n, 3) the corners, in metres, body frame.
+    - `faces`: (m, 3) the indices of the three corners of each face, counterclockwise as seen from
+      outside, as for `rigidjax.shapes.mesh`.
     - `sun`, `observer`, `scattering`: as for `ellipsoid`.
 
     **Raises:** the errors of `ellipsoid`, and those of `rigidjax.shapes.mesh` for faces.

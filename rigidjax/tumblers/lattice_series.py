@@ -1,9 +1,9 @@
 """Compute χ² of Fourier series in two frequencies for very many pairs of frequencies, from a table
 of sums over the readings.
 
-The normal equations of a series contain only sums over the times, at sums of multiples of the two
-frequencies. These sums are interpolated in a table, so that χ² of a pair of frequencies needs no
-loop over the readings.
+The normal equations of a series contain only sums over the readings, at frequencies j f₁ + k f₂
+with whole numbers j and k, where f₁ and f₂ are the two frequencies. These sums are interpolated in
+a table, so that χ² of a pair of frequencies needs no loop over the readings.
 """
 
 import functools
@@ -31,11 +31,14 @@ SIDES, HIGH = 2, 0.3
 
 
 class Sums(NamedTuple):
-    """Hold the table of sums over times at the frequencies f = −4/DENSE, −3/DENSE, … in 1/span.
+    """Hold sums over the readings of a light curve, at the frequencies f = −4/DENSE, −3/DENSE, … in
+    1/span.
 
-    **Fields:** `window` Σ w² exp 2πi f x; `data` Σ w z exp 2πi f x; `total` Σ z². Here x is the
-    time of a reading divided by the span, minus ½; z is its value divided by its noise; and w is
-    one over the noise.
+    The span is the time from the first to the last reading.
+
+    **Fields:** `window` (F,) the sums Σ w² exp 2πi f x; `data` (F,) the sums Σ w z exp 2πi f x;
+    `total` the sum Σ z². Here x is the time of a reading divided by the span, minus ½; z is its
+    value divided by its noise; and w is one over the noise.
     """
 
     window: Complex[Array, " f"]
@@ -89,14 +92,13 @@ def _interpolate_sums(
     table: Complex[Array, " entries"], frequencies: Float[Array, "*shape"]
 ) -> Complex[Array, "*shape"]:
     """Return complex sums over the readings of a light curve at the wanted `frequencies`,
-    interpolated in a `table` of such sums.
+    interpolated in a `table` of sums at other frequencies.
 
     The interpolation is the polynomial (Lagrange) through the nearest entries, whose number is
     `NEAR`.
 
-    - `table`: (F,) complex, the sums at F frequencies, (k − NEAR/2)/DENSE for k = 0, 1, …, F − 1,
-      in 1/span with `DENSE` frequencies for each 1/span, where the span is the time from the first
-      to the last reading.
+    - `table`: (F,) the complex sums at the frequencies (k − NEAR/2)/DENSE, in 1/span, for k = 0, 1,
+      …, F − 1. The span is the time from the first to the last reading.
     - `frequencies`: in 1/span, an array of any shape, which is also the shape of the result. The
       sum at a negative frequency is the complex conjugate of the sum at the opposite frequency.
     """
@@ -121,8 +123,8 @@ def fourier_chi2_of_padded_pairs(pairs: Array, table: Sums, order: int) -> Float
     """Return χ² of the best Fourier series `Σ c_jk exp 2πi (j f₁ + k f₂) t` for each pair of
     frequencies (f₁, f₂).
 
-    The series has the multiples |j| ≤ 2 and |k| ≤ `order`; the coefficients c_jk are those of the
-    least-squares fit to the readings.
+    The series has the multiples |j| ≤ 2 and |k| ≤ `order`; t is the time divided by the span, and
+    the coefficients c_jk are those of the least-squares fit to the readings.
 
     - `pairs`: (P, 2) the frequencies f₁ and f₂, 1/span, where the span is the time from the first
       to the last reading.
@@ -174,8 +176,8 @@ def least_squares_remainder(rows: Array, z: Array) -> tuple[Float[Array, ""], Fl
     """Fit z by a linear combination of rows. Return two things: the smallest value of `|z − cᵀ
     rows|²` over the coefficients c; and the coefficients c (k,) there.
 
-    - `rows`: (k, T) the k functions whose sum is fitted, at T times.
-    - `z`: (T,) the values that are fitted.
+    - `rows`: (k, T) the values of k functions at T times.
+    - `z`: (T,) the values to which a linear combination of the k functions is fitted.
     """
     gram, side = rows @ rows.T, rows @ z
     gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(side.size, dtype=z.dtype)
@@ -187,7 +189,7 @@ def pad_rows(rows: np.ndarray) -> np.ndarray:
     """Return the array `rows` (n, …) padded with copies of its first row, so that few different
     lengths occur and few programs are compiled.
 
-    The new length is `FEW` or a multiple of `MANY`.
+    The new length is `FEW` for at most `FEW` rows, else the next multiple of `MANY`.
     """
     size = FEW if len(rows) <= FEW else -(-len(rows) // MANY) * MANY
     return np.concatenate([rows, np.repeat(rows[:1], size - len(rows), axis=0)])
@@ -217,8 +219,8 @@ def side_peaks_of_window(table: Sums, highest: float) -> np.ndarray:
     1/span, the highest first.
 
     The spectral window is the spectrum of the times of the readings alone, which is the field
-    `window` of the `table`. A line of the spectrum whose frequency is shifted by such a position
-    gives nearly the same readings. Peaks are sought up to the frequency `highest`, 1/span.
+    `window` of the `table`. If the frequency of a line (a sinusoid) is shifted by such a position,
+    the line gives nearly the same readings. Peaks are sought up to the frequency `highest`, 1/span.
     """
     size = math.ceil(highest * DENSE)
     window = np.abs(np.asarray(table.window))[NEAR // 2 : NEAR // 2 + size]

@@ -98,12 +98,13 @@ class LightCurve(eqx.Module):
 
     - `fit`: the fit of the best motion; its covariance allows for a body that is not an ellipsoid.
     - `aliases`: all motions that were found, in the order of their misfits.
-    - `deviations`: (4,) the relative standard deviations of rotation, precession and the two ratios
-      of the best motion.
+    - `deviations`: (4,) the relative standard deviations of four numbers of the best motion: the
+      rotation period, the precession period and the two ratios of moments.
     - `pairs`: the pairs of frequencies that `two_frequencies` found.
-    - `search`, `explanation`: the two answers, as for a `Fit`. The search is `not alone` also if
-      another alias explains the data nearly as well; the model `leaves a part` also if χ² is three
-      standard deviations above its mean for the given noise.
+    - `search`: the answer whether the search found the best motion, as for a `Fit`. It is `not
+      alone` also if another alias explains the data nearly as well.
+    - `explanation`: the answer whether the model explains the readings, as for a `Fit`. It is
+      `leaves a part` also if χ² is three standard deviations above its mean for the given noise.
     """
 
     fit: Fit
@@ -146,24 +147,26 @@ def fit_light_curve(
     """Fit the motion of a free tumbler to one light curve, without an initial guess.
 
     `two_frequencies` finds pairs of frequencies in the squared flux. Each pair is taken as the
-    frequency of precession and twice the frequency of rotation, in long- and short-axis mode
-    (Kaasalainen 2001), over a grid of bodies and phases. A fit with the full model of the sensor
-    takes a few steps from each of the best starts. The best results are then continued to
-    convergence. The result lists all motions that were found. The brightness has symmetries: half
-    turns of the world (see `Brightness`), and half turns of the body about its axes. Motions that
-    differ by such a half turn have the same periods, moments and mode, and count as one motion.
+    frequency of precession and twice the frequency of rotation, in the long-axis and in the
+    short-axis mode (Kaasalainen 2001), over a grid of bodies and phases. In these modes the angular
+    momentum circulates in the body about the axis of the smallest or of the largest moment. A fit
+    with the full model of the sensor takes a few steps from each of the best starts. The best
+    results are then continued to convergence. The result lists all motions that were found. The
+    brightness has symmetries: half turns of the world (see `Brightness`), and half turns of the
+    body about its axes. Motions that differ by such a half turn have the same periods, moments and
+    mode, and count as one motion.
 
     The intervals allow for a shape that is not an ellipsoid by consider parameters (Tapley, Schutz
     and Born 2004, Statistical Orbit Determination, ch. 6). The brightness is multiplied by 1 + n·S
-    n, where n (3,) is the direction half way between sun and observer in the body frame, and the
-    entries of the matrix S (3, 3) are independent with a standard deviation of 4 %.
+    n, where n (3,) is the unit vector half way between sun and observer in the body frame. The
+    entries of the matrix S (3, 3) are independent random numbers with a standard deviation of 0.04.
 
     **Arguments:**
 
     - `model`: a model of one recording with one `Brightness` sensor and no torque; make the `level`
       of the sensor a `Free` unless the level is known.
     - `shortest`: the shortest period of a line in the spectrum, s; `None` for four times the median
-      distance of the samples.
+      interval between the samples.
     - `count`: the largest number of pairs of frequencies. If more pairs fit, the search has
       `not ended`.
     - `tolerance`: as for `rigidjax.identify.fit`.
@@ -240,7 +243,7 @@ def _log_periods_moment_ratios_and_mode_number(
 
     Here h is the angular momentum and T the kinetic energy. If the second result is below 1, the
     momentum circulates in the body about the axis of the smallest moment (long-axis mode), else
-    about that of the largest moment (short-axis mode).
+    about the axis of the largest moment (short-axis mode).
 
     - `x`: (n,) the free numbers of the model, which determine the body and its initial state.
     - `model`: a model of one recording of a free body.
@@ -258,9 +261,11 @@ def _log_periods_moment_ratios_and_mode_number(
 def _derivatives_of_log_periods_and_ratios(
     x: Float[Array, " n"], model: Model
 ) -> Float[Array, "4 n"]:
-    """Return the derivatives (4, n) of the logarithms of the rotation period, the precession period
-    and the two ratios of moments (the two smaller moments divided by the largest), with respect to
-    the n free numbers.
+    """Return the derivatives (4, n) of the logarithms of the two periods and the two ratios of
+    moments with respect to the n free numbers.
+
+    The periods are the rotation period and the precession period; the ratios are the two smaller
+    moments divided by the largest.
 
     - `x`: (n,) the free numbers of the model, at which the derivatives are taken.
     - `model`: a model of one recording of a free body.
@@ -269,14 +274,16 @@ def _derivatives_of_log_periods_and_ratios(
 
 
 def _motion_of_free_numbers(model: Model, x: Array, cost: float) -> Alias:
-    """Return the motion with the free numbers `x` as an `Alias`, which also holds its periods, its
-    mode (the axis, of the smallest or of the largest moment, about which the momentum circulates in
-    the body) and the two smaller moments divided by the largest.
+    """Return the motion with the free numbers `x` as an `Alias`.
+
+    The `Alias` also holds the two periods of the motion, its mode, and the two smaller moments
+    divided by the largest. The mode is `"long"` or `"short"`, for a momentum that circulates in the
+    body about the axis of the smallest or of the largest moment.
 
     - `model`: the model of the light curve.
     - `x`: (n,) the free numbers.
-    - `cost`: half of χ² of the motion, where χ² is the sum over the readings of (error divided by
-      noise)².
+    - `cost`: half of χ² of the motion. χ² is a sum over the readings, of the squares of error
+      divided by noise.
     """
     numbers, middle = (np.asarray(v) for v in _log_periods_moment_ratios_and_mode_number(x, model))
     rotation, precession, *ratios = np.exp(numbers)
@@ -286,14 +293,14 @@ def _motion_of_free_numbers(model: Model, x: Array, cost: float) -> Alias:
 
 
 def _distinct_motions(model: Model, ends: list[Attempt]) -> list[Alias]:
-    """Return one `Alias` (a motion with its free numbers, misfit and periods) for each different
-    motion among the results of searches, the smallest misfit first.
+    """Return the different motions among the results of searches, each as an `Alias`, the smallest
+    misfit first.
 
     Results whose misfit is not finite are left out; `ValueError` is raised if no result is left.
 
     - `model`: the model of the light curve.
-    - `ends`: the results of the searches, each with its free numbers `x` and its `cost`, half of χ²
-      (the sum over the readings of (error divided by noise)²), which is the misfit.
+    - `ends`: the results of the searches, each with its free numbers `x` and its misfit `cost`. The
+      misfit is half of χ², a sum over the readings of the squares of error divided by noise.
     """
     out: list[Alias] = []
     for end in sorted(ends, key=lambda one: float(one.cost)):
@@ -311,9 +318,11 @@ def _distinct_motions(model: Model, ends: list[Attempt]) -> list[Alias]:
 
 
 def _is_same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
-    """Return whether the motions `a` and `b` have the same mode (the axis about which the momentum
-    circulates in the body), and nearly the same periods and ratios of moments (the two smaller
-    moments divided by the largest).
+    """Return whether the motions `a` and `b` have the same mode, and nearly the same periods and
+    ratios of moments.
+
+    The mode is the axis about which the momentum circulates in the body. The ratios are the two
+    smaller moments divided by the largest.
 
     `tolerance` (4,) has the largest differences of the logarithms of the rotation period, the
     precession period and the two ratios of moments.

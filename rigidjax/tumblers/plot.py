@@ -34,9 +34,9 @@ def light_curve(
 
     **Arguments:**
 
-    - `ts`: (T,) s.
+    - `ts`: (T,) the times, s.
     - `values`: (T,) readings, NaN for a gap.
-    - `periods`: s, one, several or none.
+    - `periods`: one period, several or none, s.
     - `model`: (T,) the prediction of a motion at `ts`, such as `values - fit.residuals[0][:, 0]`,
       or `None`.
     - `quantity`: `mag` (bright is up) or `flux`.
@@ -45,7 +45,9 @@ def light_curve(
     - `ax`: matplotlib axes, one for the light curve and one for each period, or `None` for new
       axes.
 
-    **Returns** the axes (1 + periods,). **Raises** as `rigidjax.plot`.
+    **Returns** the axes, an array of length 1 + the number of periods. **Raises** `ValueError` for
+    shapes that do not fit, for values that are all NaN or infinite, for a period that is not
+    positive, and for another `quantity` or `time_unit`; `ModuleNotFoundError` without matplotlib.
 
     >>> t = np.linspace(0.0, 7200.0, 50)
     >>> light_curve(t, 15 + 0.1 * np.cos(2 * np.pi * t / 3600), 3600.0)[1].get_xlabel()
@@ -74,7 +76,7 @@ def light_curve(
         wide = np.append(np.diff(t) > 10 * np.median(np.diff(t)), False)
         line = np.where(wide, np.nan, predicted)
         ax[0].plot(t / seconds, line, color=COLOURS[1], lw=1.0, label="motion")
-        # The legend is beside the picture, since inside it would cover data.
+        # The legend is beside the picture, since inside the picture it would cover data.
         ax[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     ax[0].set(xlabel=f"time, {time_unit}", ylabel=label)
     for one, period in zip(ax[1:], folds, strict=True):

@@ -82,12 +82,16 @@ class Geometric(AbstractScattering):
 class LommelSeeliger(AbstractScattering):
     """Describe single scattering, `2 μ₀ μ/(μ₀ + μ)`, as by the dark surfaces of asteroids.
 
-    An ellipsoid has `π (|p||q| + p·q)/(|p| + |q|) [1 − (1 − z²) artanh(z)/z]/z²` with `z = |p +
-    q|/(|p| + |q|)`, p and q (see the module) times the product of the semi-axes. It is a form of
-    the result of Muinonen and Lumme 2015, A&A 584:A23, doi:10.1051/0004-6361/201526456, that keeps
-    its digits at any phase. Near zero phase φ the brightness changes as φ² ln φ: the second
-    derivative with respect to a direction is −∞ at zero phase, but the computed value is finite,
-    and wrong.
+    Here μ₀ and μ are the cosines of the angles of incidence and emission.
+
+    An ellipsoid has the brightness `π (|p||q| + p·q)/(|p| + |q|) [1 − (1 − z²) artanh(z)/z]/z²`
+    with `z = |p + q|/(|p| + |q|)`, `p = D A⁻¹ s` and `q = D A⁻¹ o`. Here s and o are the unit
+    vectors to sun and observer, A is the symmetric matrix that maps the unit sphere to the
+    ellipsoid, and D = det A is the product of the semi-axes. This is a form of the result of
+    Muinonen and Lumme 2015, A&A 584:A23, doi:10.1051/0004-6361/201526456, that keeps its digits at
+    any phase. The phase φ is the angle between the directions to sun and observer. Near φ = 0 the
+    brightness changes as φ² ln φ: the second derivative with respect to a direction is −∞ at φ = 0,
+    but its computed value is finite, and wrong.
 
     >>> float(LommelSeeliger().per_area(jnp.asarray(0.5), jnp.asarray(0.5)))
     0.5
@@ -108,9 +112,12 @@ class LommelSeeliger(AbstractScattering):
 class Lambert(AbstractScattering):
     """Describe the scattering of bright, rough surfaces, `3/2 μ₀ μ`.
 
-    For a triaxial ellipsoid it has no elementary form: it needs two integrals of one variable, with
-    32 points each. The relative error is below 1e-9 for axes up to 30 : 1 and phases up to 170°;
-    errors of first and second derivatives are below 1e-8 and 1e-6 of the brightness.
+    Here μ₀ and μ are the cosines of the angles of incidence and emission.
+
+    The brightness of a triaxial ellipsoid has no elementary form: it needs two integrals of one
+    variable, with 32 points each. The relative error is below 1e-9 for ratios of axes up to 30 and
+    for phases (angles between the directions to sun and observer) up to 170°. The errors of first
+    and second derivatives are below 1e-8 and 1e-6 times the brightness.
 
     >>> float(Lambert().per_area(jnp.asarray(1.0), jnp.asarray(0.5)))
     0.75
@@ -193,9 +200,9 @@ def _artanh_sqrt_ratio_minus_one_over_w(w: Array, one_minus_w: Array) -> Array:
     far = jnp.where(near, 0.5, w)
     z = jnp.sqrt(far)
     is_nonzero = jnp.abs(one_minus_w) > 0
-    # At zero phase 1 − w is 0, and the caller multiplies the result by 1 − w. The logarithm
-    # is set to 0 here, since x ln x tends to 0. The derivative is right as well, since `complement`
-    # has a minimum at zero phase.
+    # At zero phase 1 − w is 0, and the caller multiplies the result by 1 − w. The logarithm is set
+    # to 0 here, since x ln x tends to 0. The derivative is right as well, since 1 − w has a minimum
+    # at zero phase.
     logarithm = jnp.where(is_nonzero, jnp.log(jnp.where(is_nonzero, one_minus_w, 1.0)), 0.0)
     return jnp.where(near, series, ((jnp.log1p(z) - 0.5 * logarithm) / z - 1.0) / far)
 
@@ -208,13 +215,13 @@ def _lambert_integral(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
       squared semi-axes.
     - `sun`, `observer`: (3,) unit vectors from the body, body axes.
 
-    The integral is computed over the unit normals n of the surface, with dA = det E/(n·En)² dn.
-    Over the whole lit part, where μ < 0 on the part that the observer does not see, the integral is
-    `sun·T observer`, where `T = π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 to ∞ (the
-    integrals over n and over τ are two forms of one Gaussian integral). Therefore `B(sun, observer)
-    = sun·T observer + B(sun, −observer)`, where B is the integral over the lit and visible part,
-    and only the smaller of these two B is computed as an integral over normals, those of a lune of
-    the unit sphere.
+    The integral is computed over the unit normals n of the surface, with dA = det E/(n·En)² dn. The
+    integral over the whole lit part is `sun·T observer`; there μ is negative where the observer
+    does not see the surface. The matrix T is `π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 to ∞
+    (the integrals over n and over τ are two forms of one Gaussian integral). With B for the
+    integral over the lit and visible part, therefore `B(sun, observer) = sun·T observer + B(sun,
+    −observer)`. Only the smaller of `B(sun, observer)` and `B(sun, −observer)` is computed as an
+    integral over normals, which form a lune of the unit sphere.
     """
     minors = cofactors(shape)
     total, of_sun = shape[0, 0] + shape[1, 1] + shape[2, 2], apply(minors, sun)
@@ -238,8 +245,10 @@ def _lambert_integral(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
 
 
 def _integral_over_lune_of_normals(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """Return `∫ (n·sun)(n·observer)/(n·En)² dn` over the unit vectors n for which both n·sun and
-    n·observer are positive, which is a lune of the unit sphere.
+    """Return `∫ (n·sun)(n·observer)/(n·En)² dn` over the lune of the unit sphere in which both
+    n·sun and n·observer are positive.
+
+    Here E is the tensor `shape` of an ellipsoid.
 
     - `shape`: (3, 3) m², the tensor E of an ellipsoid, whose eigenvalues are the squared semi-axes.
     - `minors`: (3, 3) the matrix of cofactors of E.
@@ -256,8 +265,8 @@ def _integral_over_lune_of_normals(shape: Mat3, minors: Mat3, sun: Vec3, observe
     width = jnp.arctan2(jnp.where(apart, sine, 0.0), -dot(sun, observer))
     e_edge, e_pole, turned = apply(shape, edge), apply(shape, pole), apply(minors, edge)
     d0, d1, d2 = dot(sun, apply(minors, sun)), -dot(sun, turned), dot(edge, turned)
-    # The integrand has a peak at the minimum of d, as in an elliptic integral. After two Landen
-    # transformations of the variable this peak is gone.
+    # The integrand has a peak at the minimum of d, a determinant that is defined below, as in an
+    # elliptic integral. After two Landen transformations of the angle this peak is gone.
     m0, m1, m2 = (jax.lax.stop_gradient(d) for d in (d0, d1, d2))
     mean, far = 0.5 * (m0 + m2), jnp.sqrt(0.25 * (m0 - m2) ** 2 + m1 * m1)
     first = 0.5 * jnp.arctan2(2.0 * m1, m0 - m2)
@@ -293,7 +302,7 @@ def _integral_over_lune_of_normals(shape: Mat3, minors: Mat3, sun: Vec3, observe
 
 
 def _sqrt_or_zero(x: Scalar) -> Scalar:
-    """Return √x of a number x ≥ 0, with the derivative 0 at x = 0, where that of the root would be
+    """Return √x of a number x ≥ 0, with the derivative 0 at x = 0, where the derivative of √x is
     infinite.
 
     The number x is zero if an ellipsoid without thickness is seen edge on.

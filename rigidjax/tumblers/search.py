@@ -1,5 +1,5 @@
 """Find the motions of a tumbler that have given pairs of frequencies, by least-squares searches
-from starts on a grid.
+whose starting points are on a grid.
 """
 
 from typing import Any
@@ -24,12 +24,14 @@ from rigidjax.tumblers import starts
 from rigidjax.tumblers.sensor import sun_observer_bisector
 from rigidjax.tumblers.two_frequencies import pad_light_curve
 
-# The search takes STEPS steps from each start, where one run of a program computes FIRST starts.
-# Then it takes MORE steps from each of the SECOND best results.
+# The search takes STEPS steps from each start; one run of a program computes a chunk of FIRST
+# starts. Then the search takes MORE steps from each of the best results, which are SECOND in
+# number.
 FIRST, STEPS, SECOND, MORE = 96, 12, 24, 60
-# Finite differences with respect to the free numbers, which are of order one, have this step.
+# Derivatives with respect to the free numbers are finite differences with this step. The free
+# numbers are of order one.
 DIFFERENCE = 1e-6
-# The natural logarithm of a flux changes by this number if its magnitude changes by one.
+# The natural logarithm of a flux decreases by this number if the magnitude increases by one.
 MAGNITUDE = 0.4 * np.log(10.0)
 
 
@@ -68,8 +70,13 @@ def starts_from_frequency_pairs(
 ) -> list[Float[Array, " n"]]:
     """Return the best starting points over all pairs of frequencies, each as free numbers (n,).
 
-    **Arguments:** `model` and its only `reading`; `t` (T,) s; `squared_flux` (T,);
-    `noise` (T,) its standard deviations or `None`; `pairs` (P, 2), 1/s.
+    - `model`: the model of the light curve.
+    - `reading`: the readings of the one `Brightness` sensor.
+    - `t`: (T,) the times since the first time, s.
+    - `squared_flux`: (T,) the squared fluxes, divided by the square of the median flux.
+    - `noise`: (T,) the standard deviations of `squared_flux`, or `None`.
+    - `pairs`: (P, 2) the pairs of frequencies, 1/s, that of the mean precession and twice that of
+      the rotation.
     """
     sensor: Any = reading.sensor
     sigma = np.ones(t.shape) if noise is None else noise
@@ -84,7 +91,7 @@ def starts_from_frequency_pairs(
     for pair in pairs:
         for mode in starts.MODES:
             candidates = starts.candidate_motions(pair, mode, light, middle, areas, 3)
-            # The best body of each mode of each pair comes first, since the misfits on a grid
+            # The best body for each pair and each mode comes first, since the misfits on a grid
             # cannot decide between modes and pairs.
             best_of += candidates[: len(starts.ABOUT)]
             others += candidates[len(starts.ABOUT) :]

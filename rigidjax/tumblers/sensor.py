@@ -29,7 +29,8 @@ class Brightness(AbstractSensor):
     A flux is `level · B/(π (abc)^⅔)`, a magnitude `level − 2.5 log₁₀(B/(π (abc)^⅔))`, with B the
     result of `rj.tumblers.brightness.ellipsoid` for the semi-axes a, b, c. The level is therefore
     the brightness of a sphere of the same volume at zero phase, and the prediction depends only on
-    the ratios of the semi-axes. Readings (T,) are reduced to unit distances.
+    the ratios of the semi-axes. Readings (T,) are reduced to unit distances from sun and observer.
+    Zero phase means that sun and observer are in the same direction.
 
     Some rotations of the attitude in the world do not change the brightness, so that a light curve
     does not determine them. For fixed directions such rotations are the half turns about `sun ×
@@ -46,12 +47,12 @@ class Brightness(AbstractSensor):
     - `scattering`: the law, `LommelSeeliger()` (also for `None`), `Geometric()` or `Lambert()` of
       `rj.tumblers.brightness`.
     - `noise`: the standard deviation of a reading, in its unit; `None` to estimate it.
-    - `unit`: of a reading, `"flux"` or `"mag"`.
-    - `level`: the flux (1 for `None`) or magnitude (0 for `None`) of the sphere. It is seldom
-      known: make the level a `Free`.
-    - `semi_axes`: (3,) along the body's axes; `None` for the semi-axes of the uniform ellipsoid
-      that has the body's ratios of moments, which are proportional to √λ_k of the second moments
-      λ_k of the body.
+    - `unit`: the unit of a reading, `"flux"` or `"mag"`.
+    - `level`: the flux or magnitude of a sphere of the same volume at zero phase; `None` for a flux
+      of 1 or a magnitude of 0. The level is seldom known: make it a `Free`.
+    - `semi_axes`: (3,) along the body's axes; `None` for those of the uniform ellipsoid whose
+      moments of inertia have the same ratios as the moments of the body. These semi-axes are
+      proportional to √λ_k, where λ_k are the second moments of the body.
     - `offset`: the clock offset, s: the reading with the time stamp t was taken at t + offset.
 
     **Raises** `ValueError` for a direction of length zero, a noise or semi-axis that is not
@@ -151,8 +152,8 @@ class Brightness(AbstractSensor):
         return 0.5 * float(turns[np.argmax(power)])
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return two things: a mask (T,), true for each of the `values` that must be refused, a
-        flux far below zero; and a message with the reason.
+        """Return two things: a mask (T,), true for each of the `values` that is a flux below −10
+        times the noise, and must be refused; and a message with the reason.
         """
         noise = np.std(values) if self.noise is None else np.asarray(self.noise)[0]
         wrong = values < 0 if self.unit == "flux" else np.zeros(values.shape, bool)

@@ -2,11 +2,12 @@
 
 The squared brightness F² of an ellipsoid is nearly a quadratic form of the direction n half way
 between sun and observer: `F² ∝ Σ_k M_k (n·r_k)²`, with r_k the body's axes in the world and `M =
-(bc)², (ca)², (ab)²` for the semi-axes a, b, c (exactly at zero phase, for projected areas). For a
-given body, energy and phase of the rotation F² is therefore linear in the six numbers of the matrix
-n nᵀ, written in a frame whose z axis is along the angular momentum. A linear least-squares fit
-finds the direction of the momentum, the initial angle about the momentum and the level of
-brightness together. The grid covers the shape of the body and the phase of its rotation.
+(bc)², (ca)², (ab)²` for the semi-axes a, b, c. This relation is exact if the sun is behind the
+observer and the brightness is the projected area. For a given body, energy and phase of the
+rotation F² is therefore linear in the six numbers of the matrix n nᵀ, written in a frame whose z
+axis is along the angular momentum. A linear least-squares fit finds the direction of the momentum,
+the initial angle about the momentum and the level of brightness together. The grid covers the shape
+of the body and the phase of its rotation.
 """
 
 import math
@@ -29,8 +30,9 @@ from rigidjax.tumblers.lattice_series import least_squares_remainder
 # The grid has the ratios b/a of the semi-axes in MIDDLE, the ratios c/b in SHORT, and PHASES phases
 # in half a rotation.
 MIDDLE, SHORT, PHASES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9), (0.5, 0.65, 0.8, 0.93), 12
-# Each start is tried with these additional rotations about the direction n, rad, because they
-# hardly change the brightness.
+# These are angles of rotations, rad, about the direction n half way between sun and observer. Such
+# a rotation hardly changes the brightness, so that the fit on the grid does not determine its
+# angle: each start is tried with all of these angles.
 ABOUT = (0.0, math.pi / 3, 2 * math.pi / 3)
 MODES = ("long", "short")
 
@@ -57,17 +59,22 @@ def candidate_motions(
     areas: np.ndarray | None,
     count: int,
 ) -> list[Candidate]:
-    """Return the best motions of the grid that have a given pair of frequencies, in the order of
-    their misfits.
+    """Return the best motions, on a grid of bodies and phases, that have a given pair of
+    frequencies.
+
+    The motions are in the order of their misfits.
 
     **Arguments:**
 
-    - `pair`: the frequencies of the mean precession and of twice the rotation, 1/s.
-    - `mode`: "long" or "short", the axis about which the momentum circulates.
+    - `pair`: (2,) two frequencies, 1/s: that of the mean precession, and twice that of the
+      rotation.
+    - `mode`: "long" or "short", for a momentum that circulates in the body about the axis of the
+      smallest or of the largest moment.
     - `light`: three arrays (T,): the times since the first time, s; the squared fluxes; and one
       over the noise of the squared fluxes.
     - `bisector`: (3,) the direction n half way between sun and observer, world frame.
-    - `areas`: (3,) the numbers M (see the module) of a known ellipsoid, or `None`.
+    - `areas`: (3,) the numbers (bc)², (ca)², (ab)² of an ellipsoid whose semi-axes a, b, c are
+      known, or `None`.
     - `count`: the number of bodies of the grid for which motions are returned.
     """
     b, ratio = np.meshgrid(MIDDLE, SHORT, indexing="ij")
@@ -82,7 +89,7 @@ def candidate_motions(
     arrays = jnp.asarray(moments), jnp.asarray(forms), jnp.asarray(pair), *light
     motions = _fit_motions_on_grid_of_phases(jnp.asarray(mode == "long"), *arrays)
     misfits, sides, q, omega = (np.asarray(v) for v in motions)
-    # The best phase is taken for each body.
+    # Each body is used with the phase of its smallest misfit.
     phase, least = misfits.argmin(axis=1), misfits.min(axis=1)
     out = []
     for k in np.argsort(least)[:count]:
@@ -101,11 +108,12 @@ def _rotations_from_momentum_frame_to_world(
     fitted_entries: np.ndarray, bisector: np.ndarray
 ) -> list[tuple[Any, ...]]:
     """Return the quaternions (4,), one for each angle of `ABOUT`, that rotate the frame of the
-    angular momentum (its z axis is along the momentum) to the world frame.
+    angular momentum to the world frame.
 
-    Each of these rotations takes the direction n, half way between sun and observer, from the first
-    frame to the second. They differ in the angle of a further rotation about n in the world, which
-    `fitted_entries` does not determine: `ABOUT` has three such angles, rad.
+    The z axis of the frame of the angular momentum is along the momentum. Each of the rotations
+    takes the direction n, half way between sun and observer, from this frame to the world frame.
+    The rotations differ in the angle of a further rotation about n in the world. The
+    `fitted_entries` do not determine this angle: `ABOUT` has three values of it, rad.
 
     - `fitted_entries`: (6,) the entries xx, yy, zz, xy, xz, yz of the fitted matrix n nᵀ in the
       frame of the momentum, whose eigenvector of the largest eigenvalue is taken as n.
@@ -131,9 +139,11 @@ def _shortest_rotation(u: Any, v: Any, xp: ModuleType) -> Any:
 
 
 def _rate_at_unit_momentum(moments: Array, momentum2_over_2energy: Array) -> Float[Array, "3"]:
-    """Return the body rate (3,), in principal axes, of a motion with the angular momentum h = 1 and
-    the given h²/2T, where T is the kinetic energy, at the time at which the component of the rate
-    along the axis of the middle moment is zero.
+    """Return the body rate (3,), in principal axes, of a free motion with the angular momentum h =
+    1.
+
+    The kinetic energy T follows from the given h²/2T. The rate is that at a time at which its
+    component along the axis of the middle moment is zero.
 
     - `moments`: (3,) the principal moments, ascending.
     - `momentum2_over_2energy`: h²/2T, a number between the smallest and the largest moment.
@@ -155,8 +165,9 @@ def _rate_with_period_ratio(
 
     - `moments`: (3,) the principal moments, ascending.
     - `period_ratio`: the wanted quotient of the two periods.
-    - `is_long_axis_mode`: true for a motion in the long-axis mode (the momentum circulates in the
-      body about the axis of the smallest moment), false for the short-axis mode.
+    - `is_long_axis_mode`: true for a motion in the long-axis mode, in which the momentum circulates
+      in the body about the axis of the smallest moment; false for the short-axis mode, with the
+      axis of the largest moment.
     """
     body, pure = Inertia(jnp.diag(moments)), jnp.where(is_long_axis_mode, moments[0], moments[2])
 
@@ -194,21 +205,25 @@ def _fit_motions_on_grid_of_phases(
     Float[Array, "bodies phases 4"],
     Float[Array, "bodies phases 3"],
 ]:
-    """Return four arrays for the motions of S bodies that start at P = `PHASES` phases of half a
-    rotation: the misfits χ² (S, P); the six fitted entries xx, yy, zz, xy, xz, yz of n nᵀ times the
-    level (S, P, 6); the initial attitudes (S, P, 4), principal axes → frame of the angular
-    momentum; and the initial rates (S, P, 3), rad/s, principal axes.
+    """Return four arrays for the motions of S bodies, each started at P phases, which divide half a
+    rotation into P equal parts (P = `PHASES`).
 
-    Here n is the direction half way between sun and observer in a frame whose z axis is along the
-    angular momentum, and the level is the factor by which the model Σ_k M_k (n·r_k)² is multiplied
-    to give the squared fluxes, where r_k are the principal axes in that frame. All motions have the
-    same `pair` of frequencies. A body that has no such motion has the misfit infinity.
+    The four arrays are the misfits χ² (S, P); the six fitted entries xx, yy, zz, xy, xz, yz of the
+    matrix n nᵀ times the level (S, P, 6); the initial attitudes (S, P, 4), principal axes → frame
+    of the angular momentum; and the initial rates (S, P, 3), rad/s, principal axes.
+
+    The frame of the angular momentum has its z axis along the momentum. In this frame n is the
+    direction half way between sun and observer, and r_k are the principal axes. The level is the
+    factor by which the model Σ_k M_k (n·r_k)² is multiplied to give the squared fluxes. All motions
+    have the same `pair` of frequencies. A body that has no motion with this `pair` has the misfit
+    infinity.
 
     - `is_long_axis_mode`: true for motions in the long-axis mode, false for the short-axis mode.
     - `moments`: (S, 3) the principal moments of each body, ascending.
     - `forms`: (S, 3) the numbers M = (bc)², (ca)², (ab)² of each body with the semi-axes a, b, c,
       divided by a common factor.
-    - `pair`: (2,) the frequencies of the mean precession and of twice the rotation, 1/s.
+    - `pair`: (2,) two frequencies, 1/s: that of the mean precession, and twice that of the
+      rotation.
     - `t`: (T,) the times of the readings since the first, s.
     - `squared_flux`: (T,) the squared fluxes.
     - `weights`: (T,) one over the noise of the squared fluxes.

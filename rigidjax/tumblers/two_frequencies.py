@@ -25,11 +25,13 @@ from rigidjax.tumblers.lattice_series import (
 # two frequencies of a pair. The first frequency is on a grid with the step STEP, 1/span, where the
 # span is the time from the first to the last reading.
 LINES, STEP = 3, 0.1
-# The largest second frequency of the search is SECOND times the highest of these lines.
+# The largest second frequency of the search is SECOND times the highest frequency of the LINES
+# strongest lines.
 SECOND = 1.5
 # For each pair that is returned, TRIED pairs are refined.
 TRIED = 2
-# Squares of numbers above LARGEST may overflow; the spectrum of more than MOST lines takes hours.
+# Squares of numbers above LARGEST may overflow. If more than MOST of the shortest periods fit into
+# the span, a search takes hours.
 LARGEST, MOST = 1e100, 1e5
 # The number of times is padded to a multiple of BLOCK, so that few programs are compiled.
 BLOCK = 256
@@ -42,12 +44,13 @@ AROUND = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
 
 
 class TwoFrequencies(eqx.Module):
-    """Hold the result of `two_frequencies`, in the order of the misfits.
+    """Hold the result of `two_frequencies`: pairs of frequencies, in the order of their misfits.
 
     **Fields:**
 
     - `frequencies`: (n, 2) the pairs, 1/s.
-    - `misfits`: (n,) χ² of the series of each pair.
+    - `misfits`: (n,) χ² of the best Fourier series of each pair. If the noise is not known, it is
+      chosen such that the smallest misfit equals `dof`.
     - `dof`: the degrees of freedom of each χ².
     - `scatter`: the standard deviation of the residuals of the best pair, in the values' unit.
     - `lines`: (m,) the strongest lines of the spectrum, 1/s.
@@ -80,26 +83,26 @@ def two_frequencies(
     The multiples j go from −2 to 2, k from −`order` to `order`. One of the three strongest lines of
     the spectrum must be j f₁ + k f₂: all pairs with this property are tried on a grid, and the best
     ones are refined. Then the aliases of the best pairs are tried. An alias of a pair differs from
-    the pair in one of three ways. One frequency or both are shifted by a side peak of the spectral
-    window, or by half of the frequency of a side peak (readings at night have side peaks at one and
-    two cycles a day). Or one frequency is halved or doubled. Or f₁ is added to f₂ or subtracted
-    from f₂. Several pairs give the same set of lines. All pairs that fit are returned, since only a
-    fit of the motion can decide between the pairs.
+    the pair in one of three ways. In the first, one frequency or both are shifted by the position
+    of a side peak of the spectral window, or by half of this position (readings at night have side
+    peaks at one and two cycles a day). In the second, one frequency is halved or doubled. In the
+    third, f₁ is added to f₂ or subtracted from f₂. Several pairs give the same set of lines. All
+    pairs that fit are returned, since only a fit of the motion can decide between the pairs.
 
     **Arguments:**
 
     - `t`: (T,) increasing times, s; gaps are allowed.
     - `values`: (T,) fluxes or their squares.
-    - `noise`: their standard deviation, one number or (T,); `None` if it is not known.
+    - `noise`: the standard deviation of `values`, one number or (T,); `None` if it is not known.
     - `order`: the largest multiple k of f₂.
-    - `shortest`: the shortest period of a line, s; `None` for four times the median distance of the
-      times.
+    - `shortest`: the shortest period of a line, s; `None` for four times the median interval
+      between the times.
     - `count`: the largest number of pairs.
 
     **Returns** `frequencies`, `misfits`, `dof`, `scatter` and `lines` (`TwoFrequencies`).
 
-    Source: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021 (with all |j| and
-    |k| up to one order); the linear fit is that of Lomb 1976, doi:10.1007/BF00648343, for many
+    Source: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021 (there with the
+    same largest |j| and |k|); the linear fit is that of Lomb 1976, doi:10.1007/BF00648343, for many
     lines. **Raises:** `ValueError` for times that do not increase, NaN, too few values.
 
     >>> t = np.linspace(0.0, 60.0, 300)
@@ -233,9 +236,11 @@ def _best_sinusoid(
 def _pairs_and_chi2_with_strong_line(
     table: Sums, lines: np.ndarray, order: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return two things: the pairs of frequencies (P, 2), on a grid, for which one of the strongest
-    lines (peaks of the spectrum of the light curve) is a sum or a difference of small multiples of
-    the two frequencies; and χ² (P,) of the best Fourier series in each of the P pairs.
+    """Return two things: the pairs of frequencies (P, 2), on a grid, that explain one of the
+    strongest lines; and χ² (P,) of the best Fourier series in each of the P pairs.
+
+    A line is a peak of the spectrum of the light curve. A pair explains a line if the frequency of
+    the line is a sum or a difference of small multiples of the two frequencies.
 
     - `table`: sums over the readings at evenly spaced frequencies, from which χ² is computed.
     - `lines`: the frequencies of the strongest lines, the strongest first, in 1/span, where the
@@ -261,8 +266,10 @@ def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
     """Return the pairs of frequencies (M, 2) that may fit the same readings as the `pairs` (P, 2)
     do, all in 1/span.
 
-    One or both frequencies of a pair are shifted by a side peak of the spectral window or by half
-    of one; or one is halved or doubled; or the first is added to the second or subtracted from it.
+    The returned pairs differ from the given pairs in one of three ways: one or both frequencies are
+    shifted by the position of a side peak of the spectral window, or by half of this position; one
+    frequency is halved or doubled; or the first frequency is added to the second or subtracted from
+    it.
 
     - `peaks`: (k,) the positions of the side peaks, 1/span.
     """
@@ -290,7 +297,8 @@ def with_aliases(
     - `table`: the sums over the readings, as `fourier_sum_table` returns them.
     - `pairs`: (P, 2) in 1/span.
     - `misfits`: (P,) χ² of the pairs.
-    - `highest`: the highest frequency of an alias, 1/span.
+    - `highest`: the highest frequency of an alias, 1/span; the span is the time from the first to
+      the last reading.
     - `order`: the largest multiple of the second frequency.
     """
     peaks = side_peaks_of_window(table, highest)
@@ -333,7 +341,8 @@ def refine_pairs(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray
     no neighbour has a lower misfit.
 
     - `table`: the sums over the readings, as `fourier_sum_table` returns them.
-    - `pairs`: (P, 2) the starts, 1/span.
+    - `pairs`: (P, 2) the pairs from which the refinement starts, 1/span, where the span is the time
+      from the first to the last reading.
     - `order`: the largest multiple of the second frequency.
     """
     size = np.full(len(pairs), 0.08)

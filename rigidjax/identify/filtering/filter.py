@@ -93,8 +93,8 @@ def first_belief(
 ) -> Belief:
     """Return the belief before the first reading.
 
-    The walks begin at their values in the scene, and each `CorrelatedTorque` at its stationary
-    distribution.
+    The walks (numbers of the model that drift randomly, such as the bias of a gyro) begin at the
+    values that the model gives them. Each `CorrelatedTorque` begins at its stationary distribution.
 
     **Arguments:**
 
@@ -105,10 +105,10 @@ def first_belief(
       that x represents.
     - `rate`: the standard deviation of the initial body rate Ω, rad/s, one number or three; zero if
       the rate is known.
-    - `attitude`: the standard deviation of the initial attitude, rad, in the same form, for an
+    - `attitude`: the standard deviation of the initial attitude, rad, one number or three, for an
       `Attitude` or a `Rigid`.
-    - `position`, `velocity`: the standard deviations of the initial position, m, and velocity, m/s,
-      in the same form, for a `Rigid`.
+    - `position`, `velocity`: the standard deviations of the initial position, m, and of the initial
+      velocity, m/s, each one number or three, for a `Rigid`.
 
     **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing or below zero,
     and if neither x nor `state` is given and the readings show no initial attitude.
@@ -252,8 +252,10 @@ class Grid(NamedTuple):
     **Fields:**
 
     - `t`: (N,) the times, s.
-    - `source`: (N,) for each time, the index of the first time of the recording at or after it.
-    - `real`: (N,) for each time, whether it is a time of the recording, so that readings count.
+    - `source`: (N,) for each time of `t`, an index into the times of the recording: that of the
+      first recorded time at or after it.
+    - `real`: (N,) for each time of `t`, whether it is a time of the recording, so that its readings
+      count.
     - `rows`: (T,) the index in `t` of each time of the recording.
     """
 
@@ -313,12 +315,12 @@ class FilterInput(NamedTuple):
 
     **Fields:**
 
-    - `scene`: the body, torque, process, sensors and initial state. The torque reads the inputs of
-      the recording.
-    - `drifts`: the walks of the model.
+    - `scene`: the body, known torque, unknown torque (`process`), sensors and initial state. The
+      known torque reads the inputs of the recording, such as a log of thrust.
+    - `drifts`: the walks of the model, which are numbers that drift randomly.
     - `recording`: the readings.
     - `first`: the belief before the first reading.
-    - `grid`: the times of the steps.
+    - `grid`: the times at which the steps of the filter end.
     """
 
     scene: Scene
@@ -402,13 +404,14 @@ def filter(
 
     **Arguments:**
 
-    - `model`: a `Model` of one recording, whose sensors have their noise. Masked readings and
-      channels at full scale are left out; a sensor's `offset` is allowed for.
+    - `model`: a `Model` of one recording; each of its sensors must have a `noise`. Masked readings
+      and channels at full scale are left out. The clock `offset` of a sensor is taken into account.
     - `belief`: the belief before the first reading, such as `first_belief` returns.
     - `x`: (n,) the free numbers of the model, such as `fit(model).x`, which give the body, the
       torques and the sensors. `None` for a model whose body is known.
     - `substeps`: the number of fixed steps from one time to the next; `None` chooses this number by
-      the body rate, and takes 1 if the numbers are traced.
+      the body rate and by the correlation times of unknown torques, and takes 1 if JAX traces
+      these.
     - `throw`: whether to raise an error if the filter is lost or an estimate is not finite; with
       `False` look at `status`.
 
@@ -417,8 +420,9 @@ def filter(
     puts in the model.
 
     **Raises:** `ValueError` for several recordings, a sensor without noise, and readings before
-    `belief`; with `throw` also for a lost filter: no reading was within 6 deviations of its
-    prediction for a second and three readings.
+    `belief`; with `throw` also if an estimate is not finite or the filter is lost. The filter is
+    lost if for at least a second, and for at least three readings of one sensor in a row, no
+    reading was within six standard deviations of its prediction.
 
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 2.0, 2.5))
@@ -492,8 +496,9 @@ def step(
       in `readings` is not used). `None` if all sensors have one.
     - `x`: (n,) the free numbers of the model; `None` for a model whose body is known.
 
-    **Returns** the `Belief` at t. **Raises:** `ValueError` for a t before the belief, another
-    number of readings, or a reading with NaN, if the numbers are known.
+    **Returns** the `Belief` at t. **Raises:** `ValueError` for a number of readings that is not the
+    number of sensors; unless JAX traces the numbers, also for a t before the time of the belief and
+    for a reading with NaN.
 
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 2.0, 2.5))
@@ -654,9 +659,9 @@ def status_and_loss_time(
     lost.
 
     The status is 0 if the filter followed the readings, 1 if it was lost, and 2 if an estimate is
-    NaN or infinite. The filter is lost if for a second, and for three readings of one sensor, no
-    reading was within six standard deviations of its prediction. The time is NaN if the filter was
-    not lost.
+    NaN or infinite. The filter is lost if for at least a second, and for at least three readings of
+    one sensor in a row, no reading was within six standard deviations of its prediction. The time
+    is NaN if the filter was not lost.
 
     **Arguments:**
 
@@ -690,7 +695,8 @@ def checked_input(
 
     **Arguments:** `model`, `belief`, `x` and `substeps` are as for `filter`. **Raises:**
     `TypeError` for a `belief` without the parts of the state that a sensor reads, such as an
-    attitude; and the errors of `scene_and_recording` and `grid_of_step_times`.
+    attitude; and the errors of `scene_and_recording` (for several recordings, a missing `x`, or a
+    sensor that a filter cannot use) and of `grid_of_step_times` (for readings before the belief).
     """
     scene, recording = scene_and_recording(model, x)
     _checks.require_instance(belief, Belief, "belief", hint="identify.first_belief makes it")

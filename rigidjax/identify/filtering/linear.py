@@ -35,9 +35,9 @@ class LinearModel(eqx.Module):
     - `offset`: c (k,), or `None` for zero.
 
     Each array may have a leading axis: F, G and d over the T − 1 steps between T times; H, r and c
-    over the T times. The noise of the readings must be independent: if it is correlated, multiply
-    y, H and c by the inverse of the Cholesky factor of its covariance first. **Raises:**
-    `ValueError` for shapes that do not fit, and for a deviation that is not positive.
+    over the T times. The noise of the readings must be independent: if it is correlated, first
+    multiply y, H and c by the inverse of the Cholesky factor of the covariance of the noise.
+    **Raises:** `ValueError` for shapes that do not fit, and for a deviation that is not positive.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
     >>> walk.size
@@ -134,8 +134,9 @@ class LinearEstimate(eqx.Module):
         return jnp.sqrt(jnp.sum(self.root**2, -1))
 
 
-# An array of a model has this number of axes, or one more if it changes from step to step or from
-# time to time. The arrays in _STEPS belong to the steps, all other arrays to the times.
+# _AXES holds the number of axes of each array of a `LinearModel`. An array that changes from step
+# to step, or from time to time, has one more axis. The arrays in _STEPS belong to the steps, all
+# other arrays to the times.
 _STEPS = {"transition": 2, "noise": 2, "push": 1}
 _AXES = _STEPS | {"matrix": 2, "deviation": 1, "offset": 1}
 ArraysByField = dict[str, Any]
@@ -326,8 +327,8 @@ class SmootherMatrices(NamedTuple):
     **Fields:**
 
     - `predicted`: a root of the covariance of the predicted state after the step.
-    - `gain`: the gain of the smoother, from a change of the state after the step to the change of
-      the state before it.
+    - `gain`: the gain of the smoother, a matrix that maps a change of the state after the step to
+      the change of the state before the step.
     - `rest`: a root of the covariance of the state before the step, if the state after the step is
       known.
     """
@@ -372,8 +373,9 @@ def smoother_backward_pass(
     (T − 1, m, m) of this noise.
 
     The method is the backward pass of Rauch, Tung and Striebel (1965). The covariance of the unit
-    noise of a step is `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ` with `Z = L⁻¹ G`, where L is the predicted
-    root and S the smoothed root after the step.
+    noise of a step is `I − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ` with the unit matrix I and `Z = L⁻¹ G`.
+    Here G maps the unit noise to the state after the step, L is a root of the predicted covariance
+    of this state, and S is a root of its smoothed covariance.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""Compute with roots S of covariances `P = S Sᵀ`.
+"""Compute with roots S of covariances P, matrices with `P = S Sᵀ`.
 
 A root is used because round-off cannot make the product `S Sᵀ` indefinite.
 """
@@ -17,10 +17,11 @@ def triangular_root(rows: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """Return the lower triangular matrix L with `L Lᵀ = A Aᵀ` and no negative diagonal entry.
 
     L is computed by the modified Gram–Schmidt process on the `rows` A (n, m), whose triangular
-    factor is as accurate as that of Householder's method (Björck 1967, doi:10.1007/BF01934122). If
-    a row depends linearly on earlier rows, to a few units of round-off, its diagonal entry is zero
-    with zero derivatives; the derivatives of `jnp.linalg.qr` would be NaN. A state that is known
-    without error has such rows.
+    factor is as accurate as that of Householder's method (Björck 1967, doi:10.1007/BF01934122). A
+    row of A may depend linearly on the rows before it, to a few units of round-off. An example is
+    the row, in a root of a covariance, of a number that is known without error. The diagonal entry
+    of L in this row is then zero, with zero derivatives; the derivatives of `jnp.linalg.qr` would
+    be NaN.
     """
     n = rows.shape[0]
     below = jnp.arange(n)
@@ -86,18 +87,20 @@ def kalman_update(
     variance: Float[Array, " k"],
     mask: Bool[Array, " k"],
 ) -> Update:
-    """Return the estimate of a vector e (n,) of errors after k numbers `h · e + noise` were read.
+    """Return the estimate of a vector e (n,) of errors after k numbers were read.
 
-    The numbers are taken one after another by Potter's formula, `s = |v|² + r`,
-    `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh` (Battin, Astronautical Guidance (1964), §9.6;
-    Bierman, Factorization Methods (1977), §II.4). Here S is the root of the covariance of e, and s
-    the variance of the innovation.
+    Each number is `h · e` plus noise, with a vector h (n,) of its own.
+
+    The numbers are taken one after another by Potter's formula, `s = |v|² + r`, `S ← S − S v vᵀ/(s
+    + √(rs))` with `v = Sᵀh` (Battin, Astronautical Guidance (1964), §9.6; Bierman, Factorization
+    Methods (1977), §II.4). Here S is the root of the covariance of e, s is the variance of the
+    innovation (the number minus its prediction), and r is the variance of the noise of the number.
 
     **Arguments:**
 
     - `step`: (n,) the mean of e before the update.
     - `root`: (n, n) S before the update.
-    - `matrix`: (k, n) the rows h.
+    - `matrix`: (k, n) the vectors h, one in each row.
     - `error`: (k,) the numbers read.
     - `variance`: (k,) the variance r of the noise of each number.
     - `mask`: (k,) false for a number that does not count.
@@ -123,8 +126,9 @@ class LogDensityTerms(NamedTuple):
     """Hold the terms of a log-density in which each number read is normal, given the numbers read
     before it.
 
-    **Fields:** `error` is the error of each number over its standard deviation; `log_variance` is
-    the logarithm of 2π times the variance of each number. Masked numbers have zeros in both fields.
+    **Fields:** `error` is the error of each number divided by its standard deviation;
+    `log_variance` is the logarithm of 2π times the variance of each number. Masked numbers have
+    zeros in both fields.
     """
 
     error: Float[Array, "*n"]
@@ -142,8 +146,8 @@ def log_density_terms(innovation: Array, variance: Array, mask: Array) -> LogDen
 
     **Arguments:** `innovation` the innovations, `variance` their variances, and `mask` true for the
     numbers read, three arrays of one shape. **Returns** the `LogDensityTerms`, arrays of this shape
-    too: each innovation over its standard deviation, and the logarithm of 2π times its variance.
-    Both are zero where `mask` is false.
+    too: each innovation divided by its standard deviation, and the logarithm of 2π times its
+    variance. Both are zero where `mask` is false.
     """
     error = jnp.where(mask, innovation * lax.rsqrt(variance), 0)
     return LogDensityTerms(error, jnp.where(mask, jnp.log(2 * math.pi * variance), 0))
@@ -154,7 +158,7 @@ def left_divide_by_triangular(
 ) -> Float[Array, "n m"]:
     """Return `lower⁻¹ rhs` by forward substitution, where `lower` is a lower triangular matrix.
 
-    Where a diagonal entry of `lower` is zero, the row of the result is zero.
+    If a diagonal entry of `lower` is zero, the row of the result with the same index is zero.
     """
 
     def forward_substitution_step(rhs: Array, k: Array) -> tuple[Array, Array]:
@@ -171,7 +175,7 @@ def right_divide_by_triangular(
 ) -> Float[Array, "m n"]:
     """Return `numerator lower⁻¹`, where `lower` is a lower triangular matrix.
 
-    Where a diagonal entry of `lower` is zero, the column of the result is zero.
+    If a diagonal entry of `lower` is zero, the column of the result with the same index is zero.
     """
     turned = left_divide_by_triangular(lower[::-1, ::-1].T, numerator[:, ::-1].T)
     return turned.T[:, ::-1]

@@ -28,11 +28,12 @@ from rigidjax.motion.manifold import minus, plus
 
 
 class Push(NamedTuple):
-    """Hold the estimate of a white torque, averaged over the step that ends at each time.
+    """Hold the estimate of a white-noise torque, averaged over each of the N steps of a smoother.
 
     **Fields:** `mean` (N, 3) is the mean and `deviation` (N, 3) the standard deviation of the
-    averaged torque, N m, body frame. The deviation is large for short steps, since white noise has
-    no value at one time.
+    averaged torque, in newton metres, body frame. The deviation is large for short steps, since
+    white noise has no value at one time: the shorter a step, the larger the variance of its
+    average.
     """
 
     mean: Float[Array, "stops 3"]
@@ -46,16 +47,20 @@ class Smoothed(eqx.Module):
 
     - `belief`: a `Belief` at each of N stops. The stops are the T times of the recording and, if
       the intervals between these times are long, some times between them.
-    - `rows`: (T,) the index among the stops of each time of the recording.
+    - `rows`: (T,) for each time of the recording, its index among the stops.
     - `pushes`: a `Push` for each `RandomTorque`; the estimate of a `CorrelatedTorque` is in
       `belief.torques`.
-    - `readings`: for each sensor the `ReadNumbers` (N, k) of the last linearisation.
+    - `readings`: for each sensor a `ReadNumbers` with arrays (N, k) for the k components of a
+      reading: the innovations (reading minus prediction) of the last iteration, their variances,
+      and a mask, true for a component that was read.
     - `log_likelihood`: the logarithm of the density of all readings, by Laplace's method about the
       most probable motion.
-    - `change`: the largest change of a number in the last iteration, in standard deviations.
+    - `change`: the largest change of a component of a state in the last iteration, in standard
+      deviations of this component.
     - `iterations`: the number of iterations.
-    - `status`, `lost_at`: the status of the run of `filter` from which the iteration starts, and
-      the time, s, at which it was lost, as in `Filtered`. The status is 2 if the smoother fails.
+    - `status`: 0 if `filter`, with whose motion the iteration starts, followed the readings; 1 if
+      `filter` was lost; 2 if an estimate of the filter or the smoother is not finite.
+    - `lost_at`: the time, s, at which `filter` was lost; NaN if it was not lost.
     """
 
     belief: Belief
@@ -96,22 +101,23 @@ def smooth(
 ) -> Smoothed:
     """Return attitude, rate, unknown torque and sensor errors from all readings.
 
-    The result is the motion of largest posterior density, found by the Gauss–Newton method. Each
-    iteration linearises dynamics and sensors about the motion of the last iteration, and the first
-    iteration about the motion that `filter` returns. An iteration solves the linear problem exactly
-    by a Kalman filter and the backward pass of Rauch, Tung and Striebel (Bell 1994,
-    doi:10.1137/0804035).
+    The result is the motion of largest posterior density, which the Gauss–Newton method finds. The
+    first iteration linearises the equations of motion and the sensors about the motion that
+    `filter` returns, each further iteration about the result of the iteration before it. An
+    iteration solves the linear problem exactly by a Kalman filter and the backward pass of Rauch,
+    Tung and Striebel (Bell 1994, doi:10.1137/0804035).
 
     **Arguments:** `model`, `belief`, `x`, `substeps` and `throw` of `filter`, and
 
     - `iterations`: the largest number of iterations.
-    - `tolerance`: the iteration ends when no number moves by more than this part of its standard
-      deviation. The error that remains is about the square of this part.
+    - `tolerance`: the iteration ends when no component of a state changes by more than `tolerance`
+      times its standard deviation. The error that remains is about `tolerance`² standard
+      deviations.
 
     **Returns** `belief`, `rows`, `pushes`, `readings`, `log_likelihood`, `change`, `iterations`,
     `status` and `lost_at` (`Smoothed`). It may be jitted, differentiated in forward mode, and
-    batched. **Raises:** the errors of `filter`; with `throw` also one for a motion that still moves
-    by a standard deviation.
+    batched. **Raises:** the errors of `filter`; with `throw` also an error if the last iteration
+    changed a component of a state by more than its standard deviation.
 
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 2.0, 2.5))
@@ -142,10 +148,10 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
 
     - `run`: the checked arguments of `smooth`: the body, torques, sensors and initial state; the
       numbers that drift as random walks, such as the bias of a gyro; the readings; the estimate
-      before the first reading; and the times at which the steps end.
+      before the first reading; and the times at which the steps of the filter end.
     - `iterations`: the largest number of iterations.
-    - `tolerance`: the iteration ends when no number moves by more than this part of its standard
-      deviation.
+    - `tolerance`: the iteration ends when no component of a state changes by more than `tolerance`
+      times its standard deviation.
     """
     sensors, first, grid = run.scene.sensors, run.first, run.grid
     dynamics, stops, kept = scan_filter(run, lambda belief, read: (belief, read))
@@ -205,11 +211,12 @@ def _gauss_newton_iteration(
     - `stops`: the N times at which steps end, with their readings.
     - `path`: the N + 1 states about which the problem is linearised, at the time of the `belief`
       and at the N times.
-    - `kicks`: (N, m) for each step from a state of `path` to the next, m unit normal numbers, which
-      make the noise of the torques in this step.
+    - `kicks`: (N, m) the unit normal numbers that make the noise of the torques, m numbers for each
+      step from a state of `path` to the next.
 
     **Returns** three things: the N + 1 new states; the estimate of the changes of the states, with
-    their covariances; and the largest change of a number, in standard deviations.
+    their covariances; and the largest change of a component of a state, in standard deviations of
+    this component.
     """
     dtype = belief.root.dtype
 
@@ -246,7 +253,8 @@ def _gauss_newton_iteration(
         jax.tree.map(lambda leaf, at=at: leaf[at], path) for at in (0, slice(-1), slice(1, None))
     )
     moves, rows = lax.map(linearise_step_and_readings, (before, stops, earlier, later, kicks))
-    # The first time is that of the first belief, at which nothing is read.
+    # The first row belongs to the time of the belief before the first reading; nothing is read at
+    # this time.
     matrix, error, deviation, mask = (jnp.pad(a, [(1, 0)] + [(0, 0)] * (a.ndim - 1)) for a in rows)
     parts = dict(zip(("transition", "noise", "push"), moves, strict=True))
     parts |= {"matrix": matrix, "deviation": deviation, "offset": None}

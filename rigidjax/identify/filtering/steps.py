@@ -54,7 +54,7 @@ class ExtendedState(eqx.Module):
 
     - `motion`: a `Spin`, `Attitude` or `Rigid`.
     - `torques`: the value (3,) of each `CorrelatedTorque`, N m, body frame.
-    - `walks`: the value of each `Walk`.
+    - `walks`: the value of each `Walk`, a number that drifts as a random walk.
 
     An error of the state is a vector: the changes of motion, torques and walks, in this order, as
     in `motion.manifold`.
@@ -89,7 +89,8 @@ def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
 
 
 class Dynamics(eqx.Module):
-    """Hold the equations of a filter, for one dtype and one type of state.
+    """Hold the equations of motion, the noise and the sensors that a filter uses, for one dtype and
+    one type of state.
 
     `dynamics_of` makes a `Dynamics`.
 
@@ -101,7 +102,7 @@ class Dynamics(eqx.Module):
     - `white`: the square root of the spectral density of each `RandomTorque`.
     - `coloured`: for each `CorrelatedTorque`, the square root of its spectral density and its
       correlation time, s.
-    - `drifts`: the square root of the spectral density of each walk.
+    - `drifts`: the square root of the spectral density of each walk, a number that drifts randomly.
     - `paths`: for each walk, the path of its numbers in the tree of the scene.
     """
 
@@ -137,15 +138,15 @@ class Dynamics(eqx.Module):
     def advance_under_noise(
         self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array
     ) -> ExtendedState:
-        """Return the state at the time t + h, s, for the state x at the time t, with a random
-        torque between.
+        """Return the state after a step of duration h, s, from the state x at the time t, under
+        random torques.
 
         The step is one of the classical Runge–Kutta method of order 4. The `kicks` are unit normal
         numbers, six for each random torque, which make its noise: each white noise is replaced by
-        `√(density/h) (k₀ + √3 (1 − 2s/h) k₁)` at a time s after t, where k₀ and k₁ (3,) are kicks.
-        These are the first two terms of its expansion in Legendre polynomials. For a body at rest
-        rate and angle get their exact joint covariance (Foster, Lyons and Oberhauser 2020,
-        doi:10.1137/19M1261912).
+        `√(density/h) (k₀ + √3 (1 − 2τ/h) k₁)` at the time t + τ, where k₀ and k₁ (3,) are kicks.
+        These are the first two terms of the expansion of white noise in Legendre polynomials. If
+        the body is at rest at t, its rate and angle at t + h have, to first order in the noise, the
+        exact joint covariance (Foster, Lyons and Oberhauser 2020, doi:10.1137/19M1261912).
         """
         safe = jnp.where(h > 0, h, 1)
         pairs = kicks.reshape(-1, 2, 3) * roots.inverse_sqrt_or_zero(h)
@@ -174,13 +175,14 @@ class Dynamics(eqx.Module):
     def predict_and_linearise(
         self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array | None = None
     ) -> tuple[ExtendedState, Float[Array, "n n"], Float[Array, "n m"]]:
-        """Return the state at the time t + h, s, for the state x at the time t, and two matrices of
-        its errors.
+        """Return three things: the state after a step of duration h, s, from the state x at the
+        time t; and two matrices F and G that describe the errors of this state.
 
         The matrix F (n, n) maps an error of x to the error of the new state. The matrix G (n, m) is
         a root of the covariance that the noise of the step adds; its last columns belong to the
-        walks, which are numbers that drift randomly. F and G are the derivatives at the noise
-        `kicks` (unit normal numbers, six for each random torque), which is zero for `None`.
+        walks, which are numbers that drift randomly. F and G are the derivatives of the step for
+        the noise that `kicks` give (unit normal numbers, six for each random torque; zeros for
+        `None`).
         """
         kicks = jnp.zeros(self.noise_dimension, x.motion.omega.dtype) if kicks is None else kicks
         after, push = jax.linearize(lambda y, k: self.advance_under_noise(t, h, y, k), x, kicks)
@@ -253,16 +255,17 @@ def covariance_root_about_neighbour(
     *,
     inverse: bool = False,
 ) -> Float[Array, "n m"]:
-    """Return the root of a covariance of errors about the state x, for errors about a neighbouring
-    state.
+    """Return a root (n, m) of the covariance of errors about a neighbour of the state x, computed
+    from a root of the covariance of errors about x.
 
-    The neighbouring state is x changed by the vector `change` (n,), here called e; `root` (n, m)
-    belongs to errors about x. Only errors of a turn differ: an error e + δ about x is the error
-    `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ` about the new state, where J_r is the right Jacobian, here
-    to second order in e (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848).
+    The neighbour is x changed by the vector `change` (n,), here called e; `root` (n, m) belongs to
+    errors about x. Only the rows of rotation vectors change: a rotation vector e + δ from x is the
+    rotation vector `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ` from the neighbour. Here J_r is the right
+    Jacobian, to second order in e (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848).
 
-    With `inverse` the root is multiplied by `J_r(e)⁻¹`, to third order, which is the derivative of
-    `log(exp(e) exp(δ))` with respect to δ.
+    With `inverse` the direction is the opposite: `root` belongs to errors about the neighbour, and
+    the result to errors about x. The rows are then multiplied by `J_r(e)⁻¹`, the derivative of
+    `log(exp(e) exp(δ))` with respect to δ, to third order in e.
     """
     first, second = (0.5, 1 / 12) if inverse else (-0.5, 1 / 6)
     across = jax.vmap(cross, (None, 1), 1)
@@ -381,10 +384,11 @@ def step_counts_between(
     - `process`: the unknown torque, or `None`. A step is at most a quarter of each of its
       correlation times.
     - `ts`: (T,) the times, s.
-    - `state`: the initial state. The body turns only little in a step, at the body rate in `state`
-      or at the rates that gyros read, whichever is larger.
-    - `substeps`: the number of steps; `None` chooses it by these rates and correlation times, and
-      takes 1 if they are traced.
+    - `state`: the initial state. Steps are so short that the body turns only little in each of
+      them. The turn is computed from the body rate in `state` or from the rates that gyros read,
+      whichever is larger.
+    - `substeps`: the number of steps; `None` chooses this number by these rates and correlation
+      times, and takes 1 if JAX traces the times, the state or the correlation times.
     - `recording`: the readings of the gyros, or `None`.
     """
     if substeps is not None:
@@ -426,11 +430,13 @@ def sample(
 ) -> Sampled:
     """Draw one motion that a random torque could make.
 
-    For each step the integral and the first moment of the white noise are drawn. The equations of
-    motion are then integrated under the linear function of time with this integral and moment, by
-    one step of the classical Runge–Kutta method of order 4. The whole method is of order 1.5, and
-    exact for a body at rest (Foster, Lyons and Oberhauser 2020, doi:10.1137/19M1261912). A
-    `CorrelatedTorque` starts from its stationary distribution.
+    For each step the integral and the first moment of the white noise are drawn. The white noise is
+    then replaced by the linear function of time that has this integral and this moment. The
+    equations of motion are integrated by one step of the classical Runge–Kutta method of order 4.
+    The whole method is of order 1.5; if the body is at rest before a step, its rate and angle after
+    the step have, to first order in the noise, the exact joint covariance (Foster, Lyons and
+    Oberhauser 2020, doi:10.1137/19M1261912). A `CorrelatedTorque` starts from its stationary
+    distribution.
 
     **Arguments:**
 
@@ -441,7 +447,7 @@ def sample(
     - `process`: the random torque, a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of them.
     - `torque`: the known torque, or `None`.
     - `substeps`: the number of fixed steps between two times; `None` chooses this number by the
-      initial body rate and the correlation times, and takes 1 if these are traced.
+      initial body rate and the correlation times, and takes 1 if JAX traces these.
 
     **Returns** `t`, `states` and `torques` at these times (`Sampled`). **Raises** `ValueError` for
     times that do not increase.

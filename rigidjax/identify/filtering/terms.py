@@ -49,8 +49,8 @@ def log_density_terms_of_recording(
     """Return the terms of the log-density of the readings of one recording.
 
     The readings are normal about the motion. If the model has an unknown torque, or numbers that
-    drift as random walks, a Kalman filter integrates these out, and the readings are normal about
-    the predictions of the filter.
+    drift as random walks, a Kalman filter integrates over these unknowns, and the readings are
+    normal about the predictions of the filter.
 
     **Arguments:**
 
@@ -62,7 +62,7 @@ def log_density_terms_of_recording(
       body.
 
     **Returns** the `LogDensityTerms`, two arrays with an entry for each component of each reading:
-    its error over its standard deviation; and the logarithm of 2π times its variance.
+    its error divided by its standard deviation; and the logarithm of 2π times its variance.
     """
     scene = scene_from_row(model, free_numbers, record, reference, body_index)
     if scene.process is None and not model.walks:
@@ -153,12 +153,13 @@ def cost_gradient_and_information(model: Model, x: Float[Array, " n"]) -> Curvat
     """Return the cost, gradient and Fisher's information of a posterior density at x (n,).
 
     The free numbers x change the variances of the readings, too. The information is that of the
-    priors plus `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ`, where the sum is over the innovations ν of
-    variance s, and ∂ is the gradient with respect to x (Gupta and Mehra 1974,
-    doi:10.1109/TAC.1974.1100714, for the filter).
+    priors plus `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ`, where the sum is over the innovations ν (each
+    reading minus its prediction), s is the variance of ν, and ∂ is the gradient with respect to x
+    (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714, for the filter).
     """
     value, slopes = errors_and_jacobians(model, x, log_density_terms_of_recording)
-    # Compute dν/√s from the derivative of ν/√s, by d(ν/√s) = dν/√s − ½ ν/√s d(log s).
+    # Compute dν/√s, with the innovation ν of variance s, from the derivative of ν/√s, by d(ν/√s) =
+    # dν/√s − ½ ν/√s d(log s).
     moved = slopes.error + 0.5 * value.error[..., None] * slopes.log_variance
     both = jnp.concatenate([moved, 0.5**0.5 * slopes.log_variance], axis=1)
     places, size = model.index.places, model.size

@@ -23,8 +23,8 @@ class AttitudeSensor(ClockedSensor):
 
     The error is the rotation vector, in the sensor's axes, from the predicted attitude to the
     reading, `log((q exp(mounting))⁻¹ q_read)`: its length is the angle between the two attitudes.
-    Readings are quaternions (T, 4) or rotation matrices (T, 3, 3). Euler angles (T, 3) in degrees
-    become quaternions by
+    Here q is the predicted attitude of the body, and q_read the reading. Readings are quaternions
+    (T, 4) or rotation matrices (T, 3, 3). Euler angles (T, 3) in degrees become quaternions by
     `jax.vmap(lambda a: rj.euler.to_quaternion(a, "ZYX"))(jnp.deg2rad(angles))`.
 
     **Arguments:**
@@ -32,7 +32,7 @@ class AttitudeSensor(ClockedSensor):
     - `noise`: the standard deviation of each component of the rotation vector, rad, one number or
       (3,); `None` estimates the noise.
     - `mounting`: (3,) the rotation vector from the body's axes to the sensor's, rad, or `None`.
-    - `offset`, `jitter`: s, as for `Gyro`.
+    - `offset`, `jitter`: the clock offset and the deviation of the time stamps, s, as for `Gyro`.
 
     **Raises** `ValueError` for a noise that is not positive, a wrong shape, NaN; a `Recording`
     raises `ValueError` for a matrix that is no rotation.
@@ -62,8 +62,8 @@ class AttitudeSensor(ClockedSensor):
         return _quaternions_of_matrices(values) if values.shape[1:] == (3, 3) else values
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return two things: a mask (T,) of the rows of `values` that are not unit quaternions; and
-        the reason in words.
+        """Return two things: a mask (T,), true for each row of `values` that is not a unit
+        quaternion; and the reason in words.
         """
         wanted = "wanted (w, x, y, z) with the scalar first"
         return _differs_from_unit_length(
@@ -126,7 +126,8 @@ class Direction(ClockedSensor):
     - `world`: (3,) the direction in the world frame, of any length.
     - `noise`: the standard deviation of each component of the error, rad, one number or (2,);
       `None` estimates the noise.
-    - `mounting`, `offset`, `jitter`: as for `AttitudeSensor`.
+    - `mounting`: (3,) the rotation vector from the body's axes to the sensor's, rad, or `None`.
+    - `offset`, `jitter`: the clock offset and the deviation of the time stamps, s, as for `Gyro`.
 
     **Raises** `ValueError` for a direction of length zero, a noise that is not positive, NaN.
 
@@ -155,9 +156,9 @@ class Direction(ClockedSensor):
     def reading_of(self, motion: SensorInput, error: Float[Array, "2"]) -> Vec3:
         """Return a reading (3,) whose error has the length of `error` (2,).
 
-        The error of the reading that is returned has the components of `error` only to first order:
-        `error` is applied along axes orthogonal to the prediction, whereas the method `error` uses
-        axes orthogonal to the reading.
+        The two components of this error equal those of the argument `error` only to first order.
+        The reason is the choice of axes: here `error` is taken along axes orthogonal to the
+        prediction, but the method `error` uses axes orthogonal to the reading.
         """
         predicted = self._predicted_direction(motion)
         first, second = _orthogonal_pair(predicted)
@@ -179,8 +180,8 @@ class Direction(ClockedSensor):
         )
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return two things: a mask (T,) of the rows of `values` that are not unit vectors; and the
-        reason in words.
+        """Return two things: a mask (T,), true for each row of `values` that is not a unit vector;
+        and the reason in words.
         """
         return _differs_from_unit_length(
             values
@@ -207,18 +208,22 @@ def _orthogonal_pair(line: Vec3) -> tuple[Vec3, Vec3]:
 
 
 class Marker(ClockedSensor):
-    """Measure the position in the world of a point fixed in the body: `x + R r`, m.
+    """Measure the position, in the world, of a point that is fixed in the body: `x + R r`, m.
+
+    Here R is the rotation from body to world axes. For a `Rigid`, x is the position of the centre
+    of mass, and r leads from the centre of mass to the point. For a body on a pivot, x is the
+    position of the pivot, and r leads from the pivot to the point.
 
     **Arguments:**
 
-    - `place`: (3,) r, the point, m, body frame; for a body that moves, in the frame of its
-      `MassProperties`.
+    - `place`: (3,) the point, m, in the frame of the `MassProperties`; for an `Inertia`, the vector
+      r from the pivot, body frame.
     - `noise`: the standard deviation, m, one number or (3,); `None` estimates the noise.
-    - `origin`: (3,) m, world frame, the fixed point of a body on a pivot; `None` for a body that
-      moves (`Rigid`, with `MassProperties`).
-    - `offset`, `jitter`: s, as for `Gyro`.
+    - `origin`: (3,) the position of the pivot of a body that turns about a fixed point, m, world
+      frame; `None` for a `Rigid`, whose position is part of its state.
+    - `offset`, `jitter`: the clock offset and the deviation of the time stamps, s, as for `Gyro`.
 
-    **Raises** `ValueError` as `Gyro`.
+    **Raises** `ValueError` for a noise or jitter that is not positive, a wrong shape, NaN.
 
     >>> body = rj.MassProperties(1.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([2.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
@@ -243,7 +248,7 @@ class Marker(ClockedSensor):
 
 
 class Position(ClockedSensor):
-    """Measure the position of the centre of mass of a `Rigid`, in the world: `x + bias`, m.
+    """Measure the position x of the centre of mass of a `Rigid`, in the world: `x + bias`, m.
 
     Use `Marker` for another point.
 
@@ -251,9 +256,9 @@ class Position(ClockedSensor):
 
     - `noise`: the standard deviation, m, one number or (3,), `None` estimates the noise.
     - `bias`: (3,) m, world frame, or `None`.
-    - `offset`, `jitter`: s, as for `Gyro`.
+    - `offset`, `jitter`: the clock offset and the deviation of the time stamps, s, as for `Gyro`.
 
-    **Raises** `ValueError` as `Gyro`.
+    **Raises** `ValueError` for a noise or jitter that is not positive, a wrong shape, NaN.
 
     >>> Position(noise=0.01).unit
     'm'
@@ -273,20 +278,23 @@ class Position(ClockedSensor):
 class Velocity(ClockedSensor):
     """Measure the velocity of a point of a `Rigid`, `v + R (Ω × r)`, in world or sensor axes.
 
+    Here v is the velocity of the centre of mass, R the rotation from body to world axes, Ω the body
+    rate, and r the vector from the centre of mass to the point.
+
     Source: Landau and Lifshitz, Mechanics, eq 31.2.
 
     **Arguments:**
 
     - `noise`: the standard deviation, m/s, one number or (3,), `None` estimates the noise.
-    - `place`: (3,) the point, m, in the frame of the `MassProperties`; r is the vector from the
-      centre of mass to this point. `None` for the centre of mass.
+    - `place`: (3,) the point, m, in the frame of the `MassProperties`; `None` for the centre of
+      mass.
     - `mounting`: (3,) the rotation vector from the body's axes to the sensor's, rad, for a sensor
       on the body, such as a Doppler log; zeros for the body's axes. `None` for the world's axes, as
       in satellite navigation.
     - `bias`: (3,) m/s, or `None`.
-    - `offset`, `jitter`: s, as for `Gyro`.
+    - `offset`, `jitter`: the clock offset and the deviation of the time stamps, s, as for `Gyro`.
 
-    **Raises** `ValueError` as `Gyro`.
+    **Raises** `ValueError` for a noise or jitter that is not positive, a wrong shape, NaN.
 
     >>> Velocity(noise=0.1, mounting=[0.0, 0.0, 0.0]).unit
     'm/s'
@@ -314,20 +322,23 @@ class Velocity(ClockedSensor):
 
 
 class Range(ClockedSensor):
-    """Measure the distance of a point of a `Rigid` from a station: `|x + R r − s| + bias`, m.
+    """Measure the distance of a point of a `Rigid` from a station: `|x + R r − p| + bias`, m.
 
-    Readings are (T,). The vector r leads from the centre of mass to the point.
+    Here x is the position of the centre of mass, R the rotation from body to world axes, r the
+    vector from the centre of mass to the point, and p the position of the station. Readings are
+    (T,).
 
     **Arguments:**
 
-    - `station`: s (3,) m, world frame.
+    - `station`: (3,) the position p of the station, m, world frame.
     - `noise`: the standard deviation, m, `None` estimates the noise.
     - `place`: (3,) the point, m, in the frame of the `MassProperties`; `None` for the centre of
       mass.
     - `bias`: m, or `None`.
-    - `offset`, `jitter`: s, as for `Gyro`.
+    - `offset`, `jitter`: the clock offset and the deviation of the time stamps, s, as for `Gyro`.
 
-    **Raises** `ValueError` as `Gyro`, and for a reading below zero.
+    **Raises** `ValueError` for a noise or jitter that is not positive, a wrong shape, NaN; a
+    `Recording` raises `ValueError` for a reading below zero if there is no bias.
 
     >>> Range([0.0, 0.0, 100.0], noise=0.05).reading_shape
     ()
@@ -355,8 +366,8 @@ class Range(ClockedSensor):
         return (reading - predicted)[None]
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return two things: a mask (T,) of the distances `values` that are below zero; and the
-        reason in words.
+        """Return two things: a mask (T,), true for each of the distances `values` that is below
+        zero; and the reason in words.
 
         A sensor with a bias may read distances below zero, so that the mask is then false
         everywhere.

@@ -42,7 +42,9 @@ class SensorInput(eqx.Module):
 
     @property
     def rate(self) -> Any:
-        """Return the time derivative of the state: `.omega` is dΩ/dt, `.v` the acceleration."""
+        """Return the time derivative of the state: its `.omega` is dΩ/dt, its `.v` the
+        acceleration.
+        """
         return self.field(self.t, self.state, None)
 
     def lever(self, place: Vec3) -> Vec3:
@@ -62,21 +64,21 @@ class AbstractSensor(eqx.Module):
     - `reading_shape`: the shape of one reading.
     - `feels`: the state that the sensor needs, `HasSpin`, `HasAttitude` or `HasPose`.
     - `components`, `unit`: the number k of components of an error, and the unit of an error.
-    - `noise`: (k,) the standard deviation of each component, or `None` estimates the noise.
+    - `noise`: (k,) the standard deviation of each component; `None` if a fit shall estimate it.
 
     Optional members:
 
     - `offset`: the clock offset, s: the reading with the time stamp t was taken at t + offset.
     - `limit`: (k,) the full scale of each channel, in the unit of the error.
     - `lowpass`: a `LowPass`; it is allowed only if the error is reading minus prediction.
-    - `refusal(values)`: a method that returns two things: a mask (T,) of the rows that cannot be
-      readings; and the reason in words.
+    - `refusal(values)`: a method that returns two things for T rows of values: a mask (T,), true
+      for a row that cannot be a reading; and the reason in words.
     - `typical_rate(t, values)`: a method that returns the rough rate of the body, rad/s, from the
       unmasked readings; it is used if no other sensor gives the rate.
     - `reading_of(motion, error)`: a method that returns the reading whose error is `error`, for
       `simulate_readings`; it is needed if the error is not reading minus prediction.
-    - `suspect`: the name, the words and the remedy of a cause for large errors of this sensor,
-      which a fit names if it finds no other cause.
+    - `suspect`: three texts about a possible cause of large errors of this sensor: its name, a
+      description, and a remedy. A fit names this cause if it finds no other cause.
 
     >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s
     ...     reading_shape, components, unit = (), 1, "rad/s"
@@ -101,10 +103,11 @@ class AbstractSensor(eqx.Module):
 
 
 def array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]:
-    """Return a converter, for `eqx.field`, of a value to an array of finite numbers of this
-    `shape`.
+    """Return a converter, for `eqx.field`, that turns a value into an array of finite numbers of
+    this `shape`.
 
-    A fit may change the numbers since they are an array; `name` names the field in error messages.
+    The numbers become an array so that a fit can change them; `name` is the name of the field for
+    error messages.
     """
 
     def convert(value: NumbersLike) -> Array:
@@ -122,8 +125,8 @@ def optional_array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[
 
 
 def deviations_field(size: int = 3) -> Callable[[Any], Array | None]:
-    """Return a converter, for `eqx.field`, of one number or `size` numbers to standard deviations
-    (size,).
+    """Return a converter, for `eqx.field`, that turns one number or `size` numbers into standard
+    deviations (size,).
 
     The converter leaves `None` unchanged.
     """
@@ -160,7 +163,9 @@ class Jitter(eqx.Module):
 
 
 def jitter_of(jitter: object) -> Jitter | None:
-    """Return the `Jitter` of a positive number, s, or of `"estimated"`; `None` stays `None`."""
+    """Return the `Jitter` for a deviation of time stamps, a positive number of seconds, or for the
+    text `"estimated"`; `None` stays `None`.
+    """
     if jitter is None or isinstance(jitter, Jitter):
         return jitter
     wanted = 'a positive number of seconds or "estimated"'

@@ -32,13 +32,14 @@ class LowPass(eqx.Module):
 
     The filter is `ẏ = w(u − y)` for order 1, and `ÿ + √2 w ẏ + w² y = w² u` for order 2, with the
     input u, the output y and w = 2π · cutoff. It is solved exactly from sample to sample, for an
-    input u that is a cubic between samples. Before the first sample u is the cubic through the
-    first four samples. Before the first sample after a hole in the log, an interval of more than
-    three times the median, u is a straight line.
+    input u that is a cubic between samples. Before the first sample u is taken as the cubic through
+    the first four samples. A hole in the log is an interval of more than three times the median
+    interval. After a hole the filter starts anew: before the first sample after the hole, u is
+    taken as the cubic of the interval that follows this sample.
 
-    **Arguments:** `cutoff` Hz, the frequency of gain 1/√2 (a `Free` may move it); `order` 1 or 2.
-    **Raises** `ValueError` for a cutoff that is not positive, and for another order. Source:
-    Butterworth 1930, Experimental Wireless 7:536.
+    **Arguments:** `cutoff` Hz, the frequency of gain 1/√2 (a fit estimates it if it is a `Free`);
+    `order` 1 or 2. **Raises** `ValueError` for a cutoff that is not positive, and for another
+    order. Source: Butterworth 1930, Experimental Wireless 7:536.
 
     >>> slow = LowPass(0.5)(jnp.arange(4.0), jnp.ones((4, 1)))
     >>> bool(jnp.allclose(slow, 1.0))
@@ -62,8 +63,8 @@ class LowPass(eqx.Module):
         """Return the filtered samples (T, k).
 
         **Arguments:** `t` (T,) increasing times, s; `values` (T, k), of any unit. **Raises**
-        `ValueError`, for known times and values, if times do not increase, if a number is NaN, or
-        if its cube overflows.
+        `ValueError` if times do not increase, if a number is NaN, or if the cube of a number would
+        overflow in float32; these checks are left out if JAX traces the times or values.
         """
         values = _checks.numeric_array(values, "values")
         if values.ndim != 2:
@@ -79,8 +80,9 @@ class LowPass(eqx.Module):
             return values
         w = 2 * math.pi * self.cutoff.astype(values.dtype)
         intervals = jnp.diff(t)
-        # The padding of a shorter record repeats the last time of the record. The padding gets the
-        # median interval here. Its samples are masked, so that their values do not matter.
+        # The padding of a shorter record repeats the last time of the record. The intervals of the
+        # padding, which are zero, are replaced by the median interval. The samples of the padding
+        # are masked, so that their filtered values do not matter.
         is_padding = intervals <= 0
         usual = jnp.nanmedian(jnp.where(is_padding, jnp.nan, intervals))
         intervals = jnp.where(is_padding, usual, intervals)
@@ -114,8 +116,8 @@ def lowpass_of(lowpass: object) -> LowPass | None:
 def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
     """Raise `ValueError` for samples that a low-pass filter cannot use.
 
-    **Arguments:** `t` (T,) the times, s, which must be finite and increase; `values` (T, k) the
-    samples, which must be finite, with cubes that do not overflow.
+    **Arguments:** `t` (T,) the times, s, which must increase; `values` (T, k) the samples. All
+    times and samples must be finite, and so small that their cubes do not overflow in float32.
     """
     if not np.isfinite(values).all() or np.abs(values).max(initial=0.0) > _LARGEST:
         raise ValueError(
@@ -160,7 +162,8 @@ def _derivatives_at_first_sample(
 ) -> tuple[Array, Array, Array]:
     """Return the first, second and third time derivative of a sampled input at its first sample.
 
-    They are those of the cubic through the first four samples, three arrays (1, k) for k channels.
+    The three arrays (1, k), for k channels, are the derivatives of the cubic through the first four
+    samples.
 
     **Arguments:** `intervals` (n,) the lengths of the intervals between samples, s; `mean_slopes`
     (n, k) the mean slope of the input in each interval.
@@ -191,7 +194,9 @@ def _particular_solution(
     - `u`: (…) the value of the input at the time of the result.
     - `du`: the first three time derivatives of the input at this time.
     """
-    # With x = (d/dt)/w: 1/(1 + x) = 1 − x + x² − x³ …, 1/(1 + √2 x + x²) = 1 − √2 x + x² + 0 x³ …
+    # The solution y is a power series in the operator x = (d/dt)/w, applied to u. It is 1/(1 + x) =
+    # 1 − x + x² − x³ … for order 1, and 1/(1 + √2 x + x²) = 1 − √2 x + x² + 0 x³ … for order 2. For
+    # a cubic u higher powers are zero.
     if order == 1:
         return (u - du[0] / w + du[1] / w**2 - du[2] / w**3)[..., None]
     y = u - _ROOT * du[0] / w + du[1] / w**2
@@ -199,15 +204,15 @@ def _particular_solution(
 
 
 def _propagator(order: int, w: Array, duration: Array) -> Array:
-    """Return the matrix (order, order) by which a transient of a low-pass filter decays over a
-    time.
+    """Return the matrix (order, order) that maps a transient of a low-pass filter to the same
+    transient after a given duration.
 
     The equation of the filter, with its input u and output y, is `ẏ = w(u − y)` for order 1 and
     `ÿ + √2 w ẏ + w² y = w² u` for order 2. The transient is the difference of the filter's state
     (y and, for order 2, ẏ/w) from the particular solution for its input.
 
     **Arguments:** `order` the order of the filter, 1 or 2; `w` its angular frequency, 2π times its
-    cutoff, rad/s; `duration` the time, s.
+    cutoff, rad/s; `duration` the duration, s.
     """
     if order == 1:
         return jnp.exp(-w * duration)[None, None]
@@ -226,9 +231,9 @@ def _filter_samples(
 ) -> Array:
     """Return the output (n + 1, k) of a low-pass filter at all samples, by a scan over n intervals.
 
-    The state of the filter (the output y and, for order 2, ẏ/w with the angular frequency w of the
-    filter) is the particular solution for the input, a cubic in each interval between samples, plus
-    a transient that decays.
+    The state of the filter is the output y and, for order 2, ẏ/w, where w is the angular frequency
+    of the filter. It is the sum of a transient, which decays, and of the particular solution for
+    the input, which is a cubic in each interval between samples.
 
     **Arguments:**
 

@@ -11,8 +11,9 @@ from rigidjax.identify.sensors.base import AbstractSensor, SensorInput
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import minus_small
 
-# What a state of each kind must have for a reading of it; and two sizes: how many numbers a reading
-# has, and how many components its error has (an attitude has 4 numbers, but an error of 3).
+# _FEELS holds, for each class of state, the protocol of the states from which such a reading can be
+# predicted. _SIZES holds two numbers for each class: how many numbers a reading has, and how many
+# components its error has (an attitude has 4 numbers, but its error has 3 components).
 _FEELS = {Spin: HasSpin, Attitude: HasAttitude, Rigid: HasPose}
 _SIZES = {Spin: (3, 3), Attitude: (7, 6), Rigid: (13, 12)}
 # A reading is split at these indices into the parts of the state, such as q and Ω.
@@ -22,6 +23,8 @@ _CUTS = {Spin: (), Attitude: (4,), Rigid: (3, 6, 10)}
 class StateSensor(AbstractSensor):
     """Measure a whole state as a row of numbers: (3,) Ω, (7,) q, Ω, or (13,) x, v, q, Ω.
 
+    Here Ω is the body rate, q the attitude (a quaternion), x the position and v the velocity.
+
     The error is the difference of the measured state from the predicted state, as in
     `motion.manifold`: it has three numbers for each part of the state. For q the three numbers are
     a rotation vector (body frame, rad).
@@ -30,7 +33,8 @@ class StateSensor(AbstractSensor):
 
     - `kind`: the class of the state, `Spin`, `Attitude` or `Rigid`.
     - `noise`: (k,) the standard deviations of the k numbers of the error.
-    - `nominal`: whether `noise` holds only units for the errors, whose size is then estimated.
+    - `nominal`: whether `noise` holds only units in which the errors are counted; a fit then
+      estimates the size of the errors in these units.
 
     >>> StateSensor(rj.Attitude, jnp.ones(6), False).reading_shape
     (7,)

@@ -20,12 +20,13 @@ def _checked_tolerance_deviation(value: NumbersLike | None) -> Scalar | None:
 
 
 class Tolerance(eqx.Module):
-    """Hold the standard deviations of the errors that a sensor of vectors may have, from its data
-    sheet or a calibration.
+    """Hold the standard deviations of the constant errors that a sensor of vectors may have.
 
-    The residuals of a free motion do not show such an error: the readings with the error look like
-    the motion of another body. A fit does not estimate these errors but considers them: it adds
-    their effect on each fitted number to the covariance of the number (Schmidt 1966; Bierman,
+    The numbers come from the data sheet of the sensor or from a calibration.
+
+    The residuals of a fit to a free motion do not show such an error: readings with the error look
+    like the motion of another body. A fit does not estimate these errors but considers them: it
+    adds their effect on each fitted number to the covariance of the number (Schmidt 1966; Bierman,
     Factorization Methods for Discrete Sequential Estimation (1977), ch. VIII). If the scale, skew,
     bias or clock offset of the sensor is a `Free`, the fit estimates this error; the tolerance is
     then the prior of the `Free`, unless the `Free` has its own prior.
@@ -33,7 +34,8 @@ class Tolerance(eqx.Module):
     **Arguments**, each a standard deviation, or `None` for an error that is not considered:
 
     - `scale`: the relative error of the scale of each channel.
-    - `cross_axis`: the share of each channel that another channel reads, rad for a small angle.
+    - `cross_axis`: the fraction of the quantity along one axis that the channel of another axis
+      reads. For an axis that is turned by a small angle this fraction is the angle, rad.
     - `bias`: the bias of each channel, in the sensor's unit.
     - `clock`: the offset of the sensor's clock, s.
 

@@ -19,8 +19,9 @@ from rigidjax.rotation.linalg3 import apply, cross
 class VectorSensor(ClockedSensor):
     """Define a sensor that reads a vector v in its own axes: `scale · S exp(−mounting) v + bias`.
 
-    The matrix S is 1 for orthogonal axes (see `skew` in `Gyro`), and exp makes a rotation from a
-    rotation vector.
+    Here `scale`, `mounting` and `bias` are fields of the sensor. The rotation exp(−mounting) turns
+    v from the body's axes to the sensor's axes; `mounting` is a rotation vector. The matrix S
+    follows from the field `skew` (see `Gyro`); it is the unit matrix for orthogonal axes.
     """
 
     noise: Vec3 | None = eqx.field(converter=base.deviations_field(), default=None)
@@ -59,30 +60,32 @@ class VectorSensor(ClockedSensor):
 class Gyro(VectorSensor):
     """Measure the body rate with a rate gyro: `scale · S exp(−mounting) Ω + bias + G f`, rad/s.
 
-    **Arguments**, each `None` by default, for a sensor without this error or property; a fit can
-    estimate a number that is not `None` (see `Free`):
+    **Arguments**, each `None` by default; except for `noise` and `limit`, `None` means that the
+    sensor does not have this error or property. A fit can estimate a number that is not `None` (see
+    `Free`):
 
     - `noise`: the standard deviation of a reading, rad/s, one number or (3,); `None` estimates it
       from the residuals.
     - `bias`: (3,) rad/s.
     - `scale`: (3,) the scale of each channel.
     - `mounting`: (3,) the rotation vector from the body's axes to the sensor's axes, rad.
-    - `skew`: (3,) (a, b, c), for axes that are not orthogonal: the x channel reads a share a of y
-      and a share b of z, and the y channel reads a share c of z, `S = [[1, a, b], [0, 1, c], [0, 0,
-      1]]`.
+    - `skew`: (3,) three fractions (a, b, c), for axes that are not orthogonal. The x channel also
+      reads the fraction a of the y component and the fraction b of the z component, and the y
+      channel also reads the fraction c of the z component: `S = [[1, a, b], [0, 1, c], [0, 0, 1]]`.
     - `limit`: the full scale, rad/s, one number or (3,). A reading at full scale says only that the
       true value is at least this large. `None` finds the full scale from the readings.
-    - `offset`: s; the reading at t belongs to t + offset.
+    - `offset`: the clock offset, s: the reading with the time stamp t was taken at t + offset.
     - `jitter`: the standard deviation of the time stamps, s, or `"estimated"`. The errors of time
       stamps are independent. The effect of an error of a time stamp on the reading is taken as the
       error times the time derivative of the prediction, which is right for motions that turn little
       within the jitter.
     - `lowpass`: the `LowPass` filter through which the readings passed.
     - `tolerance`: a `Tolerance` for scale, axes, bias and clock.
-    - `g_sensitivity`: G (3, 3), rad/s per m/s², the effect on each channel of the specific force f
-      at the gyro, in the body's axes.
-    - `place`, `gravity`: for G, (3,) m and (3,) m/s² as for `Accelerometer`; `place` is zero, the
-      origin of its frame, unless given.
+    - `g_sensitivity`: (3, 3) the matrix G, in rad/s per m/s², whose product with f is added to the
+      reading. The vector f is the specific force at the gyro, in the body's axes.
+    - `place`: (3,) the place of the gyro, in metres, as for `Accelerometer`; it needs
+      `g_sensitivity`, with which the default is zero.
+    - `gravity`: (3,) the gravity, in m/s², as for `Accelerometer`; it needs `g_sensitivity`.
 
     **Raises** `ValueError` for a noise, limit or jitter that is not positive, a wrong shape, NaN.
 
@@ -123,9 +126,10 @@ class Gyro(VectorSensor):
 def specific_force(motion: SensorInput, place: Vec3, gravity: Vec3 | None) -> Vec3:
     """Return the specific force (3,) at a place of the body, m/s², body frame.
 
-    It is `Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)`, with r the vector to the `place` from the reference
-    point of the state, a the acceleration of this point, and g the `gravity`; without gravity it is
-    only the terms with r.
+    It is `Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)`. Here R is the rotation from body to world axes, Ω
+    the body rate, r the vector from the reference point of the state to the `place`, a the
+    acceleration of this point, and g the `gravity`. If `gravity` is `None`, the result is only the
+    terms with r.
     """
     state, rate = motion.state, motion.rate
     r = motion.lever(place)
@@ -139,10 +143,11 @@ def specific_force(motion: SensorInput, place: Vec3, gravity: Vec3 | None) -> Ve
 class Accelerometer(VectorSensor):
     """Measure the specific force with an accelerometer: `scale · S exp(−mounting) f + bias`, m/s².
 
-    `f = Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)` in the body frame (notes, eq 88, seen from the body),
-    with r the lever arm from the centre of mass, or from the fixed point of a body on a pivot, and
-    a the acceleration of this point. A body in free fall has a = g, so that only the terms with r
-    remain.
+    The specific force is `f = Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)` in the body frame (notes, eq 88,
+    seen from the body). Here R is the rotation from body to world axes, Ω the body rate, and g the
+    gravity. The vector r leads to the sensor from the centre of mass, or from the pivot of a body
+    on a pivot, and a is the acceleration of this point. A body in free fall has a = g, so that only
+    the terms with r remain.
 
     **Arguments:**
 
@@ -154,7 +159,7 @@ class Accelerometer(VectorSensor):
     - `bias`, `scale`, `mounting`, `skew`, `limit`, `offset`, `jitter`, `lowpass`, `tolerance`: as
       for `Gyro`.
 
-    **Raises** `ValueError` as `Gyro`.
+    **Raises** `ValueError` for a noise, limit or jitter that is not positive, a wrong shape, NaN.
 
     >>> Accelerometer(noise=0.1, place=[0.01, 0.0, 0.0]).unit
     'm/s²'
@@ -174,17 +179,21 @@ class Accelerometer(VectorSensor):
 class Magnetometer(VectorSensor):
     """Measure a known magnetic field with a magnetometer: `scale · S exp(−mounting) Rᵀ b + bias`.
 
+    Here b is the field in the world frame, and Rᵀ turns b to body axes; the matrix S is that of
+    `skew` in `Gyro`.
+
     For a sensor that measures only the direction of the field use `Direction`.
 
     **Arguments:**
 
-    - `noise`: in the field's unit, one number or (3,), `None` estimates the noise.
+    - `noise`: the standard deviation of a reading, in the field's unit, one number or (3,); `None`
+      estimates the noise.
     - `field`: (3,) b, world frame, any unit.
     - `bias`: (3,) the body's own magnetism, in the field's unit.
     - `scale`, `mounting`, `skew`, `limit`, `offset`, `jitter`, `lowpass`, `tolerance`: as for
       `Gyro`.
 
-    **Raises** `ValueError` as `Gyro`.
+    **Raises** `ValueError` for a noise, limit or jitter that is not positive, a wrong shape, NaN.
 
     >>> Magnetometer(noise=1e-7, field=[2e-5, 0.0, 4e-5]).reading_shape
     (3,)
