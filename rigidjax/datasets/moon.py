@@ -350,8 +350,8 @@ def _integrate_core_velocity(
 
 
 def _shift_along_z(positions: Chebyshev, z: float) -> Chebyshev:
-    """Return a Chebyshev table of `positions` (3,), m, as functions of time, with the length `z`,
-    m, added to the third component of each position.
+    """Return the Chebyshev table `positions` with the length `z`, m, added to the third component
+    of each position (3,), m.
     """
     moved = positions.coefficients.at[:, 2, 0].add(z)
     return eqx.tree_at(lambda t: t.coefficients, positions, moved)

@@ -283,8 +283,8 @@ def _follow_family(
         return correction.periodicity_residual(scene, numbers)
 
     def unit_tangent(matrix: Array, previous: Array) -> Array:
-        """Return the unit tangent (4,) of the family at a member, in the direction that has a
-        positive product with `previous`.
+        """Return the unit tangent (4,) of the family at a member, whose scalar product with
+        `previous` is positive.
 
         - `matrix`: (3, 4) the Jacobian of the periodicity residual (y, v_x, v_z after half a
           period) with respect to the four numbers x, z, v_y, T/2 of the member; its product with
@@ -317,8 +317,8 @@ def _follow_family(
 def stability_indices(monodromy: Float[Array, "6 6"]) -> Complex[Array, "2"]:
     """Return the two stability indices ν = ½(λ + 1/λ) of the `monodromy` matrix M.
 
-    λ and 1/λ are the two pairs of eigenvalues (multipliers) other than 1, 1; the indices are
-    computed from tr M and tr M².
+    M has the eigenvalues (multipliers) 1, 1 and two pairs λ, 1/λ; each pair gives one index. The
+    indices are computed from tr M and tr M².
     """
     total = jnp.trace(monodromy) - 2
     squares = jnp.sum(monodromy * monodromy.T) + 2
@@ -390,8 +390,9 @@ def _stability_index(scene: "AbstractReversible", orbit: PeriodicOrbit, index: i
     """Return one stability index ν = ½(λ + 1/λ) of a periodic orbit as a Python float, and raise
     `ValueError` if the index is complex.
 
-    λ and 1/λ are two eigenvalues of the monodromy matrix other than the pair 1, 1 that every orbit
-    has. `index`, 0 or 1, selects one of the two stability indices of the `orbit` in the `scene`.
+    The monodromy matrix of an orbit has the eigenvalues 1, 1 and two pairs λ, 1/λ; each pair gives
+    one index. `index`, 0 or 1, selects one of the two stability indices of the `orbit` in the
+    `scene`.
     """
     stability = np.asarray(_compiled_stability_indices(scene, orbit))[index]
     if abs(stability.imag) > 1e-9 * max(1.0, abs(stability)):
@@ -407,7 +408,7 @@ def _compiled_stability_indices(
     """Return both stability indices ν = ½(λ + 1/λ) (2,) of a periodic `orbit`, complex, the larger
     real part first, by a compiled program.
 
-    λ and 1/λ are the two pairs of eigenvalues of the monodromy matrix other than 1, 1. The `scene`
-    has the equations of motion.
+    The monodromy matrix of an orbit has the eigenvalues 1, 1 and two pairs λ, 1/λ; each pair gives
+    one index. The `scene` has the equations of motion.
     """
     return scene.stability_indices(orbit)

@@ -80,8 +80,9 @@ class ThreeBody(AbstractReversible):
         return jnp.sqrt(first * first + flat), jnp.sqrt(second * second + flat)
 
     def jacobi_constant(self, state: Point) -> Scalar:
-        """Return Jacobi's constant C = 2U − |v|², conserved along the motion, with U as in
-        `potential`.
+        """Return Jacobi's constant C = 2U − |v|², with the `potential` U.
+
+        C is conserved along the motion.
 
         Source: Szebehely 1967, eq 1.5(20).
 
@@ -94,7 +95,7 @@ class ThreeBody(AbstractReversible):
     def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:
         """Return |v|² = 2U(x) − C at the position `x` (3,) for Jacobi's constant C = `jacobi`.
 
-        The result is negative where no particle with this C can be.
+        U is the `potential`. The result is negative where no particle with this C can be.
         """
         u = self.potential(x)
         return 2 * u - _checks.array_of_shape(jacobi, (), "jacobi").astype(u.dtype)
@@ -271,7 +272,7 @@ class Hill(AbstractReversible):
 
     @property
     def lagrange_points(self) -> Float[Array, "2 3"]:
-        """Return the positions of L1 and L2 (2, 3): (∓3^{−1/3}, 0, 0)."""
+        """Return the positions (2, 3) of L1, (−3^{−1/3}, 0, 0), and of L2, (3^{−1/3}, 0, 0)."""
         place = jnp.zeros(3, self.radius.dtype).at[0].set(3.0 ** (-1 / 3))
         return jnp.stack([-place, place])
 

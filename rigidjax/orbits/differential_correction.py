@@ -304,7 +304,7 @@ def correct_orbit(
     - `index`: the place, 0 to 3, of the held number.
     - `tolerance`: the largest accepted residual.
     - `scene`: the equations of motion.
-    - `unknown`: (3,) the start of Newton's method for the other numbers.
+    - `unknown`: (3,) the values of the other three numbers, from which Newton's method starts.
     - `held_value`: the number that is held.
     """
 
@@ -322,14 +322,14 @@ def _correct_orbit_jvp(
     """Return two things: the two results of `correct_orbit`; and their derivatives along given
     tangents, by the implicit function theorem.
 
-    The two results are the three numbers (3,) that make an orbit periodic, and the largest residual
-    that is left, whose derivative is taken as zero.
+    The first result is the three numbers (3,) that make an orbit periodic. The second result is the
+    largest residual that is left; its derivative is taken as zero.
 
     - `primals`: the arguments of `correct_orbit`: index, tolerance, scene, unknown numbers (3,) and
       held value.
     - `tangents`: the tangents of these arguments, `None` for constants; only the tangents of the
       scene (the equations of motion) and of the held value are used, since the corrected orbit does
-      not depend on the start.
+      not depend on the point from which Newton's method starts.
     """
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 # multiplies x, y, z, vx, vy, vz.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 Branch = Literal["stable", "unstable"]
-# A manifold starts at a point of the orbit that is computed with these tolerances of a step.
+# A manifold starts at a point of the orbit. The integration to this point has these relative and
+# absolute tolerances of a step.
 _TIGHT = dict(rtol=1e-13, atol=1e-14)
 # Inverse iteration takes this number of steps. Each step reduces the error of an eigenvector at
 # least a hundredfold.
@@ -152,9 +153,9 @@ def _compiled_manifold_point(
     - `orbit`: the unstable periodic orbit.
     - `phase`: the point of the orbit, in periods since `orbit.state`.
     - `branch`: `"stable"` or `"unstable"`, the manifold.
-    - `side`: 1 for the half of the manifold that goes to larger x at the start of the orbit, −1 for
-      the opposite half.
-    - `distance`: the distance of the state from the orbit, in (x, v).
+    - `side`: 1 for the half of the manifold that goes to larger x at `orbit.state`, −1 for the
+      opposite half.
+    - `distance`: the distance of the returned state from the orbit, in (x, v).
     """
     value, vector = unstable_direction(scene.monodromy(orbit))
     # The mirror image of the unstable manifold is the stable manifold, with the opposite phase.
@@ -189,8 +190,8 @@ def manifold(
     - `branch`: `"unstable"` (the motions leave the orbit) or `"stable"` (the motions approach the
       orbit, and are computed backwards in time).
     - `time`: the duration of the motions, two periods by default.
-    - `side`: 1 for the half of the manifold that goes to larger x at the start of the orbit, −1 for
-      the opposite half.
+    - `side`: 1 for the half of the manifold that goes to larger x at `orbit.state`, −1 for the
+      opposite half.
     - `count`: the number N of motions, which start at equally spaced phases of the orbit.
     - `samples`: the number T of times of each motion.
     - `distance`: the distance between the start of each motion and the orbit, in (x, v). The error

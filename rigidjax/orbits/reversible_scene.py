@@ -67,7 +67,8 @@ class AbstractReversible(AbstractScene):
     def stability_indices(self, orbit: PeriodicOrbit) -> Complex[Array, "2"]:
         """Return the two stability indices ν = ½(λ + 1/λ) of an orbit, the larger real part first.
 
-        λ and 1/λ are the two pairs of eigenvalues of `monodromy` other than 1, 1.
+        The `monodromy` matrix has the eigenvalues 1, 1 and two pairs λ, 1/λ; each pair gives one
+        index.
 
         The orbit is stable to first order if both indices are real with |ν| ≤ 1. For many orbits
         use `jax.vmap(scene.stability_indices)(scene.family(…))`. Source: Howell 1984,

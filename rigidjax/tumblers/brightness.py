@@ -2,8 +2,8 @@
 
 The brightness is the light to the observer from all lit and visible surface, `∫ f(μ₀, μ) dA`, where
 μ₀ and μ are the cosines of the angles of incidence and emission, and f is the scattering law. Its
-unit is an area: each law f is scaled so that a sphere of radius r at zero phase has the brightness
-π r².
+unit is an area: each law f is scaled so that a sphere of radius r has the brightness π r² at zero
+phase, which means that sun and observer are in the same direction.
 """
 
 import jax.numpy as jnp
@@ -27,10 +27,11 @@ from rigidjax.tumblers.scattering import (
 def ellipsoid(
     semi_axes: Vector, sun: Vector, observer: Vector, scattering: AbstractScattering | None = None
 ) -> Scalar:
-    """Return the brightness of a triaxial ellipsoid, m², which is π r² for a sphere at zero phase.
+    """Return the brightness of a triaxial ellipsoid, in square metres.
 
-    It is differentiable in all numbers, also at zero phase and for a sphere. For many directions
-    use `jax.vmap`.
+    The brightness of a sphere of radius r is π r² at zero phase, which means that sun and observer
+    are in the same direction. The brightness is differentiable in all numbers, also at zero phase
+    and for a sphere. For many directions use `jax.vmap`.
 
     **Arguments:**
 

@@ -47,8 +47,9 @@ class Sums(NamedTuple):
 
 
 def fourier_sum_table(light: tuple[Array, ...], highest: float) -> Sums:
-    """Return the table of sums over the readings, from which `fourier_chi2_of_padded_pairs`
-    computes χ², up to the frequency `highest`.
+    """Return the table of sums over the readings of a light curve, up to the frequency `highest`.
+
+    `fourier_chi2_of_padded_pairs` computes χ² of Fourier series from this table.
 
     - `light`: the light curve as three arrays (T,): the times of the readings divided by the span
       (the time from the first to the last reading); the values divided by their noise; and one over

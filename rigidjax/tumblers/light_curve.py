@@ -223,8 +223,8 @@ def _require_one_brightness(model: Model) -> Reading:
         raise ValueError(f"fit_light_curve: wanted one Brightness sensor, got {kinds}")
     if model.count != 1:
         raise ValueError(
-            f"fit_light_curve: wanted one recording, got {model.count}; fit the longest, then "
-            "all of them with rigidjax.identify.fit from what it found"
+            f"fit_light_curve: wanted one recording, got {model.count}; fit the longest alone, "
+            "then all of them with rigidjax.identify.fit, starting from the result"
         )
     if isinstance(model.chart, Bodies):
         raise ValueError("fit_light_curve: wanted one body, got several by name")

@@ -30,7 +30,7 @@ def light_curve(
 
     The folded light curve of a body that turns about a principal axis is a single curve. The folded
     light curve of a tumbler is a band, since a second period changes the curve from cycle to cycle.
-    The colour of a point shows its cycle.
+    The colour of a point shows its cycle, the number of periods that have passed.
 
     **Arguments:**
 

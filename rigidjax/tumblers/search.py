@@ -199,7 +199,9 @@ def _search_from_starts(
     count: np.ndarray | np.generic | Array,
 ) -> Attempt:
     """Return the results of least-squares searches as one `Attempt` with a leading axis of length
-    `FIRST`, one entry for each start; only the first `count` starts are searched from.
+    `FIRST`.
+
+    The `Attempt` has one entry for each start. A search is run only from the first `count` starts.
 
     The searches run one after another within one compiled program. The derivatives are finite
     differences, because exact derivatives of the closed-form motion take a hundred times as long.
@@ -241,9 +243,9 @@ def _fit_brightness_level_of_starts(
     """Return the `starts` of searches, each with the level of brightness that fits the readings
     best.
 
-    The starts are unchanged if the level (the flux or magnitude of a sphere of the same volume at
-    zero phase) is not a free number of the `model`, so that it must keep its value. A start is a
-    vector (n,) of free numbers.
+    A start is a vector (n,) of free numbers of the `model`. The level is the flux or magnitude of a
+    sphere of the same volume, if sun and observer are in the same direction. If the level is not a
+    free number of the `model`, it must keep its value, and the starts are returned unchanged.
     """
     scene = scene_at_starting_values(model, model.records)
     path = leaf_at(lambda s: s.sensors[0].level, scene, "level", "the sensor")[0]

@@ -68,7 +68,7 @@ class Brightness(AbstractSensor):
     suspect: ClassVar[tuple[str, str, str]] = (
         "shape",
         "perhaps a shape that is no ellipsoid: then the motion may be right all the same",
-        "take the intervals of fit_light_curve, which allow for it",
+        "take the intervals of fit_light_curve, which allow for such a shape",
     )
     unit: str = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
     sun: Any

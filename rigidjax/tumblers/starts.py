@@ -156,15 +156,15 @@ def _rate_at_unit_momentum(moments: Array, momentum2_over_2energy: Array) -> Flo
 def _rate_with_period_ratio(
     moments: Array, period_ratio: Array, is_long_axis_mode: Array
 ) -> tuple[Float[Array, "3"], Scalar, Bool[Array, ""]]:
-    """Return three things: the body rate (3,) of a free motion whose precession period divided by
-    its rotation period is `period_ratio`; its precession period; and whether there is such a
-    motion.
+    """Return three things for a free motion with a given ratio of precession period to rotation
+    period: the body rate (3,), in principal axes; the precession period; and whether there is such
+    a motion.
 
     The angular momentum is 1, and the energy is found by bisection. The first two results have no
     meaning if the third is false.
 
     - `moments`: (3,) the principal moments, ascending.
-    - `period_ratio`: the wanted quotient of the two periods.
+    - `period_ratio`: the wanted precession period divided by the rotation period.
     - `is_long_axis_mode`: true for a motion in the long-axis mode, in which the momentum circulates
       in the body about the axis of the smallest moment; false for the short-axis mode, with the
       axis of the largest moment.

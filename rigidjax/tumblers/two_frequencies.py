@@ -318,8 +318,10 @@ def with_aliases(
 
 
 def distinct_pairs(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
-    """Return the indices of the best pairs of frequencies that differ from each other by more than
-    `NEAR`, in the order of their misfits, at most `count` of them.
+    """Return the indices of the best different pairs of frequencies, at most `count` of them, in
+    the order of their misfits.
+
+    Two pairs are different if the first or the second frequency differs by more than `NEAR`.
 
     - `pairs`: (P, 2) the two frequencies of each pair, 1/span.
     - `misfits`: (P,) χ² of the pairs.

@@ -280,8 +280,8 @@ def grid_of_step_times(
     """Return the times at which the steps of a filter end, from the time of a `belief` to the last
     reading.
 
-    These are the times of the `recording`, and equally spaced times between them if the body turns
-    much from one reading to the next.
+    These are the times of the `recording`. Between two of them there are equally spaced further
+    times if one step would be too long.
 
     **Arguments:**
 
@@ -330,8 +330,9 @@ class FilterInput(NamedTuple):
     grid: Grid
 
 
-# A filter is lost if, for at least LOST_AFTER seconds and LOST_READINGS readings of a sensor in a
-# row, no reading was within LOST_BEYOND standard deviations of its prediction.
+# A filter is lost if, for at least LOST_AFTER seconds and at least LOST_READINGS readings of a
+# sensor in a row, no reading was within LOST_BEYOND standard deviations of its prediction. WORDS
+# has the texts for the status 0, 1 and 2 of a filter.
 LOST_AFTER, LOST_READINGS, LOST_BEYOND = 1.0, 3, 6.0
 WORDS = (
     "followed",
@@ -376,10 +377,14 @@ class Filtered(eqx.Module):
 
     @property
     def nis(self) -> tuple[Float[Array, " times"], ...]:
-        """Return the sum of the normalised squared innovations of each sensor at each time.
+        """Return, for each sensor, the sum of its squared innovations divided by their variances,
+        at each of T times (T,).
+
+        An innovation is a component of a reading minus its prediction.
 
         If the model is right, the sum follows the χ² distribution, with as many degrees of freedom
-        as components were read (Bar-Shalom, Li and Kirubarajan, Estimation (2001), §5.4).
+        as components were read at this time (Bar-Shalom, Li and Kirubarajan, Estimation (2001),
+        §5.4).
         """
         return tuple(
             jnp.sum(jnp.where(r.mask, r.innovation**2 / r.variance, 0), -1) for r in self.readings
@@ -436,11 +441,14 @@ def filter(
 
 
 def raise_if_filter_lost(run: Any) -> Any:
-    """Return the result `run` of a filter, or raise an error if the filter was lost or stopped."""
+    """Return the result `run` of a filter, or raise an error if the filter was lost or an estimate
+    is not finite.
+    """
     status = run.status
     at = f" (at {float(run.lost_at):g} s)" if _checks.is_known(run.lost_at) else ""
     advice = (
-        "; is the noise or density too small, or the initial state far off? throw=False returns it"
+        "; is the noise or density too small, or the initial state far off? throw=False returns "
+        "the result"
     )
     run = _checks.error_if(run, status == 1, f"filter: {WORDS[1]}{at}{advice}")
     return _checks.error_if(run, status == 2, f"filter: {WORDS[2]}{advice}")
@@ -453,12 +461,14 @@ def log_likelihood(
     *,
     substeps: int | None = None,
 ) -> Scalar:
-    """Return the logarithm of the density of all readings, with the unknown torques integrated out.
+    """Return the logarithm of the density of all readings, which is integrated over the unknown
+    torques.
 
-    The result is `Σ log N(ν; 0, s)` over the innovations ν, where N(ν; 0, s) is the normal density
-    with mean 0 and variance s (Schweppe 1965, doi:10.1109/TIT.1965.1053737). It can be maximised
-    over moments, the spectral density of a torque, a noise or an initial state, and is
-    differentiable in forward and reverse mode.
+    The result is `Σ log N(ν; 0, s)` over the innovations ν (each reading minus its prediction from
+    earlier readings). Here N(ν; 0, s) is the normal density with mean 0, and s is the variance of ν
+    (Schweppe 1965, doi:10.1109/TIT.1965.1053737). The result is differentiable in forward and
+    reverse mode. It can be maximised over moments, the spectral density of a torque, a noise or an
+    initial state.
 
     **Arguments:** `model`, `belief`, `x`, `substeps` as for `filter`. **Raises** the errors of
     `filter`.

@@ -244,9 +244,9 @@ def _checked_arguments(
 def _drop_constant_arrays(parts: ArraysByField) -> ArraysByField:
     """Return the arrays of a linear model that change from step to step or from time to time.
 
-    Such an array has one more axis, its first, than a constant one. The argument `parts` and the
-    result are dicts of field name of a `LinearModel` → array; an entry `None` of `parts` is left
-    out.
+    An array that changes has one more axis, its first, than an array that does not change. The
+    argument `parts` and the result are dicts that map the name of a field of `LinearModel` to its
+    array. An entry of `parts` that is `None` is left out.
     """
     return {n: part for n, part in parts.items() if part is not None and part.ndim > _AXES[n]}
 
@@ -341,8 +341,8 @@ class SmootherMatrices(NamedTuple):
 def smoother_gain_and_roots(transition: Array, noise: Array, root: Array) -> SmootherMatrices:
     """Return the gain of a smoother and two roots of covariances for one step.
 
-    The three matrices come from the triangular root of the matrix `[[F S, G], [S, 0]]` (Park and
-    Kailath 1995, doi:10.1080/00207179508921582).
+    The three matrices are computed from blocks of the triangular root of the matrix `[[F S, G], [S,
+    0]]` (Park and Kailath 1995, doi:10.1080/00207179508921582).
 
     **Arguments:** `transition` F (n, n); `noise` G (n, m); `root` S (n, n), a root of the
     covariance of the state before the step. **Returns** the `SmootherMatrices`.

@@ -117,7 +117,7 @@ class Direction(ClockedSensor):
     """Measure the direction, in the sensor's axes, of an object of known direction in the world.
 
     Examples are a sun sensor, a tracker of one star, a sensor of the vertical. The error is a
-    vector in the plane orthogonal to the reading, which has two components. It points from the
+    vector with two components, in the plane orthogonal to the reading. The error points from the
     prediction to the reading, and its length is the chord between the two unit vectors: the angle
     in rad for small errors, 2 at most. Readings (T, 3) are unit vectors.
 
@@ -148,8 +148,8 @@ class Direction(ClockedSensor):
         # The axes orthogonal to the reading are data, so that no derivative passes through these
         # axes. Axes orthogonal to the prediction would jump as the motion changes.
         first, second = _orthogonal_pair(reading)
-        # The chord is sin θ / cos ½θ = 2 sin ½θ; the bound prevents a division by zero for opposite
-        # directions.
+        # With the angle θ between prediction and reading, `half` is cos ½θ, and the chord is sin θ
+        # / cos ½θ = 2 sin ½θ. The lower bound prevents a division by zero for opposite directions.
         half = jnp.sqrt(jnp.maximum(0.5 * (1.0 + dot(predicted, reading)), 1e-12))
         return -jnp.stack([dot(first, predicted), dot(second, predicted)]) / half
 
@@ -162,7 +162,8 @@ class Direction(ClockedSensor):
         """
         predicted = self._predicted_direction(motion)
         first, second = _orthogonal_pair(predicted)
-        # The length of `error` is a chord: cos θ = 1 − ½ |error|², sin θ = |error| cos ½θ.
+        # The length of `error` is the chord of the angle θ between prediction and reading: cos θ =
+        # 1 − ½ |error|², sin θ = |error| cos ½θ.
         square = jnp.minimum(error[0] * error[0] + error[1] * error[1], 4.0)
         half = jnp.sqrt(1.0 - 0.25 * square)
         return (1.0 - 0.5 * square) * predicted + half * (error[0] * first + error[1] * second)

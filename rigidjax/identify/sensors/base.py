@@ -138,8 +138,8 @@ def positive_numbers(
 ) -> Array | None:
     """Return one number, or `size` numbers, as an array (size,) of positive numbers.
 
-    `None` stays `None`. **Raises** `ValueError` for other values; `name` and `requirement` are
-    words of its message.
+    `None` stays `None`. **Raises** `ValueError` for a number that is not positive and for another
+    shape; `name` and `requirement` are words of the message.
     """
     if value is None:
         return None

@@ -76,9 +76,9 @@ class Gyro(VectorSensor):
       true value is at least this large. `None` finds the full scale from the readings.
     - `offset`: the clock offset, s: the reading with the time stamp t was taken at t + offset.
     - `jitter`: the standard deviation of the time stamps, s, or `"estimated"`. The errors of time
-      stamps are independent. The effect of an error of a time stamp on the reading is taken as the
-      error times the time derivative of the prediction, which is right for motions that turn little
-      within the jitter.
+      stamps are independent. An error of a time stamp changes the reading; this change is computed
+      as the error times the time derivative of the prediction. The result is right if the body
+      turns little in a time as long as the jitter.
     - `lowpass`: the `LowPass` filter through which the readings passed.
     - `tolerance`: a `Tolerance` for scale, axes, bias and clock.
     - `g_sensitivity`: (3, 3) the matrix G, in rad/s per m/s², whose product with f is added to the
