@@ -81,8 +81,11 @@ class Moon(eqx.Module):
             raise ValueError(f"Moon: wanted years in order in 1900 to 2199, got {first}, {last}")
 
         def read_chebyshev_table(name: str, days_per_interval: int) -> np.ndarray:
-            """Return the Chebyshev coefficients (intervals, 3, coefficients) of one table of the
-            ephemeris, for the years of this object and at least ten days before and after.
+            """Return the Chebyshev coefficients of one table of the ephemeris, for the years from
+            `first` to `last` and at least ten days before and after these years.
+
+            The result is an array (N, 3, k) with k coefficients of three functions on each of N
+            intervals.
 
             - `name`: the name of the table in the file names of DE421, such as `moon`.
             - `days_per_interval`: the length of an interval of the result, days; longer intervals
@@ -298,8 +301,9 @@ class _CoreAcceleration(eqx.Module):
     """Evaluate the time derivative (3,), rad/s², of the core's angular velocity, while the mantle
     moves as in the ephemeris.
 
-    It is a vector field (t, own, args) with the time t, s, and the angular velocity `own` (3,),
-    rad/s, mantle frame. **Fields:** `core` the torque of the core; `moon` the ephemeris.
+    An object of this class is a function (t, own, args) of the time t, s, and of the angular
+    velocity `own` (3,), rad/s, mantle frame. **Fields:** `core` the torque of the core; `moon` the
+    ephemeris.
     """
 
     core: _LiquidCore

@@ -67,10 +67,11 @@ class Alias(eqx.Module):
     **Fields:**
 
     - `x`: (n,) the free numbers.
-    - `cost`: half of χ².
+    - `cost`: half of χ², the sum over the readings of the squares of error divided by noise.
     - `rotation`: the body period, s (`rigidjax.exact.body_period`).
     - `precession`: the mean precession period, s (`rigidjax.exact.precession_period`).
-    - `mode`: `"long"` or `"short"`, the axis about which the momentum circulates in the body.
+    - `mode`: `"long"` or `"short"`, for a momentum that circulates in the body about the axis of
+      the smallest or of the largest moment.
     - `ratios`: (2,) the two smaller moments of inertia divided by the largest.
     - `explains`: whether this motion explains the data nearly as well as the best motion.
     """
@@ -357,8 +358,8 @@ def _widen_covariance_for_shape_errors(best: Fit) -> Fit:
 
     The errors of the shape are not estimated, but their uncertainty is added to the covariance: the
     brightness is multiplied by 1 + n·S n, where n (3,) is the direction half way between sun and
-    observer in the body frame, and the entries of S (3, 3) are independent with the standard
-    deviation `SHAPE`. All quantities of the fit get new, wider intervals.
+    observer in the body frame, and the entries of S (3, 3) are independent random numbers with the
+    standard deviation `SHAPE`. All quantities of the fit get new, wider intervals.
     """
     linear: Any = best.linear
     reading, weight = stacking.pick_records(best.model.records.readings[0], 0), linear.weights[0][0]

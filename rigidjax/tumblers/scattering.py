@@ -164,7 +164,8 @@ def _scalars_of_ellipsoid_brightness(
 
     Here p = D A⁻¹ s and q = D A⁻¹ o, where s and o are the unit vectors to sun and observer, A is
     the symmetric root of `shape`, D = det A is the product of the semi-axes, and z = |p + q|/(|p| +
-    |q|). They are computed without a loss of digits at any phase.
+    |q|). The five scalars are computed without a loss of digits, whatever the angle between s and
+    o.
 
     - `shape`: (3, 3) m², the tensor A², whose eigenvalues are the squared semi-axes.
     - `sun`, `observer`: (3,) the unit vectors s and o, body axes.

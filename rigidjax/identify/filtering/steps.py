@@ -212,8 +212,8 @@ def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: ExtendedState) -> Dyna
 
     **Arguments:**
 
-    - `scene`: the body, torques, sensors and initial state of a recording. Its torque must not read
-      an `Input`.
+    - `scene`: the body, torques, sensors and initial state of a recording. The known torque in the
+      scene must not read an `Input`, a quantity that the recording holds.
     - `drifts`: the walks of the model, which are numbers of the scene that drift randomly, such as
       the bias of a gyro.
     - `x`: a state, whose dtype and type (`Spin`, `Attitude` or `Rigid`) the equations get.

@@ -93,8 +93,9 @@ def _log_density_terms_of_motion(model: Model, scene: Scene, record: Recording) 
 
     **Returns** the `LogDensityTerms`, two arrays with an entry for each component of each reading:
     z, its error divided by its standard deviation σ; and l = log(2πσ²). The log-density is −½ Σ (z²
-    + l). For a masked reading both entries are zero. For a component at full scale, of which only a
-    bound is known, z is √(−2 log P), with the probability P of exceeding the bound, and l is zero.
+    + l). For a masked reading both entries are zero. For a component at full scale only a bound is
+    known: z is √(−2 log P), where P is the probability that a reading exceeds this bound, and l is
+    zero.
     """
     errors = errors_of_scene(model, scene, record)
     scaled, log_variance = [], []

@@ -22,8 +22,8 @@ class SensorInput(eqx.Module):
     - `t`: the time, s.
     - `state`: a `Spin`, `Attitude` or `Rigid`.
     - `body`: the `Inertia` or `MassProperties`.
-    - `field`: the equations of motion `f(t, state, args)`. A torque with its own states, such as a
-      wheel, keeps in these equations the states that it has at `t`.
+    - `field`: the equations of motion `f(t, state, args)`. If a torque has states of its own, such
+      as the speed of a wheel, these equations use the values of these states at `t`.
     - `own`: the own states of the torques at `t`, in the order of `Solution.own`, for a sensor of a
       wheel or a motor.
 
@@ -119,7 +119,11 @@ def array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Arr
 
 
 def optional_array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array | None]:
-    """Return the converter of `array_field`, for a field that may be `None`."""
+    """Return a converter, for `eqx.field`, that turns a value into an array of finite numbers of
+    this `shape`, and leaves `None` unchanged.
+
+    `name` is the name of the field for error messages.
+    """
     converted = array_field(name, shape)
     return lambda value: None if value is None else converted(value)
 

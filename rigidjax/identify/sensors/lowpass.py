@@ -136,8 +136,9 @@ def _input_slopes_at_interval_ends(
     """Return two arrays (n, k): the time derivatives of a sampled input at the begin, and at the
     end, of each of n intervals between samples.
 
-    A derivative is that of the parabola through three neighbouring samples. Next to a hole in the
-    log it is that of the straight line through two samples.
+    Each derivative is the slope of the parabola through three neighbouring samples or, at a sample
+    next to a hole in the log, the slope of the straight line through the two samples of the
+    interval.
 
     **Arguments:**
 

@@ -57,8 +57,8 @@ class StateSensor(AbstractSensor):
 
     @property
     def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Return the protocol (such as `HasPose`) of the smallest state with all parts that the
-        sensor reads.
+        """Return the protocol, such as `HasPose`, of the states that have all parts that the sensor
+        reads.
         """
         return _FEELS[self.kind]
 
