@@ -19,7 +19,8 @@ Row = tuple[str, float, float, float, str]
 
 
 def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
-    """Return all results of a fit as rows (name, value, low, high, unit) with 95 % intervals.
+    """Return all results of a fit as rows (name, value, low, high, unit), where low and high are
+    the ends of the 95 % interval.
 
     **Arguments:**
 
@@ -72,9 +73,10 @@ def table(lines: list[Row]) -> str:
 
 
 def numbers(value: float, low: float, high: float) -> list[str]:
-    """Return `value`, `low` and `high` as text, rounded by the width of the interval.
+    """Return three texts: `value`, `low` and `high`, rounded by the width of the interval.
 
-    **Arguments:** `value`; `low` and `high`, the ends of its interval, in the unit of `value`.
+    **Arguments:** `value` the number; `low` and `high` the ends of the interval of this number, in
+    the same unit.
 
     >>> numbers(1.23456, 1.2, 1.27)
     ['1.2346', '1.2000', '1.2700']
@@ -114,8 +116,8 @@ def _interval_as_text(texts: list[str]) -> str:
 
 
 def verdict(fit: Fit) -> str:
-    """Return, in words, the answers and the advice of a fit, and how well the data determine each
-    quantity.
+    """Return in words whether the search of a fit found the best point, whether the model explains
+    the readings, what to try, and how well the data determine each quantity.
 
     **Arguments:** `fit` a result of `rigidjax.identify.fit`.
 
@@ -148,7 +150,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
 
     - `fit`: a result of `rigidjax.identify.fit`.
     - `files`: the names of the files that were read.
-    - `more`: rows of further quantities, in the form of `rows`.
+    - `more`: rows (name, value, low, high, unit) of further quantities.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> as_dict(result)["status"]
@@ -227,8 +229,12 @@ def write_json(
 ) -> None:
     """Write all results of a fit to a file as JSON, in the form that `as_dict` returns.
 
-    **Arguments:** `fit`; `path`, the place of the file, which is overwritten; `files` and `more` as
-    for `as_dict`.
+    **Arguments:**
+
+    - `fit`: a result of `rigidjax.identify.fit`.
+    - `path`: the path of the file. A file that exists is overwritten.
+    - `files`: the names of the files that were read.
+    - `more`: rows (name, value, low, high, unit) of further quantities.
 
     >>> import json, tempfile
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
@@ -238,8 +244,7 @@ def write_json(
     'ok'
     """
     text = json.dumps(as_dict(fit, files, more), indent=2, ensure_ascii=False, allow_nan=False)
-    # A file name may contain bytes that are not a valid character. Such bytes are written as
-    # escapes.
+    # A file name may contain bytes that are not valid UTF-8. These bytes are written as escapes.
     Path(path).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
@@ -259,12 +264,12 @@ def write_html(
     **Arguments:**
 
     - `fit`: a result of `rigidjax.identify.fit`.
-    - `path`: the place of the file, which is overwritten.
+    - `path`: the path of the file. A file that exists is overwritten.
     - `title`: the title of the page.
     - `figures`: figures of matplotlib, such as those of `rigidjax.plot.fit`.
-    - `rate_unit`: as for `rows`.
+    - `rate_unit`: the unit of all angular rates: `rad/s`, `deg/s` or `deg/day`.
     - `files`: the names of the files that were read.
-    - `more`: rows of further quantities, in the form of `rows`.
+    - `more`: rows (name, value, low, high, unit) of further quantities.
 
     >>> import tempfile
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
@@ -322,8 +327,11 @@ def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str
     """Return the status, the table of quantities and the verdict of a fit as HTML, for a page or a
     notebook.
 
-    **Arguments:** `fit`; `rate_unit` as for `rows`; `more` rows of further quantities, in the form
-    of `rows`.
+    **Arguments:**
+
+    - `fit`: a result of `rigidjax.identify.fit`.
+    - `rate_unit`: the unit of all angular rates: `rad/s`, `deg/s` or `deg/day`.
+    - `more`: rows (name, value, low, high, unit) of further quantities.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> as_html(result).startswith("<p") and "Ix/Iz" in as_html(result)

@@ -16,8 +16,9 @@ from rigidjax.identify.uncertainty.quantities import Quantity
 
 # One sentence names at most this number of quantities.
 MOST = 3
-# A free bias is reported as large if it exceeds this share of the root mean square of the readings:
-# the bias of a real gyro is about a hundredth of the rates in a record that is worth a fit.
+# A free bias is reported as large if it exceeds this fraction of the root mean square of the
+# readings. The bias of a real gyro is about a hundredth of the rates in a record that is worth a
+# fit.
 REMARKABLE = 0.2
 # The words for the small constant errors whose sizes are in `considered.USUAL`.
 _WAYS = {
@@ -42,10 +43,11 @@ def describe_allowed_sensor_errors(
     - `model`: the fitted model.
     - `considered_errors`: the errors that the intervals allow for. They are the errors of the
       sensors with a `Tolerance`.
-    - `usual_shifts`: for each sensor without a tolerance a pair: the index of the sensor, and a
-      dict of kind of error ("scale" or "cross_axis") → how far a usual error of this kind would
-      move each of the `quantities` (from `considered.quantity_shifts_by_usual_errors`).
-    - `quantities`: the reported quantities that the sentences name.
+    - `usual_shifts`: for each sensor without a tolerance two things: the index of the sensor; and a
+      dict of kind of error → shifts (q,) of the q `quantities`. The kinds are "scale" (an error of
+      1 %) and "cross_axis" (an error of 1° between axes), as in
+      `considered.quantity_shifts_by_usual_errors`.
+    - `quantities`: the q reported quantities that the sentences name.
     """
     out = []
     sensors = model.records.sensors
@@ -67,11 +69,12 @@ def describe_allowed_sensor_errors(
 
 
 def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
-    """Describe the sensor biases without a prior that a fit made large beside the readings.
+    """Describe each sensor bias that has no prior and that is large compared with the readings.
 
-    Such a bias stands for a part of the motion that the model lacks: in one fit the bias of a
+    Such a bias may stand for a part of the motion that the model lacks: in one fit the bias of a
     pendulum's gyro came out as 1.6 rad/s. The text is empty if there is no such bias.
-    **Arguments:** `model` the fitted model; `quantities` the reported quantities of the fit.
+    **Arguments:** `model` the fitted model; `quantities` the reported quantities of the fit, which
+    hold the fitted biases.
     """
     out = []
     for index, reading in enumerate(model.records.readings):
@@ -99,8 +102,9 @@ def _describe_quantity_shifts(
     """Describe by how much each reported quantity would move if a sensor had a small constant
     error, such as an error of 1 % in the scale of one axis.
 
-    The words are such as "I1 by 0.02 (interval ±0.1)": in brackets stands half the width of the
-    95 % interval of the quantity, if it is finite. At most `MOST` quantities are named.
+    The words are such as "I1 by 0.02 (interval ±0.1)". The number in brackets is half the width of
+    the 95 % interval of the quantity; it is left out if it is not finite. At most `MOST` quantities
+    are named.
 
     **Arguments:**
 

@@ -11,7 +11,8 @@ FOUND, NOT_ALONE, NOT_ENDED = "found", "not alone", "not ended"
 # These words are the possible answers on the model.
 EXPLAINS, LEAVES, FAILS = "explains the readings", "leaves a part", "does not explain the readings"
 
-# Errors that exceed the given noise by more than this factor are not taken for sensor errors.
+# If the errors are larger than the given noise by more than this factor, sensors cannot have made
+# them, so that the intervals cannot be trusted.
 FAR = 3.0
 
 
@@ -40,8 +41,9 @@ class Cause(eqx.Module):
 
     - `name`: a short name of the cause, such as "drag".
     - `sensor`: the class of the sensor that has the errors.
-    - `share`: the share of the sum of squared errors that the cause explains. It is 1 for the cause
-      "misread" (the file was read with a wrong unit, axis or sign), and `None` for a guess.
+    - `share`: the fraction of the sum of squared errors that the cause explains, 0 to 1. It is 1
+      for the cause "misread" (the file was read with a wrong unit, axis or sign), and `None` for a
+      guess.
     - `words`: the cause in words.
     - `remedy`: what to do about the cause.
 
@@ -82,11 +84,12 @@ def advice_on_intervals(
 
     **Arguments:**
 
-    - `search`, `model`: the answers on the search and on the model.
+    - `search`: the answer on the search, whose word says whether the search found the best point.
+    - `model`: the answer on the model, whose word says whether the model explains the readings.
     - `causes`: the likely causes of the errors.
     - `covariance_kind`: the method by which the covariance was computed, in words, such as
       "jackknife: …".
-    - `error_ratio`: by how many times the errors are larger than the given noise of the sensors.
+    - `error_ratio`: the size of the errors divided by the given noise of the sensors.
     - `allowance`: sentences on the sensor errors that the intervals allow for, as
       `describe_allowed_sensor_errors` returns them.
     """

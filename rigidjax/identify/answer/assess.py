@@ -1,5 +1,7 @@
-"""Measure the quality of a fit: its covariance, the answers on search and model, and the starts
-that ended at other points which fit as well.
+"""Measure the quality of a fit.
+
+The measures are the covariance of the fit, the answer on its search, the answer on its model, and
+the number of searches that ended at another point but fit as well.
 """
 
 import dataclasses
@@ -58,9 +60,9 @@ RARE = 1e-5
 # The test for autocorrelated errors uses the autocorrelations at lags of 1 to this number of
 # samples.
 LAGS = 10
-# These numbers are shares of the variance of the readings. A model fails if its errors exceed HALF
-# of this variance, or if the autocorrelated part of its errors exceeds a TENTH of this variance.
-# Errors below a QUARTER of this variance are small, if nothing else is wrong.
+# These numbers are fractions of the variance of the readings. A model fails if the mean square of
+# its errors exceeds HALF of the variance, or if the autocorrelated part of this mean square exceeds
+# a TENTH of the variance. Errors whose mean square is at most a QUARTER of the variance are small.
 HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
@@ -71,17 +73,13 @@ def goodness_of_fit(
     times: CorrelationTimes,
     covariance: np.ndarray,
 ) -> tuple[float, int, Answer, tuple[int, ...]]:
-    """Return the χ² of a fit and the answer on the model.
+    """Return the χ² of a fit, and the answer whether its model explains the readings.
 
-    Four things are returned: χ², summed over the sensors whose noise is given; the degrees of
-    freedom of χ²; the answer on the model; and the indices of the sensors whose errors the model
-    does not explain.
-
-    The errors of a sensor count as larger than its given noise if χ² exceeds its mean by five of
-    its standard deviations; under a robust loss the median of the squared errors takes the place
-    of χ². The errors are also compared with the variance of the readings. Ljung and Box's test
-    (1978, doi:10.1093/biomet/65.2.297) says whether the errors are white. Readings at full scale
-    are left out.
+    The errors of a sensor count as larger than its given noise if their χ² exceeds the expected χ²
+    by more than five standard deviations of χ². Under a robust loss the median of the squared
+    errors takes the place of χ². The errors are also compared with the variance of the readings.
+    Ljung and Box's test (1978, doi:10.1093/biomet/65.2.297) says whether the errors are white.
+    Readings at full scale are left out.
 
     **Arguments:**
 
@@ -89,6 +87,13 @@ def goodness_of_fit(
     - `linear`: the errors and their derivatives at the best point.
     - `times`: the autocorrelation times of the errors.
     - `covariance`: (n, n) the covariance of the free numbers for white errors.
+
+    **Returns** four things:
+
+    - χ², summed over the sensors whose noise is given;
+    - the degrees of freedom of χ²;
+    - the answer on the model;
+    - the indices of the sensors whose errors the model does not explain.
     """
     chi2, count, word, free = 0.0, 0, EXPLAINS, linear.free_count
     words: list[str] = []
@@ -148,10 +153,11 @@ def _describe_errors(
       times and k components.
     - `mask`: (R, T, k) true for the errors to use: those of readings that are neither masked nor at
       full scale.
-    - `factor`: by how many times the errors are larger than the known noise. It is written only if
-      it is above 1.
-    - `share`: the sum of squared errors divided by the sum of squares of the readings about their
-      mean, or `None` if the readings are constant or have another unit than the errors.
+    - `factor`: the size of the errors divided by the known noise. It is written only if it is above
+      1.
+    - `share`: the sum of squared errors divided by the sum of squared differences of the readings
+      from their mean. It is `None` if the readings are constant, or if they have another unit than
+      the errors.
     - `span`: the number of samples over which the errors are autocorrelated, or `None` for white
       errors.
     """
@@ -173,11 +179,11 @@ def _describe_errors(
 
 
 def _describe_time_of_largest_errors(model: Model, error: np.ndarray, mask: np.ndarray) -> str:
-    """Describe the shortest interval of time that contains half of the sum of squared errors of a
-    sensor.
+    """Describe the shortest interval of time in which a sensor has half of its sum of squared
+    errors.
 
-    The interval lies in the recording with the largest sum of squared errors. If it is longer than
-    40 % of this recording, the words are "all along".
+    The interval is sought in the recording with the largest sum of squared errors. If the interval
+    is longer than 40 % of this recording, the words are "all along".
 
     **Arguments:**
 
@@ -203,8 +209,11 @@ def _describe_time_of_largest_errors(model: Model, error: np.ndarray, mask: np.n
 def _sums_of_squares_of_errors_readings_round_off(
     reading: Reading, error: np.ndarray, mask: np.ndarray
 ) -> tuple[float, float, float]:
-    """Return three sums of squares for one sensor: of its errors; of the differences of its
-    readings from their mean; and of the round-off of its readings.
+    """Return three sums of squares for one sensor, which are compared with each other.
+
+    They are the sum of its squared errors; the sum of the squared differences of its readings from
+    their mean; and 1e-12 times the sum of its squared readings. The last one is a bound of
+    round-off.
 
     **Arguments:**
 
@@ -221,11 +230,11 @@ def _sums_of_squares_of_errors_readings_round_off(
 def _noise_ratio_by_median(squared_lengths: np.ndarray, components: int) -> float:
     """Return the factor by which errors are larger than their given noise.
 
-    The errors are given in standard deviations of the noise. The factor is √(m/m₁): m is the median
-    of their squared lengths, and m₁ is the median for errors that are as large as the noise. The
-    factor is 1 if m is less than five of its standard deviations above m₁, since so small an excess
-    may be chance. The median takes the place of χ² under a robust loss: outliers are expected
-    there, and outliers would dominate χ².
+    The errors are given in standard deviations of the noise. The factor is √(m/m₁), where m is the
+    median of the squared lengths of the errors, and m₁ is the expected median for errors that are
+    as large as the noise. The factor is 1 if m − m₁ is at most five standard deviations of m, since
+    so small an excess may be chance. The median takes the place of χ² under a robust loss, because
+    a robust loss is chosen where outliers are expected, and outliers would dominate χ².
 
     **Arguments:**
 
@@ -252,9 +261,9 @@ def _is_white(
     """Return whether the errors of a sensor are white (not autocorrelated), by Ljung and Box's
     test.
 
-    A fit makes white errors correlated: it subtracts `slope covariance slopeᵀ` from their
-    covariance, which shows in many short recordings (Box and Pierce 1970,
-    doi:10.1080/01621459.1970.10481180). The test allows for this correlation.
+    A fit makes white errors correlated: it subtracts `slope covariance slopeᵀ` from the covariance
+    of the errors (Box and Pierce 1970, doi:10.1080/01621459.1970.10481180). This correlation is
+    noticeable if there are many short recordings. The test allows for it.
 
     **Arguments:**
 
@@ -312,15 +321,16 @@ AT_THE_END = 0.05
 def _answer_on_search(
     best_cost: float, ended: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
 ) -> Answer:
-    """Return the answer of a fit on its search: `found`, `not alone` (another motion fits, too), or
-    `not ended`.
+    """Return the answer whether the search of a fit found the best point.
+
+    The word of the answer is `found`, `not alone` (another motion fits as well) or `not ended`.
 
     **Arguments:**
 
     - `best_cost`: the least cost (half the sum of squared residuals) of all starts.
     - `ended`: whether the search reached a minimum.
     - `rivals`: a sentence on the starts that ended at other points and fit as well, or "".
-    - `interrupted`: what was interrupted, in words.
+    - `interrupted`: one text for each interrupt (Ctrl-C) of the search; empty if there was none.
     - `remarks`: other reasons for the answer, in words.
     """
     if not np.isfinite(best_cost):
@@ -336,20 +346,22 @@ def _answer_on_search(
 def _count_rivals(
     starts: Sequence[Start], best_cost: float, margin: float, linear: Linearisation, x: Array
 ) -> int:
-    """Return how many searches ended at another point than the best one and fit the readings as
+    """Return how many searches converged to another point than the best one and fit the readings as
     well.
+
+    An end of a search is counted as another point if two conditions hold:
+
+    - Its cost exceeds `best_cost` by more than a hundredth of `margin`. Two searches that reach the
+      same minimum end at slightly different costs.
+    - The step from the best point x to this end changes the errors, by the linearisation at x, by a
+      sum of squares of more than twice `margin`. Distant points of a flat valley predict the same
+      readings and are therefore not counted.
 
     **Arguments:**
 
-    - `starts`: the ends of the searches that fit as well as the best one. An end that has not
-      converged is not counted. An end whose cost exceeds `best_cost` by less than a hundredth of
-      `margin` is not counted either: it is the best point again, since two searches that reach the
-      same minimum end at slightly different costs.
+    - `starts`: the ends of the searches that fit as well as the best one.
     - `best_cost`: the least cost (half the sum of squared residuals) of all searches.
-    - `margin`: the growth of the cost below which two points fit equally well. A point is another
-      one if the errors there, by the linearisation at x, differ from the errors at x by a sum of
-      squares of more than twice this margin. Distant points of a flat valley, which predict the
-      same readings, are therefore not counted.
+    - `margin`: the largest difference of cost with which two points fit equally well.
     - `linear`: the errors at the best point, with their derivatives.
     - `x`: (n,) the free numbers at the best point.
     """
@@ -373,12 +385,12 @@ def assess(
     interrupted: Sequence[str],
     remarks: Sequence[str],
 ) -> Fit:
-    """Return the `Fit` of the best point of all starts, whether or not it converged.
+    """Return the `Fit` of the best point of all starts, whether or not the search converged there.
 
     **Arguments:**
 
     - `model`: the model that was fitted, whose readings may be padded.
-    - `best`: the best point.
+    - `best`: the best point, with the errors at this point and their derivatives.
     - `noise`: the standard deviations of the errors of each sensor.
     - `attempts`: the ends of the searches from all starts.
     - `best_cost`: the least cost of the `attempts`.
@@ -425,9 +437,9 @@ def assess(
     done = bool(best.converged) or uncertainty.distance_to_minimum(linear, white, held) < near_end
     chi2, dof, explanation, left = goodness_of_fit(model, noise, linear, times, white.determined)
     believable = explanation.word != FAILS
-    # A start fits as well as the best one if its log-likelihood is at most ten units lower. The
-    # unit is that of the estimated noise if some noise is estimated, and autocorrelated errors
-    # count as fewer independent errors.
+    # A start fits as well as the best one if its log-likelihood is at most ten lower. If some noise
+    # is estimated, the cost is measured in mean squared residuals at the best point. Autocorrelated
+    # errors count as fewer independent errors, which makes the margin of the cost larger.
     guessed = not all(r.has_known_noise and not has_unit_noise(r) for r in model.records.readings)
     unit = 2 * best_cost / model.records.size if guessed else 1.0
     margin = 10.0 * unit * max(times.longest_span, 1.0)
@@ -491,24 +503,24 @@ def _describe_constant_sensor_errors(
     quantities: Sequence[Quantity],
     slopes: np.ndarray,
 ) -> str:
-    """Return sentences on the constant errors of sensors, such as an error of scale: on those that
-    the intervals of a fit allow for, and on those that the intervals do not allow for.
+    """Say for which constant errors of sensors, such as an error of scale, the intervals of a fit
+    allow.
 
-    Intervals allow for the errors of a sensor that has a `Tolerance`. For a sensor without one, the
-    sentences say how far a small error of its scale or of its axes would move the moments and
-    ratios of the body or, if none is reported, the values of the `Free`s (numbers that a fit may
-    move).
+    The intervals allow for the errors of a sensor that has a `Tolerance`. For a sensor without a
+    tolerance, the sentences say how far a small error of its scale or of its axes would move the
+    moments of the body or their ratios. If the fit reports none of these, the sentences say how far
+    the values of the `Free`s (numbers that a fit may move) would move.
 
     **Arguments:**
 
     - `model`, `noise`: the fitted model, and the standard deviations of the errors of its sensors.
     - `linear`: the errors and their derivatives at the best point.
     - `covariance`: (n, n) the covariance of the free numbers, computed as if the errors were white.
-    - `considered_errors`: the errors that the intervals allow for: the constant errors, within its
-      `Tolerance`, of each sensor that has one.
+    - `considered_errors`: the constant errors, within the `Tolerance` of a sensor, for which the
+      intervals allow.
     - `quantities`: the q reported quantities.
-    - `slopes`: (q, n) the derivatives of the quantities with respect to the free numbers; further
-      rows, for the flatness of bodies, are not used.
+    - `slopes`: the derivatives (q, n) of the quantities with respect to the n free numbers. Further
+      rows at the end, for the flatness of bodies, are not used.
     """
     bodies = {
         log + name for name, chart in name_suffixes_and_charts(model) for log in chart.log_names
@@ -537,16 +549,18 @@ def _covariance_with_considered_errors(
     considered_errors: tuple[considered.Consideration, ...],
     model: Model,
 ) -> uncertainty.Covariance:
-    """Return the `covariance` of a fit plus the covariance that the constant errors of sensors
-    within their `Tolerance` make.
+    """Return the `covariance` of a fit plus the covariance that considered errors of its sensors
+    cause.
 
-    Such an error is called considered: the fit does not estimate it, but the intervals allow for
-    it.
+    A considered error is a constant error of a sensor, such as an error of scale. Its size is
+    limited by the `Tolerance` of the sensor. The fit does not estimate it, but the intervals allow
+    for it.
 
     **Arguments:**
 
     - `covariance`: the covariance of the free numbers.
-    - `considered_errors`: the considered errors, with the change of the free numbers by each.
+    - `considered_errors`: the considered errors. Each one holds the changes of the free numbers
+      that it causes.
     - `model`: the fitted model.
     """
     if not considered_errors:

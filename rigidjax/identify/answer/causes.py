@@ -1,9 +1,9 @@
 """Find the most likely cause of the errors of a fit.
 
 Each cause has a direction: the change that the cause would make in the readings along the fitted
-motion. The errors are regressed on this direction together with the derivatives with respect to
-all free numbers (a score test: Rao 1948, doi:10.1017/S0305004100023987). A cause whose effect a
-change of the free numbers could also make therefore explains nothing.
+motion. The errors are regressed on this direction together with the derivatives of the readings
+with respect to all free numbers (a score test: Rao 1948, doi:10.1017/S0305004100023987). Therefore
+a cause explains nothing if a change of the free numbers has the same effect on the readings.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,10 +30,11 @@ from rigidjax.identify.uncertainty.considered import slope_in_time
 from rigidjax.identify.uncertainty.covariance import Linearisation
 from rigidjax.motion.torques.base import Torque
 
-# A corrected recording is believed if its error is less than BETTER times the error without the
-# correction, and less than LITTLE times the size of the whole signal.
+# A correction of the recorded body rates is believed if two conditions hold: the error of the
+# corrected rates, by the attitudes or by Euler's equations, is less than BETTER times the error
+# without the correction; and it is less than LITTLE times the size of the whole signal.
 BETTER, LITTLE = 0.5, 0.3
-# Corrections whose error is at most EQUAL times the least error cannot be told apart.
+# Several corrections cannot be told apart if the error of each is at most EQUAL times the least.
 EQUAL = 1.1
 _SAME = np.eye(3)
 
@@ -64,7 +65,8 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None
     The result is `None` if no mistake is likely. The rates of the gyro are compared with the rates
     between successive attitudes. Without attitudes the rates are inserted in Euler's equations with
     the inertia that fits best, and a correction is accepted only if this inertia is that of a real
-    body. Without attitudes, a mirrored axis shows only under a torque.
+    body. A mirrored axis then shows only under a torque: free motion with a mirrored axis is a free
+    motion, too.
 
     **Arguments:** `recordings` are the recordings of one body; `torque` is the torque of the model.
     """
@@ -116,13 +118,16 @@ def _euler_residual_and_tensor_margin(
     correction: np.ndarray,
     sign: float = 1.0,
 ) -> tuple[float, float]:
-    """Return two numbers: the relative residual of Euler's equations, for the inertia tensor that
-    fits the recorded body rates best; and the margin of this tensor, positive if a body can have
-    it.
+    """Return how well the inertia tensor that fits the recorded body rates best satisfies Euler's
+    equations, and whether a real body can have this tensor.
 
-    The matrix of second moments of a tensor I is `½ tr(I) E − I`, with the unit matrix E; its
-    eigenvalues are positive for a real body. The margin is the smallest eigenvalue of this matrix,
-    divided by the magnitude of the eigenvalue that has the largest magnitude.
+    Two numbers are returned:
+
+    - The residual of Euler's equations, relative to the angular momentum.
+    - The margin of the tensor, which is positive if a real body can have the tensor. The matrix of
+      second moments of a tensor I is `½ tr(I) E − I`, with the unit matrix E; its eigenvalues are
+      positive for a real body. The margin is the smallest of the eigenvalues, divided by the
+      largest magnitude of an eigenvalue.
 
     **Arguments:**
 
@@ -146,10 +151,11 @@ def _relative_rate_difference(
     attitudes: Sequence[tuple[np.ndarray, np.ndarray]],
     correction: np.ndarray,
 ) -> float:
-    """Return how far the body rates of a gyro differ from those between successive recorded
-    attitudes.
+    """Return how far the body rates of a gyro differ from the mean body rates between successive
+    recorded attitudes.
 
-    The result is the root mean square difference, relative to the rates between attitudes.
+    The result is the root mean square difference, divided by the root mean square rate between
+    attitudes.
 
     **Arguments:**
 
@@ -174,17 +180,17 @@ def _relative_rate_difference(
     return float(np.sqrt(left / size))
 
 
-# A cause is named if it explains more than the share ENOUGH of the squared errors, and at least the
-# share NEARLY of what the best cause explains.
+# A cause is named if it explains more than the fraction ENOUGH of the squared errors, and at least
+# NEARLY times as much as the best cause.
 ENOUGH, NEARLY = 0.7, 0.95
-# A direction has unit length. It is dropped if its part that no change of the free numbers can make
-# is shorter than this number.
+# The direction of a cause has length one. All changes of the readings that the free numbers can
+# make are subtracted from it. It is dropped if the remainder is shorter than this number.
 APART = 0.05
 # The causes in LINEAR change the readings in proportion to their size only if the size is below
 # SMALL.
 LINEAR, SMALL = ("scale", "mounting", "skew"), 0.5
-# The entry SKEW[i, j, k] is 1 if the k-th angle of skew adds a part of component i to the reading
-# of axis j.
+# The entry SKEW[i, j, k] is 1 if the k-th angle of skew adds component i, times this angle, to the
+# reading of axis j.
 SKEW = np.zeros((3, 3, 3))
 SKEW[1, 0, 0] = SKEW[2, 0, 1] = SKEW[2, 1, 2] = 1.0
 
@@ -234,10 +240,12 @@ def causes(
 
 
 def time_stamp_cause(model: Model, noise: Noise, linear: Linearisation, index: int) -> Cause | None:
-    """Return the cause "clock" if the time stamps of a sensor scatter by more than its jitter.
+    """Return the cause "clock" if the time stamps of a sensor scatter by more than its jitter, the
+    standard deviation of the time stamps that the fit allows for.
 
     Otherwise the result is `None`. A late time stamp makes an error along dy/dt, the derivative of
-    the readings y with respect to time.
+    the readings y with respect to time. Time stamps are the likely cause if the errors along dy/dt
+    are larger than errors of random direction would be.
 
     **Arguments:** `model` is the fitted model, `noise` the standard deviations of the errors of
     each sensor, `linear` the errors and their derivatives at the best point, and `index` the index
@@ -257,7 +265,8 @@ def time_stamp_cause(model: Model, noise: Noise, linear: Linearisation, index: i
         return None
     along = np.sum(np.sum(error * slope, axis=-1)[moving] ** 2 / moved[moving])
     channels = np.sum(error[kept] ** 2, axis=0)
-    # Random errors that are as large in each channel have this share along dy/dt by chance.
+    # Random errors that are as large in each channel as the errors have this fraction of their sum
+    # of squares along dy/dt by chance.
     ways = np.mean(slope[moving] ** 2 / moved[moving][:, None], axis=0)
     chance, share = float(ways @ channels / channels.sum()), float(along / channels.sum())
     if not share > chance + 0.5 * (1.0 - chance) + 1.0 / np.sqrt(moving.sum()):
@@ -272,14 +281,15 @@ def time_stamp_cause(model: Model, noise: Noise, linear: Linearisation, index: i
 def _cause_with_share(
     name: str, sensor: AbstractSensor, share: float, words: str, remedy: str
 ) -> Cause:
-    """Return a likely cause of the errors of a sensor, whose words say how much of them it
-    explains.
+    """Return a likely cause of the errors of a sensor.
+
+    The words of the cause say what percentage of the squared errors it explains.
 
     **Arguments:**
 
     - `name`: a short name of the cause, such as "drag".
     - `sensor`: the sensor that has the errors.
-    - `share`: the share of the sum of squared errors that the cause explains, 0 to 1.
+    - `share`: the fraction of the sum of squared errors that the cause explains, 0 to 1.
     - `words`: the cause in words.
     - `remedy`: what to do about the cause, in words.
     """
@@ -293,21 +303,24 @@ def _cause_with_largest_share(
     candidates: Sequence[tuple[str, np.ndarray, str, str]],
     shares: Sequence[tuple[float, np.ndarray]],
 ) -> Cause | None:
-    """Return the cause that explains the largest share of the squared errors of a `sensor`.
+    """Return the cause that explains the largest fraction of the squared errors of a `sensor`.
 
-    Causes that explain nearly as large a share are joined to it by "or". The result is `None` if
-    the largest share is at most 0.7. The share is computed as if the readings changed in proportion
-    to the size of a cause. An error of the scale, mounting or skew that comes out large is left
-    out, since this is false for it; only a large scale error that is the same for all axes is kept,
-    since it shows a wrong unit.
+    Causes that explain nearly as large a fraction are joined to it by "or". The result is `None` if
+    the largest fraction is at most 0.7.
+
+    The fractions are computed as if the readings changed in proportion to the size of a cause. A
+    large error of the scale, mounting or skew does not change the readings in proportion to its
+    size, so that it is left out. A large scale error is kept only if it is the same for all axes,
+    since it then shows a wrong unit.
 
     **Arguments:**
 
     - `sensor`: the sensor that has the errors.
-    - `candidates`: for each possible cause its name; the change (R, T, 3, c) of the readings by a
-      cause of unit size, for R recordings, T times, three axes and the c numbers of the cause; the
-      cause in words; and its remedy in words.
-    - `shares`: for each possible cause the share that it explains, and its size (c,).
+    - `candidates`: for each possible cause four things, as `_candidate_causes` returns them: its
+      name; the change of the readings by a cause of unit size; the cause in words; and its remedy
+      in words.
+    - `shares`: for each possible cause two things: the fraction of the squared errors that it
+      explains; and its size (c,), the c numbers of the cause, such as the components of a bias.
     """
     kept = [
         (share, name, words.format(size=", ".join(f"{x:.2g}" for x in size)), remedy)
@@ -334,8 +347,8 @@ def _is_vector_error(sensor: AbstractSensor) -> bool:
 def _candidate_causes(
     model: Model, x: Float[Array, " n"], linear: Linearisation, index: int
 ) -> tuple[tuple[str, np.ndarray, str, str], ...]:
-    """Return the possible causes of the errors of a sensor, with the change of the readings by
-    each.
+    """Return the possible causes of the errors of a sensor, and how each cause would change the
+    readings.
 
     **Arguments:**
 
@@ -344,10 +357,13 @@ def _candidate_causes(
     - `linear`: the errors and their derivatives at x.
     - `index`: the index of the sensor.
 
-    **Returns** for each cause four things: its name, such as "bias"; the change (R, T, 3, c) of the
-    readings by a cause of unit size; the cause in words, in which `{size}`, if it occurs, stands
-    for the size; and the remedy in words. The change is given for R recordings, T times, three axes
-    and the c numbers of the cause, such as the three components of a bias.
+    **Returns** for each cause four things:
+
+    - its name, such as "bias";
+    - the change (R, T, 3, c) of the readings by a cause of unit size, for R recordings, T times,
+      three axes and the c numbers of the cause, such as the three components of a bias;
+    - the cause in words, in which `{size}`, if it occurs, stands for the size of the cause;
+    - the remedy in words.
     """
     reading = model.records.readings[index]
     t, shown = np.asarray(model.records.t), np.asarray(reading.values) - linear.raw[index]
@@ -383,10 +399,10 @@ def _rate_response_to_torques(
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that maps torques to the changes of the body rate that the torques make.
 
-    Torques τ, N m, and changes, rad/s, have the shape (R, T, 3, c), for R recordings, T times and c
-    torques in the body frame. The change is `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt`, where I is the inertia tensor
-    and Φ = dΩ/dΩ₀ the derivative of the body rate Ω with respect to the initial rate Ω₀ along the
-    fitted motion.
+    The torques τ, in N m, and the changes, in rad/s, have the shape (R, T, 3, c), for R recordings,
+    T times and c torques in the body frame. The change at the time t is `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt`, with
+    the integral from the first time to t. Here I is the inertia tensor, and Φ = dΩ/dΩ₀ is the
+    derivative of the body rate Ω with respect to the initial rate Ω₀ along the fitted motion.
 
     **Arguments:**
 
@@ -422,22 +438,23 @@ def _explained_share(
     free_columns: np.ndarray,
     direction: np.ndarray,
 ) -> tuple[float, np.ndarray]:
-    """Return two things: the share of a sensor's squared errors that a cause explains, 0 to 1; and
-    the size (c,) of the cause.
+    """Return two things: the fraction of a sensor's squared errors that a cause explains, 0 to 1;
+    and the size (c,) of the cause.
 
-    A cause has c numbers, such as the three components of a bias. The direction of a number is the
-    change of the readings if it is one. The size holds the coefficients of the c directions in the
-    least-squares fit of the errors.
+    A cause has c numbers, such as the three components of a bias. The direction of one of these
+    numbers is the change of the readings if this number is one and all others are zero. The size of
+    the cause holds the coefficients of the c directions in the least-squares fit of the errors.
 
     **Arguments:**
 
-    - `model`, `noise`, `linear`: the fitted model, the standard deviations of its errors, and the
-      errors and their derivatives at the best point.
+    - `model`: the fitted model.
+    - `noise`: the standard deviations of the errors of each sensor.
+    - `linear`: the errors and their derivatives at the best point.
     - `index`: the index of the sensor.
-    - `free_columns`: (R, N, m) orthonormal columns. They span all changes of the N errors of each
-      of R recordings that a change of the free numbers can make. These changes are subtracted from
-      the directions and from the errors.
-    - `direction`: (R, T, k, c) the directions, for T times and k components of a reading.
+    - `free_columns`: (R, N, m) for each of R recordings m orthonormal columns. They span all
+      changes that the free numbers can make in the N errors of the recording. These changes are
+      subtracted from the directions and from the errors.
+    - `direction`: (R, T, k, c) the c directions, for T times and k components of a reading.
     """
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]

@@ -51,12 +51,13 @@ _FEW = 100_000
 # Integration steps are short enough if shorter steps change all predictions by less than this
 # fraction of the noise.
 _MATTERS = 0.05
-# The noise, and the standard deviation between recordings of a `Free` (its `spread`), are each
-# estimated in rounds: of the best point for the last estimate, then of a new estimate. For the
-# spread a round is one of expectation and maximisation (Dempster, Laird and Rubin 1977; Laird and
-# Ware 1982, doi:10.2307/2529876). There are at most _ROUNDS rounds, and they end once an estimate
-# changes by less than the fraction _SETTLED of itself. A spread does not fall below _LEAST times
-# its first value, which then stands for zero.
+# The noise of the sensors is estimated in rounds, and so is the `spread` of a `Free` (its standard
+# deviation between recordings). Each round finds the best point for the last estimate, and then a
+# new estimate at this point. For the spread a round is one of expectation and maximisation
+# (Dempster, Laird and Rubin 1977; Laird and Ware 1982, doi:10.2307/2529876). There are at most
+# _ROUNDS rounds, and they end once every estimate changes by less than the fraction _SETTLED of
+# itself. A spread does not fall below _LEAST times its first value; this least value stands for
+# zero.
 _ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
 
 
@@ -84,8 +85,9 @@ def fit(
     - `initial`: (n,) a starting point of your own, which is tried first.
     - `key`: the random key of the scattered starting points; without a key these points are the
       same at each call.
-    - `tolerance`: Levenberg–Marquardt stops when a step is shorter than `tolerance` standard
-      deviations of each number (with all other numbers fixed), and changes the misfit as little.
+    - `tolerance`: the search has converged if the next Levenberg–Marquardt step changes each free
+      number by less than `tolerance` standard deviations of this number, computed with all other
+      numbers fixed.
     - `max_steps`: the largest number of Levenberg–Marquardt steps.
     - `descent`: a `Descent(optimiser, steps=…, batch=…)` with an optimiser of optax, which first
       improves each starting point on a few recordings at a time. It pays for many recordings, where
@@ -110,9 +112,9 @@ def fit(
     CPU, and the report says so. Within `jax.default_device(…)`, or if an array of the model was put
     on a device, the fit runs on that device.
 
-    **Raises:** `TypeError` unless `model` is a `Model`, `ValueError` for fewer than one start, more
-    than 1000 free numbers that recordings share (`descend` takes any number), a checkpoint that is
-    damaged or of another model, or one in a folder that does not exist.
+    **Raises:** `TypeError` unless `model` is a `Model`. `ValueError` for fewer than one start; for
+    more than 1000 free numbers that recordings share (`descend` takes any number); and for a
+    checkpoint that is damaged, belongs to another model, or lies in a folder that does not exist.
 
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
@@ -201,10 +203,11 @@ def _cpu_if_faster(model: Model) -> Any:
 
 def _with_original_readings(original: Model, fitted: Model) -> Model:
     """Return the `fitted` model with the readings of the `original` model in place of its padded
-    ones.
+    readings.
 
     A fit adds masked readings at the end of each recording, so that recordings of similar length
-    share one compiled program. The errors of time stamps (jitter) that the fit estimated are kept.
+    share one compiled program. The scatter of the time stamps (jitter) that the fit estimated is
+    kept.
     """
     records = original.records
     for index, r in enumerate(fitted.records.readings):
@@ -216,11 +219,11 @@ def _with_original_readings(original: Model, fitted: Model) -> Model:
 
 
 def _finite_cost(attempt: Attempt) -> float:
-    """Return the cost at the end of a search, or infinity for NaN, so that the least cost is a good
-    one.
+    """Return the cost at the end of a search, or infinity if it is NaN, so that NaN is never taken
+    for the least cost.
 
     The cost is half the sum of squared residuals. The `attempt` is the end of the search from one
-    start.
+    starting point.
     """
     cost = float(attempt.cost)
     return cost if np.isfinite(cost) else np.inf
@@ -305,7 +308,8 @@ def _search_from_each(
       which each new end is saved; `None` for no file.
     - `progress`: a function that is called with a line of text after each search, or `None`.
     - `interrupts`: a list, to which a line is added after an interrupt (Ctrl-C). The remaining
-      starts are then left out; the interrupt is raised if no search has got anywhere.
+      starts are then left out. If no search has reached a finite cost, the interrupt is raised
+      again.
     """
     like, print_of = Attempt(points[0]), ""
     if checkpoint is not None:
@@ -346,9 +350,10 @@ def _search_from_each(
 
 
 def _with_errors_and_derivatives(best: Attempt, model: Model) -> Attempt:
-    """Return the end of a search with the errors of the `model` there, and with their derivatives.
+    """Return `best`, the end of a search, with the errors of the `model` at its free numbers and
+    the derivatives of the errors.
 
-    They are computed only if `best`, the end of the search, does not hold them already.
+    Errors and derivatives are computed only if `best` does not hold them already.
     """
     if best.blocks is not None:
         return best
@@ -380,16 +385,16 @@ def _with_integrator(model: Model, integrator: AbstractIntegrator | None) -> Mod
 def _converged_integrator(
     best: Attempt, task: Task, remarks: list[str]
 ) -> AbstractIntegrator | None:
-    """Return an integrator with steps so short that shorter steps do not change the predictions.
+    """Return an integrator with steps so short that shorter steps hardly change the predictions.
 
-    The result is `None` if the present integrator of the model is accurate enough.
+    Predictions hardly change if each change is at most a twentieth of the noise. The result is
+    `None` if the present integrator of the model is accurate enough.
 
     **Arguments:**
 
-    - `best`: the end of a search, with the errors at its free numbers; the predictions are compared
-      there.
-    - `task`: the model with its integrator, and the noise of its sensors, which is the measure of a
-      change.
+    - `best`: the end of a search, with the errors at its free numbers. The predictions of two
+      integrators are compared at these numbers.
+    - `task`: the model with its integrator, and the noise of its sensors.
     - `remarks`: a list, to which a line is added if even the shortest steps still change the
       predictions.
     """
@@ -454,16 +459,16 @@ def _expected_spreads(best: Attempt, task: Task, indices: list[int]) -> np.ndarr
     """Return the expected spread (k,) of each of k `Free`s (numbers that a fit may move) whose
     value differs between recordings.
 
-    The spread is the root mean square, over recordings,
-    of the deviation of its value from the value that the recordings share. The expectation is over
-    the posterior density at the point `best`, which Laplace's method takes as normal.
+    The spread is the root mean square, over recordings, of the deviation of the value of a `Free`
+    in one recording from the value that the recordings share. The expectation is over the posterior
+    density of the free numbers, which Laplace's method takes as normal about the point `best`.
 
     **Arguments:**
 
     - `best`: the end of a search, with the errors and their derivatives there.
     - `task`: the model and the noise of its sensors.
-    - `indices`: the indices of the k `Free`s in `task.model.slots`, which describes all `Free`s of
-      the model.
+    - `indices`: the indices of the k `Free`s in `task.model.slots`, the list of all `Free`s of the
+      model.
     """
     linear = linearise(task.model, best.x, task.noise, best.blocks)
     variance, x = np.diag(white_covariance(linear).determined), np.asarray(best.x)

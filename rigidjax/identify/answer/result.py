@@ -54,33 +54,36 @@ class Fit(eqx.Module):
     - `model`: the model that was fitted.
     - `x`: (n,) the free numbers at the best point.
     - `covariance`: (n, n) the covariance of x; infinite for numbers that the data do not determine.
-    - `determined_covariance`: (n, n) the part of the covariance within the directions of x that the
-      data determine.
+    - `determined_covariance`: (n, n) the covariance of x within the directions of x that the data
+      determine.
     - `covariance_kind`: the method by which the covariance was computed, in words.
-    - `noises`: for each sensor, (R, k) the standard deviations of the k components of its errors,
-      in each of R recordings.
+    - `noises`: for each sensor the standard deviations (R, k) of the k components of its errors in
+      each of R recordings.
     - `starts`: a `Start` for each starting point.
-    - `chi2`, `dof`: χ², summed over the sensors whose noise was given, and its degrees of freedom.
+    - `chi2`: χ², summed over the sensors whose noise was given.
+    - `dof`: the degrees of freedom of χ².
     - `correlation`: the number of samples over which the errors are autocorrelated; 1 for white
       errors.
     - `independent`: the number of independent errors.
-    - `singular_values`: (n,) the singular values of the whitened Jacobian with columns of length
-      one. The free numbers that belong to one recording alone are eliminated first.
+    - `singular_values`: (n,) the singular values of the Jacobian of all residuals, with columns of
+      length one. The free numbers that belong to one recording alone are eliminated first.
     - `null_directions`: (k, n) the directions of x that the data do not determine.
     - `quantities`: all reported quantities.
     - `search`: the answer on the search; its `word` is `found`, `not alone` or `not ended`.
     - `explanation`: the answer on the model; its `word` is `explains the readings`, `leaves a part`
       or `does not explain the readings`.
     - `left`: the indices of the sensors whose errors the model does not explain.
-    - `limits`: the distance of each body from a flat body.
-    - `near`: (n,) the free numbers at which derivatives are taken if the body is flat, else `None`.
+    - `limits`: for each body with free moments its distance from a flat body, whose principal
+      moments are I1 + I2 = I3.
+    - `near`: (n,) the free numbers of a slightly thicker body, at which derivatives are taken if a
+      body is flat at x; else `None`.
     - `freedom`: the numbers from which the degrees of freedom of a variance are computed.
     - `linear`: the errors and their derivatives at the best point, from which the covariance and
       the answers are computed.
     - `considered`: the sensor errors that the covariance allows for by a `Tolerance`.
     - `allowance`: the sentences on the sensor errors that the intervals allow for.
-    - `hidden_directions`: (k, n) for a fit of windows, the directions of x that only one stretch of
-      windows shows. The variance along these directions is infinite.
+    - `hidden_directions`: (k, n) for a fit of windows the directions of x that only one stretch (a
+      run of neighbouring windows) shows. The variance along these directions is infinite.
     - `place`: where the fit was computed, in words, if that is not JAX's default device.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
@@ -125,13 +128,16 @@ class Fit(eqx.Module):
 
     @property
     def ok(self) -> bool:
-        """Return whether the fit converged, explains the data, and is unique."""
+        """Return whether the search converged, the model explains the data, and no other motion
+        fits as well.
+        """
         return self.status == "ok"
 
     @property
     def derivative_point(self) -> Float[Array, " n"]:
-        """Return the free numbers at which derivatives are taken: `near` for a flat body, else
-        `x`.
+        """Return the free numbers at which derivatives are taken.
+
+        They are the field `near` (a slightly thicker body) if a body is flat, else the field `x`.
         """
         return self.x if self.near is None else self.near
 
@@ -139,8 +145,8 @@ class Fit(eqx.Module):
     def causes(self) -> tuple[Cause, ...]:
         """Return the most likely causes of the errors that the model does not explain.
 
-        The tuple is empty if the readings show no cause. Each cause has `name`, `sensor`, `share`,
-        `words` and `remedy`.
+        The tuple is empty if the readings show no cause. Each cause has the fields `name`,
+        `sensor`, `share`, `words` and `remedy`.
         """
         if not self.left or self.linear is None:
             return ()
@@ -204,7 +210,7 @@ class Fit(eqx.Module):
     def noise(self) -> tuple[Float[Array, "*records _"], ...]:
         """Return the standard deviations (k,) of the noise of each sensor, given or estimated.
 
-        For R > 1 recordings the shape of the standard deviations is (R, k).
+        Here k is the number of components of an error. For R > 1 recordings the shape is (R, k).
         """
         return tuple(n[0] for n in self.noises) if self.model.count == 1 else self.noises
 
@@ -234,9 +240,9 @@ class Fit(eqx.Module):
         """Return the residuals (R, T, k) of each sensor, reading minus prediction, in the sensor's
         unit.
 
-        R is the number of recordings, T the number of times and k the number of components. The
-        readings that a fit adds to fill up its arrays are left out. **Raises** `ValueError` for a
-        fit that does not hold its errors (`linear` is `None`).
+        R is the number of recordings, T the number of times and k the number of components of an
+        error. The masked readings that a fit adds at the end of recordings are left out. **Raises**
+        `ValueError` for a fit that does not hold its errors (`linear` is `None`).
         """
         if self.linear is None:
             raise ValueError(
@@ -279,8 +285,8 @@ class Fit(eqx.Module):
 
         **Arguments:**
 
-        - `function`: a function that is given an `Unpacked` (the body, the states and the values at
-          a point) and returns an array.
+        - `function`: a function of an `Unpacked`, which holds the body, the initial states and the
+          values of all `Free`s. It returns an array.
         - `level`: the probability that the interval holds the true value.
 
         **Raises** as `interval`.
@@ -327,8 +333,8 @@ class Fit(eqx.Module):
     def undetermined_combinations(self) -> tuple[Combination, ...]:
         """Return the combinations of numbers that the data do not determine at all.
 
-        The tuple is empty if the data determine all numbers. Each combination has `names`,
-        `changes` and `in_words`.
+        The tuple is empty if the data determine all numbers. Each combination has the members
+        `names`, `changes` and `in_words`.
         """
         return undetermined_combinations(self)
 

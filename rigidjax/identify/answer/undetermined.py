@@ -37,13 +37,13 @@ if TYPE_CHECKING:
     from rigidjax.identify.answer.result import Fit
 
 
-# A number belongs to a combination if it changes by more than this share of the largest change.
+# A number belongs to a combination if it changes by more than this fraction of the largest change.
 PART = 1e-3
-# In the elimination the remaining rows count as zero if all of their entries are below this share
-# of the largest entry of the matrix.
+# In the elimination of a matrix the remaining rows count as zero if all of their entries are below
+# this fraction of the largest entry of the matrix.
 ROUND_OFF = 1e-5
-# Several numbers change by the same factor if their relative changes differ by less than this share
-# of the largest relative change.
+# Several numbers change by the same factor if their relative changes differ by less than this
+# fraction of the largest relative change.
 EVEN = 0.01
 # Readings change along a direction if a small step along it (of at most 0.01 in each free number)
 # moves all readings together by more than this number of standard deviations.
@@ -62,8 +62,9 @@ class Combination(eqx.Module):
     - `changes`: a small change of each number.
     - `units`: the unit of each change, "" for a relative change.
     - `relative`: for each number, whether its change is relative.
-    - `unseen_switch`: whether the readings do change along the combination although their
-      derivatives are zero, as for a time or a state at which a torque switches.
+    - `unseen_switch`: whether the readings change along the combination although the derivatives of
+      the readings are zero. This happens if the combination moves the time or the state at which a
+      torque switches.
 
     >>> Combination(("I1", "I2"), (0.01, 0.01), ("", ""), (True, True)).in_words
     'I1 and I2 rise together: only I1/I2 is determined.'
@@ -113,9 +114,10 @@ TENSOR = dict(zip(Tensor.plain_names, COMPONENTS, strict=True))
 def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
     """Return the combinations of numbers that the data of a fit do not determine at all.
 
-    Each combination is made of few numbers: by the reduced echelon form it has one number that no
-    other combination has. Changes of the initial attitude are expressed about the axes of the world
-    or of the body, whichever makes combinations of fewer numbers.
+    Each combination is made of few numbers, and it has one number that no other combination has,
+    because the combinations are the rows of a reduced row echelon form. Changes of the initial
+    attitude are expressed about the axes of the world or about the axes of the body: the axes with
+    which the combinations contain fewer numbers.
     """
     null = np.asarray(fit.null_directions)
     if not null.size:
@@ -136,7 +138,8 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
         begin = first + 6 * many + other * turns
         rows = np.delete(np.arange(len(names)), slice(begin, begin + turns))
         here, slope = [names[row] for row in rows], slopes[rows]
-        # The free numbers are of order one, so that the largest derivative of a number is its size.
+        # The free numbers are of order one, so that the largest derivative of a reported number
+        # with respect to them measures its size.
         size = np.abs(slope).max(axis=1)
         tensors = size[first : first + 6 * many].reshape(many, 6)
         tensors[:] = tensors.max(axis=1, keepdims=True)
@@ -165,11 +168,12 @@ def _readings_change_along(fit: "Fit", direction: np.ndarray) -> bool:
     are zero.
 
     The direction is a vector in the space of the n free numbers of a `fit`. Such a change comes
-    from a torque that switches at a time, or at a state, that moves along the direction; without a
-    torque the result is false. The change is half the difference of the readings after a step
-    forwards and a step backwards, and it counts if it is more than a hundredth of the noise, over
-    all readings together. A number on which the readings depend only by its square has zero
-    derivatives, too, but it does not change this difference.
+    from a torque that switches at a certain time or state, if this time or state moves along the
+    direction. Without a torque the result is false. The change is half the difference of the
+    predicted readings after a step forwards and after a step backwards. The result is true if the
+    length of the change, over all readings together, is more than a hundredth of the noise. If the
+    readings depend only on the square of a number, their derivatives with respect to it are zero,
+    too, but the difference is zero as well.
     """
     if fit.model.torque is None:
         return False
@@ -189,10 +193,11 @@ def _combination_from_echelon_row(
     values: np.ndarray,
     switch: bool,
 ) -> Combination:
-    """Return the combination of numbers, which the data leave undetermined, that one row describes.
+    """Return the undetermined combination of numbers that one row describes.
 
-    The row is one of the reduced row echelon form of a matrix, which has one row for each direction
-    of the free numbers that the data do not determine.
+    A combination is undetermined if no reading changes along it. The row is a row of the reduced
+    row echelon form of a matrix. Each row of this matrix holds the changes of the numbers along one
+    direction of the free numbers that the data do not determine.
 
     **Arguments:**
 
@@ -201,8 +206,8 @@ def _combination_from_echelon_row(
       change.
     - `size`: (M,) the size of each number.
     - `values`: (M,) the value of each number.
-    - `switch`: whether the readings change along the combination after all, although their
-      derivative is zero, because a torque switches at other times.
+    - `switch`: whether the readings change along the combination although their derivative is zero,
+      because the combination moves a time or a state at which a torque switches.
     """
     order = np.flatnonzero(row)
     # Scale the row so that its largest entry is a hundredth, and so that the first number rises.
@@ -227,11 +232,17 @@ def _names_units_and_relative_flags(model: Model) -> list[tuple[str, str, bool]]
     """Return three things for each number that a report may name: its name; its unit; and whether
     its changes are given as relative changes.
 
-    The numbers are, in this order: the reported quantities of the `model`; the components of its
-    inertia tensors; the initial attitudes, as turns about the world's axes and then about the
-    body's axes; the initial positions; and the initial velocities. Of the last four kinds only
-    those that the initial state has are listed, and none for a model of windows
-    (short stretches of a log), whose many initial states are not reported.
+    The numbers are, in this order:
+
+    - the reported quantities of the `model`;
+    - the components of its inertia tensors;
+    - the initial attitudes, as turns about the world's axes;
+    - the initial attitudes once more, as turns about the body's axes;
+    - the initial positions;
+    - the initial velocities.
+
+    Attitudes, positions and velocities are listed only if the initial state has them. They are not
+    listed for a model of windows (short parts of a record), which has too many initial states.
     """
     out = names_units_and_signs(model)
     for name, chart in name_suffixes_and_charts(model):
@@ -253,11 +264,10 @@ def _names_units_and_relative_flags(model: Model) -> list[tuple[str, str, bool]]
 def _slopes_and_values_for_report(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
     """Return the derivatives (M, n) and the values (M,) of all M numbers that a report may name.
 
-    The numbers are, in this order: the reported quantities of the `model`, a positive one by its
-    logarithm; the components of its inertia tensors; the initial attitudes, as turns about the
-    world's axes and then about the body's axes; the initial positions; and the initial velocities.
-    The initial states are left out for a model of windows (short stretches of a log). The
-    derivatives are taken with respect to the n free numbers, at `point` (n,).
+    The numbers of the `model` are in the order of `_names_units_and_relative_flags`. A positive
+    reported quantity is given by its logarithm. The derivatives are taken with respect to the n
+    free numbers, at `point` (n,). An initial attitude is a turn from the attitude at `point`; an
+    initial position or velocity is the difference from its value in the reference state.
     """
     reference = model.reference
     start = jax.vmap(ReferenceStates.initial_state_at)(reference, point[model.index.start])
@@ -284,15 +294,18 @@ def _slopes_and_values_for_report(model: Model, point: Float[Array, " n"]) -> tu
 
 
 def _mask_of_reported_numbers(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
-    """Return a mask (M,), true for each number that a report names where it says which numbers the
-    data do not determine.
+    """Return a mask (M,), true for each number that a report may name as undetermined.
 
     The moments and the tensor components of a body describe the same changes, so that only one of
-    these two kinds is reported: the moments, or the components if some change turns the principal
-    axes. All other numbers are reported.
+    these two kinds is named: the components if some undetermined change turns the principal axes,
+    else the moments. All other numbers may be named.
 
-    **Arguments:** `fit` the fit; `names` the names of the M numbers; `changes` (k, M) the changes
-    of the numbers along k directions that the data do not determine.
+    **Arguments:**
+
+    - `fit`: the fit.
+    - `names`: the names of the M numbers.
+    - `changes`: (k, M) the changes of the numbers along k directions that the data do not
+      determine.
     """
     rows = bodies_at(fit.model, fit.derivative_point)
     mask = np.ones(len(names), bool)
@@ -324,8 +337,8 @@ def _reduced_echelon_form(rows: np.ndarray) -> np.ndarray:
     """Return the reduced row echelon form of the matrix `rows` (k, M), by elimination with complete
     pivoting.
 
-    Rows that are zero up to round-off are left out, and entries that are small beside the largest
-    of their row are set to zero.
+    Rows that are zero up to round-off are left out. An entry is set to zero if it is small compared
+    with the largest entry of its row.
     """
     rows = np.array(rows)
     size, done = np.abs(rows).max(), 0
@@ -439,8 +452,8 @@ def _describe_undetermined_combinations(fit: "Fit") -> list[str]:
     """Describe, each in a sentence, the combinations of numbers that the data of a `fit` do not
     determine.
 
-    At most `SEVERAL` combinations are described; of further ones only the number is given. The list
-    is empty if the data determine all numbers.
+    At most `SEVERAL` combinations are described; one more sentence says how many further
+    combinations there are. The list is empty if the data determine all numbers.
     """
     combinations = undetermined_combinations(fit)
     if not combinations:
@@ -459,8 +472,8 @@ def _describe_undetermined_combinations(fit: "Fit") -> list[str]:
 def inertia_scale_is_undetermined(fit: "Fit") -> bool:
     """Return whether the data leave the scale of the inertia tensor undetermined.
 
-    This is the case if some undetermined direction multiplies all components of the tensor by one
-    factor. For a model of several bodies the result is false.
+    This is the case if a change of the free numbers along undetermined directions multiplies all
+    components of the tensor by one factor. For a model of several bodies the result is false.
     """
     null = np.asarray(fit.null_directions)
     if not len(null) or isinstance(fit.model.chart, Bodies):
@@ -478,7 +491,7 @@ def inertia_scale_is_undetermined(fit: "Fit") -> bool:
 
 
 def describe_strong_correlations(fit: "Fit") -> list[str]:
-    """Describe the pairs of reported quantities whose errors are strongly correlated.
+    """Describe the pairs of reported quantities of a `fit` whose errors are strongly correlated.
 
     There is one sentence for each of at most five pairs with |ρ| > 0.95, where ρ is the correlation
     coefficient. Components of the inertia tensor are left out, because they follow from the moments

@@ -11,18 +11,20 @@ from rigidjax.identify.data.recording import Reading, Recording
 
 # Readings are cut off only if at least this number of readings in a row have the largest value.
 RUN = 3
-# A channel with a larger share of its readings at the largest value is taken as constant, not as
-# cut off.
+# If more than this fraction of the readings of a channel have the largest value, the channel is
+# taken as constant, not as cut off.
 MOST = 0.7
 
 
 def full_scale_of(values: np.ndarray) -> float | None:
-    """Return the full scale of one channel of a sensor, the largest value that it can read, if its
-    readings `values` (T,) are cut off there; else `None`.
+    """Return the full scale of one channel of a sensor if its readings `values` (T,) are cut off,
+    else `None`.
 
-    Readings are cut off if more readings in a row have the largest value than at the top of a
-    smooth wave: there about 2 √(2d/a) readings in a row are equal, where d is the last digit of the
-    readings and a the typical second difference of successive readings.
+    The full scale is the largest value that the channel can read. Readings count as cut off if many
+    readings in a row have the largest value: at least twice as many as at the top of a smooth wave.
+    At the top of a wave about 1 + 2 √(2d/a) readings in a row are equal, where d is the smallest
+    change between successive readings (the last digit), and a is the typical second difference of
+    successive readings.
     """
     size = np.abs(values)
     top = float(size.max(initial=0.0))
@@ -44,8 +46,8 @@ def with_full_scale_limits(recordings: Sequence[Recording]) -> list[Recording]:
     """Return the recordings with the full scale as the `limit` of each sensor whose readings are
     cut off.
 
-    The full scale is the largest value that a sensor can read; the readings show it. A sensor that
-    has a `limit` already keeps this limit.
+    The full scale is the largest value that a sensor can read. It is found from the readings. A
+    sensor that has a `limit` already keeps this limit.
     """
     out = list(recordings)
     for index in range(max(len(r.readings) for r in recordings)):

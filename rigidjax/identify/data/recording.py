@@ -23,8 +23,9 @@ class Reading(eqx.Module):
     - `sensor`: the sensor.
     - `values`: (T, …) the readings.
     - `mask`: (T,) true where there is a reading.
-    - `jitter_error`: (T, k) for a sensor with jitter, the error that a time stamp makes if it is
-      one standard deviation late, along the motion of the last fit; else `None`.
+    - `jitter_error`: (T, k) for a sensor with jitter (random errors of its time stamps) the error
+      of a reading whose time stamp is one standard deviation late; `None` for any other sensor. It
+      is computed along the motion of the last fit.
 
     Here T is the number of times and k the number of components of an error. Inside a `Model` all
     arrays have a leading axis over recordings.
@@ -51,10 +52,11 @@ class Reading(eqx.Module):
 
     @property
     def usable_channel_mask(self) -> np.ndarray:
-        """Return a mask (…, T, k), true for each component of a reading that was read and is not at
-        full scale (the largest value that the sensor can read).
+        """Return a mask (…, T, k), true for each component of a reading that is neither masked nor
+        at full scale.
 
-        T is the number of times and k the number of components of an error.
+        The full scale is the largest value that the sensor can read. T is the number of times and k
+        the number of components of an error.
         """
         mask = np.broadcast_to(
             self.host_mask[..., None], (*self.mask.shape, self.sensor.components)
@@ -67,12 +69,12 @@ class Reading(eqx.Module):
     def with_jitter(self, jitter_error: Array, deviation: Array) -> "Reading":
         """Return these readings with another jitter (random error of the time stamps).
 
-        A search holds `jitter_error` constant: if the search changed `jitter_error`, errors would
-        count less wherever a motion changes quickly, and the search would prefer such motions.
+        A search holds `jitter_error` constant. If the search changed `jitter_error`, errors would
+        count less wherever a motion changes quickly, and the search would prefer quick motions.
 
-        - `jitter_error`: (…, T, k) the error that a time stamp makes if it is one standard
+        - `jitter_error`: (…, T, k) the error of each reading if its time stamp is one standard
           deviation late.
-        - `deviation`: s, the standard deviation of the time stamps of the sensor.
+        - `deviation`: the standard deviation of the time stamps of the sensor, s.
         """
 
         def parts(reading: PyTree) -> Any:
@@ -104,14 +106,15 @@ class Recording(eqx.Module):
       sample is held until the next one. The torque of a `Model` reads an input by its name,
       `rigidjax.torques.Input("speed")`.
 
-    A time at which no sensor was read is dropped, unless an input is sampled. A row of a NumPy
-    masked array (`values` or `mask`) with a masked entry counts as not read, but its time is kept
-    between the first and the last reading. `t` may not be masked.
+    A time at which no sensor was read is dropped, unless an input is an array of samples. If
+    `values` or `mask` is a NumPy masked array, a row with a masked entry counts as not read. Its
+    time is kept if it lies between the first and the last reading. `t` may not be masked.
 
-    **Raises:** `TypeError` for traced numbers (known numbers decide which times are kept) and for
-    anything but a sensor; `ValueError` for times that do not increase, also after rounding to
-    float32, a wrong shape, an unmasked NaN (with its index), or a quaternion that is not of unit
-    length. It warns if rounding the times to float32 changes a step by more than a tenth.
+    **Raises:** `TypeError` for traced numbers, because the readings decide which times are kept,
+    and for anything but a sensor in place of a sensor. `ValueError` for times that do not increase,
+    also after rounding to float32; for a wrong shape; for an unmasked NaN, whose index the error
+    gives; and for a quaternion that is not of unit length. It warns if rounding the times to
+    float32 changes a step by more than a tenth.
 
     >>> Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]])).t.shape
     (2,)
@@ -234,8 +237,8 @@ def inputs_as_functions(recording: Recording) -> dict[str, Callable[[Any], Any]]
     t, out = recording.t, {}
     for name, source in recording.inputs.items():
         if not callable(source):
-            # The last sample belongs to the last time. The samples of a window may begin before its
-            # start: then there are more samples than times.
+            # The last sample belongs to the last time. If the samples of a window begin before the
+            # start of the window, there are more samples than times.
             steps = jnp.arange(t.size - len(source), t.size, dtype=t.dtype)
             source = Held(t[0] + (t[1] - t[0]) * steps, source)
         out[name] = source
@@ -278,10 +281,11 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
 
 
 def _require_distinct_times(t: np.ndarray, dtype: np.dtype) -> None:
-    """Raise `ValueError` if increasing times `t` (T,), s, become equal when they are rounded to the
-    `dtype` in which a recording stores them, such as float32.
+    """Raise `ValueError` if two of the increasing times `t` (T,), s, become equal when they are
+    rounded to `dtype`.
 
-    A warning is given if rounding changes a step between two successive times by more than a tenth.
+    The `dtype` is the one in which a recording stores its times, such as float32. A warning is
+    given if rounding changes a step between two successive times by more than a tenth.
     """
     # Use NumPy: within a trace the numbers of a new JAX array are not known.
     steps, held = np.diff(t), np.diff(t.astype(dtype).astype(float))
@@ -300,17 +304,23 @@ def _require_distinct_times(t: np.ndarray, dtype: np.dtype) -> None:
 def _checked_reading(
     t: np.ndarray, sensor: AbstractSensor, values: Any, mask: NumbersLike | None = None
 ) -> tuple[AbstractSensor, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the readings of a sensor after checks, as four things: the sensor; its readings (T,
-    *reading_shape); a mask (T,), true where there is a reading; and a mask (T,), true for each time
-    whose reading a NumPy masked array hides.
+    """Return the readings of a sensor after checks.
 
-    `reading_shape` is the shape of one reading of the sensor. Where there is no reading, the first
-    valid reading is filled in, so that no NaN is left.
+    Four things are returned:
+
+    - the sensor;
+    - its readings (T, *reading_shape), where `reading_shape` is the shape of one reading of the
+      sensor; the first valid reading is filled in where there is no reading, so that no NaN is
+      left;
+    - a mask (T,), true where there is a reading;
+    - a mask (T,), true for each time whose reading a NumPy masked array hides.
+
+    **Arguments:**
 
     - `t`: (T,) the times of the recording, s.
     - `sensor`: the sensor.
-    - `values`: (T, …) the readings of the user, which may be a NumPy masked array.
-    - `mask`: (T,) true where there is a reading, which may be a NumPy masked array; `None` if there
+    - `values`: (T, …) the readings of the user. They may be a NumPy masked array.
+    - `mask`: (T,) true where there is a reading. It may be a NumPy masked array, or `None` if there
       is a reading at each time.
     """
     name = type(sensor).__name__

@@ -29,11 +29,13 @@ from rigidjax.motion.manifold import leaf_names, plus
 from rigidjax.rotation import quaternion, so3
 from rigidjax.rotation.fitting import nearest_rotation
 
-# A mean rate is computed between two attitudes that differ by a turn of about this angle, rad. The
-# angle is large against noise, but so small that the axis of rotation hardly moves.
+# A mean body rate is computed between two attitudes that differ by a turn of about this angle, rad.
+# The angle is large compared with the noise of attitudes, but so small that the axis of rotation
+# hardly moves during the turn.
 _TURN = 0.3
-# Directions determine an attitude if the sum of the two smaller singular values of Σ world bodyᵀ
-# (the smallest with the sign of the determinant) is above this share of the largest one.
+# Directions w in the world and the same directions b in the body determine an attitude if s₂ + s₃
+# is above this fraction of s₁. Here s₁ ≥ s₂ ≥ |s₃| are the singular values of the sum Σ w bᵀ, and
+# s₃ has the sign of the determinant of this sum.
 _DETERMINED = 1e-3
 
 
@@ -107,11 +109,12 @@ def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rates_between_attitudes(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return two things: times (m,), s; and the mean body rate (m, 3), rad/s, between two attitudes
-    for each of these times.
+    """Return two things: times (m,), s; and for each of these times the mean body rate (m, 3),
+    rad/s, between two attitudes.
 
-    The quaternions q (n, 4) are the attitudes at the times t (n,), s. Each mean rate belongs to a
-    turn of about `_TURN`, and its time is the middle of the interval of the turn.
+    The quaternions q (n, 4), body → world, are the attitudes at the times t (n,), s. The two
+    attitudes differ by a turn of about 0.3 rad. The time of a mean rate is the middle between the
+    times of the two attitudes.
     """
     if t.size < 2:
         return np.zeros(0), np.zeros((0, 3))
@@ -127,11 +130,12 @@ def rates_between_attitudes(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.nd
 
 @jax.jit
 def _rotation_vectors_between(first: ArrayLike, last: ArrayLike) -> Array:
-    """Return the shortest rotation vectors (n, 3), rad, in body axes, each of which turns one
-    attitude into another.
+    """Return the rotation vectors (n, 3), rad, in body axes, of the turns from n attitudes to n
+    other attitudes.
 
-    `first` and `last` (n, 4) are the attitudes before and after each of the n turns, as quaternions
-    body → world. The sign of a quaternion does not matter.
+    The arguments `first` and `last` (n, 4) are the attitudes before and after each turn, as
+    quaternions body → world. Each turn is the shortest one, so that the sign of a quaternion does
+    not matter.
     """
 
     def turn(a: Array, b: Array) -> Array:
@@ -149,8 +153,8 @@ class ReferenceStates(eqx.Module):
 
     - `state`: the reference state, a `Spin`, `Attitude` or `Rigid`.
     - `rate`: the typical body rate, rad/s.
-    - `units`: (n,) the unit of each free number of the initial state: the change of the state is
-      `units` times the free numbers.
+    - `units`: (n,) for each free number of the initial state the change of the state if the number
+      is one. The whole change of the state is `units` times the free numbers.
 
     For several recordings all arrays have a leading axis.
     """
@@ -169,10 +173,10 @@ class ReferenceStates(eqx.Module):
 
 
 def reference_states_of(recordings: Sequence[Recording], state_type: type) -> ReferenceStates:
-    """Return the reference state of each recording, found from its first readings; the free numbers
-    of an initial state are changes of it.
+    """Return the reference state of each recording, found from its first readings.
 
-    The body rate of each reference state is zero.
+    The free numbers of an initial state are changes of the reference state. The body rate of each
+    reference state is zero.
 
     - `recordings`: R recordings; the result has a leading axis (R,).
     - `state_type`: the type of the states: `Spin`, `Attitude` or `Rigid`.
@@ -195,9 +199,9 @@ def _typical_rate(recording: Recording) -> float:
     """Return the typical size of the body rate in a `recording`, rad/s, or 1 if its readings show
     no rate.
 
-    With a gyro it is the root mean square of the length of its readings. Without a gyro it is the
-    size of the first rate that is computed from two attitudes. If there is no such rate, or it is
-    zero, it is the estimate of the first sensor that has a method `typical_rate`.
+    With a gyro the typical size is the root mean square of the length of its readings. Without a
+    gyro it is the size of the first mean rate between two attitudes. If attitudes show no rate, or
+    this rate is zero, it is the estimate of the first sensor that has a method `typical_rate`.
     """
     _, w = rates(recording)
     if readings_of(recording, Gyro):
@@ -219,8 +223,8 @@ def _first_motion_and_typical_length(recording: Recording) -> tuple[np.ndarray, 
 
     Position and velocity belong to the centre of mass or, if markers take the place of a position
     sensor, to the origin of the body frame. The typical length is the largest distance of a
-    position from the mean position. What no sensor shows is zero for position and velocity, and 1
-    for the length.
+    position from the mean position. A position or velocity that no sensor shows is zero; a length
+    that no sensor shows is 1.
     """
     t, when, x = np.asarray(recording.t), np.zeros(0), np.zeros((0, 3))
     positions, markers = readings_of(recording, Position), readings_of(recording, Marker)
@@ -251,11 +255,11 @@ def _origins_by_markers(
     """Return the times (n,), s, and the positions (n, 3), m, of the origin of the body frame,
     computed from the positions of markers on the body.
 
-    If no time has readings of all markers, only the first marker is used. If the attitude is not
-    known at each of the n times, the mean position of the markers is returned in place of the
+    If no time has readings of all markers, only the first marker is used. If the attitude is
+    unknown at any of the n times, the mean position of the markers is returned in place of the
     origin.
 
-    - `recording`: the recording, which shows the times and the attitudes.
+    - `recording`: the recording, which holds the times and the readings that show the attitudes.
     - `markers`: a sequence with the `Reading` of each marker.
     """
     mask = np.all([r.host_mask for r in markers], axis=0)
@@ -272,11 +276,11 @@ def _origins_by_markers(
 
 
 def _first_velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the velocity (3,), m/s, of a body at the first of its positions x (n, 3), m, which
-    belong to the times t (n,), s.
+    """Return the first velocity (3,), m/s, of a body from its positions x (n, 3), m, at the times t
+    (n,), s.
 
-    It is the slope of the straight line that fits the first five positions (or all, if there are
-    fewer) best, or zero for fewer than two positions.
+    The velocity is the slope of the straight line that fits the first five positions (or all, if
+    there are fewer) best. It is zero for fewer than two positions.
     """
     few = slice(0, max(2, min(5, t.size)))
     return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
@@ -286,9 +290,10 @@ def _positions_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarra
     """Return the positions x (n, 3), m, of a body from its distances to k stations.
 
     For each station the equation `|x|² − 2 s·x + |s|² = d²` holds, where s is the position of the
-    station and d its distance. It becomes linear in x if the mean of the equations of all stations
-    is subtracted. If the stations do not determine a component of x, as with stations in one plane,
-    this component is that of the mean position of the stations.
+    station and d is the distance of the body from it. The mean of the equations of all stations is
+    subtracted from each equation, which removes |x|² and makes the equation linear in x. If the
+    stations do not determine a component of x, as with stations in one plane, the component is
+    taken from the mean position of the stations.
 
     - `stations`: (k, 3) the positions of the stations, m.
     - `lengths`: (n, k) the distance to each station, m, at each of n times.
@@ -303,10 +308,11 @@ def _positions_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarra
 def first_rates(
     records: Recording, counts: Int[Array | np.ndarray, " records"]
 ) -> Float[Array, "records 3"]:
-    """Return the first body rate (R, 3), rad/s, of each of R recordings, as `first_rate` finds it.
+    """Return the first body rate (R, 3), rad/s, that the readings of each of R recordings show.
 
-    `records` holds the recordings with a leading axis, and `counts` (R,) the number of times of
-    each recording without padding. The rates are zero for traced recordings without a gyro.
+    A rate is zero if the readings show no rate. The argument `records` holds the recordings with a
+    leading axis, and `counts` (R,) the number of times of each recording without padding. The rates
+    are zero for traced recordings without a gyro.
     """
     for reading in readings_of(records, Gyro):
         xp: Any = np if _checks.is_known(reading) else jnp

@@ -18,8 +18,9 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
     """Return the recordings as one `Recording` with a leading axis, and the number of times of each
     recording.
 
-    Shorter recordings are padded with masked readings at their last time. Shorter tables of time
-    (the `Linear` and `Series` in inputs and sensors) are padded with their last value.
+    Shorter recordings are padded with masked readings at their last time. Inputs and sensors may
+    hold tables of time (a `Linear` or `Series`, which interpolates values between times). Shorter
+    tables are padded with their last value.
     """
     counts = np.array([r.t.shape[0] for r in recordings], np.int32)
     rows = max(_count_table_rows(recording, 0) for recording in recordings)
@@ -48,11 +49,12 @@ def _is_stackable(leaf: PyTree) -> bool:
 
 
 def pad_to_few_lengths(model: PyTree) -> PyTree:
-    """Return a `model` with its recordings padded by masked readings to one of few lengths.
+    """Return a `model` with its recordings padded by masked readings to one of a few allowed
+    lengths.
 
-    Between a length and its double there are about four such lengths, so that few programs are
-    compiled. A model of windows (short parts of a record of measured states) stays unchanged: all
-    windows have one length already.
+    Recordings of similar length then share one compiled program. There are about four allowed
+    lengths between any length and its double. A model of windows (short parts of a record of
+    measured states) stays unchanged: all windows have one length already.
     """
     records = model.records
     if model.clusters is not None:
@@ -80,11 +82,12 @@ def _count_table_rows(recording: Recording, axis: int) -> int:
 
 
 def _padded_length(count: int) -> int:
-    """Return the number of times to which a recording (or a table of values) with `count` times is
-    padded: the least allowed number that is not below `count`.
+    """Return the number of times to which a recording or a table of time with `count` times is
+    padded.
 
-    Only few numbers are allowed, so that few programs are compiled: the powers of 2^(1/4), rounded
-    up to multiples of 16, and 0 for a `count` of 0.
+    It is the least allowed number that is not below `count`. Only few numbers are allowed, so that
+    few programs are compiled: the powers of 2^(1/4), rounded up to multiples of 16. For a `count`
+    of 0 the result is 0.
     """
     if not count:
         return 0
@@ -94,9 +97,9 @@ def _padded_length(count: int) -> int:
 
 
 def _stack_leaves(*leaves: PyTree) -> Array:
-    """Return arrays of one shape, stacked along a new first axis.
+    """Return the `leaves`, arrays of one shape, stacked along a new first axis.
 
-    `leaves` are the arrays or numbers with the same place in several trees.
+    The leaves are the arrays or numbers that have the same place in several trees of JAX.
     """
     # Use NumPy if the numbers are not traced: JAX would compile a program for each shape.
     if _checks.is_known(leaves):
@@ -105,12 +108,12 @@ def _stack_leaves(*leaves: PyTree) -> Array:
 
 
 def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "*rows"]) -> PyTree:
-    """Return the recordings with the given `index` on the leading axis of all arrays of a tree.
+    """Return the recordings at `index` from a tree whose arrays have a leading axis over
+    recordings.
 
     **Arguments:**
 
-    - `records`: the tree, whose arrays have a leading axis over recordings. Leaves that are not
-      arrays are unchanged.
+    - `records`: the tree. Leaves that are not arrays are returned unchanged.
     - `index`: one index, a slice, or an array of indices.
     """
 
@@ -181,9 +184,9 @@ def _is_table(node: PyTree) -> bool:
 def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0) -> Recording:
     """Return the recording padded to `count` times, with its tables of time padded to `rows` rows.
 
-    Masked readings are added at the last time, and the last value of a table of time is repeated.
-    Times are along `axis`, which is 0 for one recording, and 1 for several recordings with a
-    leading axis.
+    Masked readings are added at the last time. A table of time (a `Linear` or `Series`, which
+    interpolates values between times) is padded with its last value. Times are along `axis`, which
+    is 0 for one recording, and 1 for several recordings with a leading axis.
     """
     missing = count - recording.t.shape[axis]
     # Pad the tables in sensors as well as in inputs: a sensor that observes a moving object holds a

@@ -1,8 +1,9 @@
 """Make windows of measured states, to identify driven machines by many short predictions.
 
-A record of measured states is cut into windows. From the measured state at the start of each window
-the model predicts the states that follow, driven by the recorded inputs but without further
-measurements (open-loop). The predictions are compared with the measured states at every step.
+A record of measured states is cut into windows, which are short parts of the record. From the
+measured state at the start of each window the model predicts the states that follow. It uses the
+recorded inputs but no further measurements (open-loop). The predictions are compared with the
+measured states at every step.
 """
 
 from collections.abc import Callable, Mapping
@@ -69,8 +70,10 @@ def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"])
 
 @jax.jit
 def constant_state_errors(starts: HasSpin, measured: HasSpin) -> Float[Array, "windows steps n"]:
-    """Return the errors (N, L, n) that a prediction has if it keeps the state constant, in each of
-    N windows of L steps: the state at the start minus each measured state.
+    """Return the errors (N, L, n) of a prediction that the state stays constant in each window.
+
+    For each of N windows and L steps the error is the state at the start of the window minus the
+    measured state, as a vector of n components.
 
     - `starts`: the state at the start of each window, with a leading axis (N,).
     - `measured`: the states that follow, with leading axes (N, L).
@@ -89,10 +92,14 @@ class Windows(eqx.Module):
     - `step`: s, the time between two samples.
     - `starts`: the states at the starts of the windows, with a leading axis (N,).
     - `wanted`: the L measured states that follow each start, with leading axes (N, L).
-    - `inputs`: a dict of name → samples (N, before + L, *k). In step i after the start (i = 0, 1,
-      …) an input without a delay has the value in row before + i.
+    - `inputs`: a dict of name → samples (N, before + L, *k), where each sample has the shape k. In
+      step i after the start (i = 0, 1, …) an input without a delay has the sample of row
+      `before + i`.
     - `before`: the number of samples of each input before the start of a window.
-    - `noise`, `start_deviation`: the arguments `noise` and `starts` of `windows`.
+    - `noise`: a dict of kind → standard deviation of a component of the measured states, where the
+      kinds are the fields of the state, such as `omega`; `None` if the noise is unknown.
+    - `start_deviation`: a dict of kind → standard deviation of a component of the measured start;
+      `None` if the measured starts are taken as exact.
 
     >>> cut = windows(np.arange(6.0), Spin(np.ones((6, 3))), length=2, stride=2)
     >>> cut.count, cut.length, cut.wanted.omega.shape
@@ -121,8 +128,9 @@ class Windows(eqx.Module):
     def scales(self) -> Float[Array, " m"]:
         """Return the scale (m,) of each of the m components of an error of the state.
 
-        The scale is the `noise` if this is given. Otherwise it is the root mean square error, for
-        each part of the state, of a prediction that the state stays constant in each window.
+        The scale is the field `noise` if this is given. Otherwise each part of the state, such as
+        the body rate, has its own scale: the root mean square error of a prediction that the state
+        stays constant in each window.
         """
         if self.noise is not None:
             return jnp.asarray(np.repeat([self.noise[kind] for kind in leaf_names(self.starts)], 3))
@@ -159,7 +167,7 @@ class Windows(eqx.Module):
     def held_horizons(self) -> Horizons:
         """Return the errors of a prediction that the state stays constant in each window.
 
-        A model must have smaller errors to be of use.
+        A model is of use only if its errors are smaller than these.
         """
         return average_by_horizon(self.starts, constant_state_errors(self.starts, self.wanted))
 
@@ -216,8 +224,8 @@ def windows(
 
     **Arguments:**
 
-    - `t`: (T,) s, evenly spaced times. Some samples may be missing; no window, and none of the
-      `before` samples of a window, reaches across a missing sample.
+    - `t`: (T,) evenly spaced times, s. Some samples may be missing. A window with its `before`
+      input samples never reaches across a missing sample.
     - `states`: a `Spin`, `Attitude` or `Rigid` with a leading axis (T,).
     - `inputs`: a dict of name → samples (T, *k), for each `rigidjax.torques.Input` of a torque.
       Each sample is held until the next one.
@@ -228,8 +236,9 @@ def windows(
       torque follow the inputs up to the start, while the body is held at the start.
     - `noise`: a dict of kind → standard deviation of a component of the measured states, where the
       kinds are the fields of the state, such as `q` and `omega`; `None` if the noise is unknown.
-    - `starts`: a dict of kind → standard deviation of a component of the measured start, infinite
-      for a start that is free; `None` takes the measured starts as exact. It needs `noise`.
+    - `starts`: a dict of kind → standard deviation of a component of the measured start of a
+      window, infinite for a start that is free. `None` takes the measured starts as exact. If
+      `starts` is given, `noise` must be given, too.
 
     **Raises:** `ValueError` for shapes that do not agree, NaN, uneven times, or a record without a
     window of this length; `TypeError` for other states.
@@ -295,11 +304,11 @@ def _checked_numbers_by_state_part(
     A kind is the name of a part of a state, such as `q` (attitude) or `omega` (body rate).
 
     - `numbers`: the user's mapping of kind → number.
-    - `kinds`: the kinds that must be in the mapping; an error is raised unless these and no others
-      are there.
+    - `kinds`: the kinds that must be in the mapping. An error is raised if a kind is missing, or if
+      the mapping has another kind.
     - `name`: the name of the argument `numbers` in an error.
-    - `check`: a function of a number and its name in an error, which returns the number or raises
-      an error.
+    - `check`: a function of two arguments: a number, and the name of the number in an error. It
+      returns the number or raises an error.
     """
     by_kind = _checks.require_instance(numbers, Mapping, name, requirement="numbers by kind")
     if set(by_kind) != set(kinds):
@@ -308,12 +317,12 @@ def _checked_numbers_by_state_part(
 
 
 def _checked_start_deviation(value: object, name: str) -> float:
-    """Return the standard deviation of the measured start of a window as a float, and raise
-    `ValueError` unless it is positive or infinite.
+    """Return the standard deviation of the measured start of a window as a float.
 
-    A window is a short part of a record of measured states. Infinity means that the start is free,
-    without a prior about the measured state. `value` is the number of the user, and `name` what it
-    is called in the error.
+    A `ValueError` is raised unless it is positive or infinite. A window is a short part of a record
+    of measured states. Infinity means that the start is free, without a prior about the measured
+    state. The argument `value` is the number of the user, and `name` is the name of the number in
+    the error.
     """
     number = _checks.python_float(value, name)
     if not number > 0:
@@ -325,8 +334,10 @@ def _checked_start_deviation(value: object, name: str) -> float:
 
 
 def _require_finite_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) -> None:
-    """Raise `ValueError` unless states and inputs (logged quantities such as a motor command) have
-    finite numbers for each time, and the quaternions of the states have length 1 to within 0.01.
+    """Raise `ValueError` unless states and inputs have finite numbers for each time, and the
+    quaternions of the states have length 1 to within 0.01.
+
+    An input is a logged quantity such as a motor command.
 
     - `times`: (T,) the times, s.
     - `states`: a `Spin`, `Attitude` or `Rigid` with a leading axis (T,).
@@ -356,12 +367,12 @@ def _require_finite_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str,
 
 
 def _sampling_step(times: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return two things: the time between two successive samples, s; and a mask (T − 1,) of the
-    intervals between successive `times` (T,), s, which is false where samples are missing.
+    """Return two things for successive `times` (T,), s: the time between two samples, s; and a mask
+    (T − 1,), false for each interval in which samples are missing.
 
-    The time between two samples is the median of the intervals. Samples are missing in an interval
-    of more than 1.5 times the median; `ValueError` is raised if any other interval differs from the
-    median by more than a thousandth of it.
+    The time between two samples is the median of the intervals between successive times. Samples
+    are missing in an interval of more than 1.5 times the median. `ValueError` is raised if any
+    other interval differs from the median by more than a thousandth of the median.
     """
     gaps = np.diff(times)
     h = float(np.median(gaps))
@@ -398,14 +409,14 @@ def require_windows(windows: PyTree) -> None:
 def describe_delays_outside_window_samples(
     torque: PyTree, history: float, length: float
 ) -> list[str]:
-    """Describe each delay with which a torque reads an input outside of the samples that a window
-    has; return one text for each such delay.
+    """Describe each delay that makes a torque read an input at times for which a window has no
+    samples.
 
-    An input is a logged quantity such as a motor command.
+    There is one text for each such delay. An input is a logged quantity such as a motor command.
 
     - `torque`: the torque, a function of time, state and body, or `None`.
-    - `history`: s, the time before the start of a window for which inputs are known.
-    - `length`: s, the duration of a window.
+    - `history`: the time before the start of a window for which inputs are known, s.
+    - `length`: the duration of a window, s.
     """
     out = []
     for name, delay in delays_of(torque):
@@ -432,8 +443,9 @@ def window_starts_weights_and_stretches(
     Three things are returned:
 
     - The starts of the N `windows` as `ReferenceStates`.
-    - The weights (N, m) of the m free numbers of each start, or `None` if the starts are known. A
-      weight is the unit of a free number over the standard deviation of the start.
+    - The weights (N, m) of the m free numbers of each start, or `None` if the starts are known. The
+      weight of a free number is the change of the start if this number is one, divided by the
+      standard deviation of the start.
     - The index (N,) of the stretch of each window. The windows, in their order, are divided into at
       most `stretches` stretches.
     """

@@ -1,6 +1,8 @@
 """Compute the effect of considered errors on a fit.
 
-A considered error of a sensor is one that the covariance allows for, and that no fit estimates.
+A considered error is a constant error of a sensor, such as an error of scale, that a fit does not
+estimate, but that its covariance allows for.
+
 Sources: Schmidt 1966, Application of state-space methods to navigation problems; Bierman 1977,
 Factorization Methods for Discrete Sequential Estimation, ch. VIII; Tapley, Schutz and Born 2004,
 Statistical Orbit Determination, ch. 6.
@@ -22,7 +24,8 @@ from rigidjax.identify.uncertainty.covariance import Linearisation
 # A report states the effect of errors of this size for a sensor of unknown tolerance: an error of
 # the scale of 1 %, and of the angle between two axes of 1°.
 USUAL = {"scale": 0.01, "cross_axis": float(np.radians(1.0))}
-# This maps the name of a tolerance to the name of the sensor's member that it limits.
+# This maps the name of each field of `Tolerance` to the name of the sensor's attribute whose error
+# the field limits.
 MEMBERS = {tolerance: member for member, tolerance in TOLERANCES.items()}
 _OFF_DIAGONAL = [(i, j) for i in range(3) for j in range(3) if i != j]
 
@@ -35,9 +38,9 @@ class Consideration(eqx.Module):
     - `sensor`: the index of the sensor.
     - `kind`: the name of the error, a field of `Tolerance`.
     - `deviation`: the standard deviation of the error.
-    - `shifts`: (n, c) the changes of the n free numbers if one of the c independent components of
-      the error is one standard deviation. The components are three scales, six pairs of axes, three
-      biases, or one clock offset.
+    - `shifts`: (n, c) for each of c independent components of the error the changes of the n free
+      numbers if this component is one standard deviation. The components are three scales, six
+      pairs of axes, three biases, or one clock offset.
 
     >>> t = jnp.linspace(0.0, 2.0, 41)
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
@@ -58,11 +61,11 @@ class Consideration(eqx.Module):
 def compute_considered_errors(
     model: Model, linear: Linearisation, noise: Noise, covariance: np.ndarray
 ) -> tuple[Consideration, ...]:
-    """Return the considered errors of all sensors, with the change of the free numbers
-    that each of them makes.
+    """Return the considered errors of all sensors. Each one holds the changes of the free numbers
+    that it causes.
 
-    A considered error is one that a sensor may have within its `Tolerance`, and that no `Free` of
-    the model estimates.
+    A considered error is a constant error that a sensor may have within its `Tolerance`, and that
+    no `Free` of the model estimates.
 
     **Arguments:**
 
@@ -90,10 +93,10 @@ def compute_considered_errors(
 
 
 def slot_of_sensor_member(model: Model, sensor_index: int, member: str) -> Slot | None:
-    """Return the slot for one attribute (`member`) of a sensor, such as "bias"; `None` if a fit
-    does not estimate this attribute.
+    """Return the slot of one attribute of a sensor, such as "bias", or `None` if a fit does not
+    estimate this attribute.
 
-    A slot describes a `Free`, a number that the fit estimates.
+    A slot describes a `Free`, a number that a fit estimates.
 
     **Arguments:**
 
@@ -119,10 +122,10 @@ def shifts_by_unit_errors(
     """Return the changes (n, c) of the n free numbers of a fit if a sensor has a unit error of the
     kind `error_kind`.
 
-    An error with c components changes the readings of the sensor by D, (R, T, k, c), for R
-    recordings, T times and k components of a reading. It changes the least-squares solution by
-    `−H⁻¹ Jᵀ W D`, where J holds the derivatives of the errors of the readings with respect to the
-    free numbers, and W the weights of the readings.
+    A unit error with c components changes the readings of the sensor by D, an array (R, T, k, c)
+    for R recordings, T times and k components of a reading. The change D of the readings changes
+    the least-squares solution by `−H⁻¹ Jᵀ W D`. Here J holds the derivatives of the errors of the
+    readings with respect to the free numbers, and W holds the weights of the readings.
 
     **Arguments:**
 
@@ -166,9 +169,12 @@ def _reading_changes_by_unit_errors(
     - `model`: the fitted model with its readings.
     - `linear`: the errors of the readings at the best point; reading minus error is the prediction.
     - `sensor_index`: the index of the sensor.
-    - `error_kind`: the name of the error: "scale" has three components, relative errors of scale;
-      "bias" three, in the unit of the sensor; "clock" one, a delay of 1 s; "cross_axis" six, one
-      for each pair of axes (i, j) with i ≠ j, where axis i also reads all that axis j reads.
+    - `error_kind`: the name of the error:
+        - "scale" has three components: the reading of an axis is larger by a factor of two.
+        - "bias" has three components: the reading of an axis is larger by one unit of the sensor.
+        - "clock" has one component: a delay of 1 s.
+        - "cross_axis" has six components, one for each pair (i, j) of different axes: the reading
+          of axis j is added to the reading of axis i.
     """
     reading = model.records.readings[sensor_index]
     shown = np.asarray(reading.values) - linear.raw[sensor_index]
@@ -189,8 +195,10 @@ def slope_in_time(
     """Return the time derivative (R, T, k) of the `prediction` (R, T, k) of the readings of a
     sensor.
 
-    It is computed by differences for R recordings, T times and k components, and is zero after the
-    last time of a recording. The `model` holds the times and the number of times of each recording.
+    Here R is the number of recordings, T the number of times and k the number of components. The
+    derivative is computed from differences of successive predictions. It is zero at the times that
+    pad a short recording, and in a recording of fewer than three times. The `model` holds the times
+    and the number of times of each recording.
     """
     t, counts = np.asarray(model.records.t)[..., None], np.asarray(model.counts)
     gap = np.diff(t, axis=1)
@@ -212,12 +220,13 @@ def shift_matrix(
 ) -> Float[np.ndarray, "n ways"]:
     """Return the matrix S (n, c) of the shifts of the free numbers by all considered errors.
 
-    S Sᵀ is the covariance that these errors add to a fit.
+    The product S Sᵀ is the covariance that the considered errors add to a fit. The matrix has a
+    column for each of the c independent components of all errors.
 
     **Arguments:**
 
-    - `considered_errors`: the considered errors. Each one holds the shifts by an error of one
-      standard deviation.
+    - `considered_errors`: the considered errors. Each one holds its shifts: the changes of the free
+      numbers if a component of the error is one standard deviation.
     - `number_count`: the number n of free numbers.
     """
     return np.concatenate(
@@ -256,21 +265,22 @@ def quantity_shifts_by_usual_errors(
     covariance: np.ndarray,
     slopes: Float[np.ndarray, "quantities n"],
 ) -> list[tuple[int, dict[str, Float[np.ndarray, " quantities"]]]]:
-    """Return by how much each of q quantities of a fit would change if a sensor had a usual error,
-    for each sensor without a `Tolerance`.
+    """Return how much a usual error of a sensor would change each of q quantities of a fit.
 
-    The usual errors (`USUAL`) are 1 % of scale and 1° between two axes.
+    The usual errors (`USUAL`) are an error of scale of 1 % and an error of 1° between two axes.
+    Only sensors without a `Tolerance` are considered.
 
     **Arguments:**
 
-    - `model`, `linear`: the fitted model; and its errors with their derivatives at the best point.
+    - `model`: the fitted model.
+    - `linear`: the errors of its readings at the best point, with their derivatives.
     - `noise`: the standard deviations of the noise of the sensors.
     - `covariance`: (n, n) the covariance of the n free numbers for white errors.
-    - `slopes`: (q, n) the derivatives of q quantities with respect to the free numbers.
+    - `slopes`: (q, n) the derivatives of the q quantities with respect to the free numbers.
 
     **Returns** two things for each sensor without a tolerance: the index of the sensor; and a dict
-    of kind of error → the largest change (q,) of each quantity that one component of the error
-    makes.
+    of kind of error ("scale" or "cross_axis") → changes (q,). The change of a quantity is the
+    largest one that a single component of the error causes, without its sign.
     """
     out = []
     for index, sensor in enumerate(model.records.sensors):

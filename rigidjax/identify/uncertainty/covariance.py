@@ -33,21 +33,26 @@ class Linearisation(eqx.Module):
     """Hold the errors of a model at one point, and the derivatives of the errors with respect to
     the n free numbers.
 
-    **Fields**; each of the first six holds one array for each sensor, for R recordings, T times and
-    k components:
+    Here R is the number of recordings, T the number of times, k the number of components of an
+    error, and m the number of free numbers on which one recording depends. The first six fields
+    hold one array for each sensor.
+
+    **Fields:**
 
     - `raw`: (R, T, k) the errors in the unit of the sensor.
     - `raw_slopes`: (R, T, k, m) the derivatives of `raw` with respect to the m numbers of each
       recording.
-    - `errors`, `slopes`: the errors and their derivatives in standard deviations (`terms.whiten`).
+    - `errors`: (R, T, k) the errors in standard deviations of the noise (`terms.whiten`).
+    - `slopes`: (R, T, k, m) the derivatives of `errors` with respect to the m numbers of each
+      recording.
     - `weights`: (R, T) the weights of the robust loss.
     - `mask`: (R, T, k) true if an error has a weight and its reading is below full scale.
     - `places`: (R, m) the indices of the numbers of each recording among all n numbers.
     - `prior_residuals`: (n,) the free numbers divided by the standard deviations of their priors.
     - `prior_weights`: (n,) one over the standard deviations of the priors, zero for a number
       without a prior.
-    - `extra`, `extra_slopes`: (j,) all further residuals, such as those of a prior of the body, and
-      (j, n) the derivatives of these residuals.
+    - `extra`: (j,) all further residuals, such as those of a prior of the body.
+    - `extra_slopes`: (j, n) the derivatives of `extra` with respect to the n free numbers.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model(), starts=1, max_steps=2)
     >>> [slopes.shape for slopes in result.linear.slopes]  # 17 times, 3 components, 8 free numbers
@@ -83,8 +88,8 @@ class Linearisation(eqx.Module):
     def misfit_gradient(self) -> np.ndarray:
         """Return the gradient (n,) of the misfit with respect to the free numbers.
 
-        The misfit is half the sum of squared residuals, those of the priors included, or a robust
-        loss of the errors.
+        The misfit is half the sum of squared residuals, with the residuals of the priors. Under a
+        robust loss, the loss of the errors takes the place of half the sum of their squares.
         """
         readings = self.rows_for_all_numbers(self.misfit_gradients_by_recording).sum(axis=0)
         priors = self.prior_weights * self.prior_residuals
@@ -95,7 +100,8 @@ class Linearisation(eqx.Module):
         """Return the weighted derivatives (R, N, m) of the N errors of all sensors, for each of R
         recordings.
 
-        The derivatives are with respect to the m numbers of each recording.
+        The derivatives are with respect to the m numbers of each recording. They are multiplied by
+        the square roots of the weights of the errors.
         """
         return np.concatenate(self.weighted_jacobians_by_sensor, axis=1)
 
@@ -105,6 +111,7 @@ class Linearisation(eqx.Module):
         each error.
 
         There are R recordings, T times, k components of an error, and m numbers of each recording.
+        The derivatives are multiplied by the square roots of the weights of the errors.
         """
         return [
             _slopes_as_matrices(slope * np.sqrt(weight)[..., None, None])
@@ -125,7 +132,7 @@ class Linearisation(eqx.Module):
         """Return the sum of the squared changes of all residuals if the n free numbers change by
         `step` (n,).
 
-        The residuals are linear in the step; they include those of the priors.
+        The residuals are taken as linear in the step. They include the residuals of the priors.
         """
         moved = np.append(step, 0.0)[self.places]
         readings = np.einsum("rim,rm->ri", self.weighted_jacobian, moved)
@@ -147,8 +154,8 @@ class Linearisation(eqx.Module):
         """Return the parts (R, m, m) of a `covariance` (n, n) that belong to the numbers of each
         recording.
 
-        Each of R recordings depends on m of the n free numbers. The result is zero unless the
-        covariance is finite.
+        Each of R recordings depends on m of the n free numbers. The result is zero if the
+        `covariance` is not finite in all entries.
         """
         known = covariance if np.isfinite(covariance).all() else np.zeros_like(covariance)
         wide = np.pad(known, (0, 1))
@@ -159,7 +166,8 @@ class Linearisation(eqx.Module):
         """Return the gradient (R, m) of the misfit of each of R recordings with respect to its m
         numbers.
 
-        The misfit is half the sum of squared errors, or a robust loss of the errors.
+        The misfit of a recording is half the sum of its squared errors, or a robust loss of its
+        errors.
         """
         total: Any = sum(
             ((error * weight[..., None]).reshape(len(error), 1, -1) @ _slopes_as_matrices(slope))[
@@ -197,12 +205,12 @@ def _weighted_errors_and_derivatives(
 
     **Returns** three things, from which a `Linearisation` is made:
 
-    - a tuple on the readings: the errors and the derivatives of `blocks`, in standard deviations of
-      the noise; and the weights of the robust loss;
+    - a tuple of three things for the readings: their errors, in standard deviations of the noise;
+      the derivatives of these errors; and the weights of the robust loss;
     - the indices (R, m) of the numbers of each recording among all n free numbers;
-    - a tuple on what is known besides the readings: the residuals (n,) of the priors of single free
-      numbers; the derivative (n,) of each with respect to its number; the j residuals of all other
-      priors; and their derivatives (j, n).
+    - a tuple of four things for the priors: the residual (n,) of the prior of each free number; the
+      derivative (n,) of this residual with respect to the number; the residuals (j,) of all other
+      priors; and the derivatives (j, n) of these residuals.
     """
     errors, slopes = blocks
     out, slopes = residuals_and_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
@@ -226,8 +234,9 @@ def linearise(
     - `x`: (n,) the free numbers.
     - `blocks`: for each sensor the errors and the derivatives of the errors at x, as
       `terms.errors_and_jacobians` returns them.
-    - `thickened`: `None`, or, if a body is flat (I1 + I2 = I3) at x, two things: the free numbers
-      with a thicker body, at which the derivatives are computed; and the `blocks` at these numbers.
+    - `thickened`: `None` if no body is flat (I1 + I2 = I3) at x. Otherwise two things: the free
+      numbers of a slightly thicker body, at which the derivatives are computed; and the `blocks` at
+      these numbers.
     """
     (errors, slopes, weights), places, others = jax.tree.map(
         np.asarray, _weighted_errors_and_derivatives(model, x, noise, blocks)
@@ -242,22 +251,26 @@ def linearise(
 
 
 class Root(eqx.Module):
-    """Hold a root of the covariance of n numbers for white errors, recording by recording.
+    """Hold a root of the covariance of n free numbers for white errors, recording by recording.
 
-    A root of a matrix A is a matrix B with B Bᵀ = A.
+    A root of a matrix A is a matrix B with B Bᵀ = A. An own number of a recording is a free number
+    on which no other recording depends, and which no prior ties to another recording. All other
+    free numbers are called shared.
 
     **Fields:**
 
-    - `size`: (n,) the factor by which each number is multiplied for the other fields.
-    - `lift`: (n, s) the derivatives of all numbers, at their best values for given shared numbers,
-      with respect to the s numbers that recordings share.
+    - `size`: (n,) the factor by which each number is multiplied, to make it of order one. All other
+      fields are for the multiplied numbers.
+    - `lift`: (n, s) how all n numbers change with the s shared numbers, if the own numbers of each
+      recording take the values with the least misfit.
     - `core`: (s, r) a root of the covariance of the shared numbers.
-    - `own`: for each recording three things: the places (k,) of the numbers that it alone has; a
-      root (k, j) of the covariance of these own numbers for known shared numbers; and the
-      derivatives (p, k + s) of the residuals of priors with respect to the own and the shared
-      numbers.
+    - `own`: for each recording three things:
+        - the indices (k,) of its own numbers among all n numbers;
+        - a root (k, j) of the covariance of the own numbers for known shared numbers;
+        - the derivatives (p, k + s), with respect to the own and the shared numbers, of the p
+          residuals of priors that depend on own numbers.
     - `ties`: (q, s) the derivatives of the residuals of priors that depend on shared numbers only.
-    - `null`: (i, n) orthonormal directions that are not determined.
+    - `null`: (i, n) orthonormal directions that the data do not determine.
     """
 
     size: np.ndarray
@@ -272,8 +285,8 @@ class Root(eqx.Module):
     ) -> np.ndarray:
         """Return the sandwich covariance `H⁻¹ M H⁻¹` (n, n).
 
-        H⁻¹ is the covariance for white errors. M is the information of priors plus the sum over
-        recordings of `rowsᵀ middle rows`.
+        Here H⁻¹ is the covariance for white errors. The matrix M is the information of the priors
+        plus the sum, over recordings, of `rowsᵀ middle rows`.
 
         **Arguments:**
 
@@ -302,8 +315,8 @@ class Root(eqx.Module):
 
     @property
     def covariance(self) -> np.ndarray:
-        """Return the covariance `H⁻¹` (n, n) for white errors, within the directions that are
-        determined.
+        """Return the covariance (n, n) for white errors, within the directions that the data
+        determine.
         """
         half = self.lift @ self.core
         out = half @ half.T
@@ -339,13 +352,15 @@ class Covariance(eqx.Module):
 
     **Fields:**
 
-    - `covariance`: (n, n), with an infinite variance for a number that the data do not determine.
-    - `determined`: (n, n) the covariance within the determined directions.
+    - `covariance`: (n, n) the covariance, with an infinite variance for each number that the data
+      do not determine.
+    - `determined`: (n, n) the covariance within the directions that the data determine.
     - `kind`: the method of the covariance, in words.
     - `singular_values`: (n,) the singular values of the weighted Jacobian with columns of length
       one.
-    - `null_directions`: (k, n) the directions that are not determined.
-    - `root`: a root of the covariance for white errors; `None` if the motion is not finite.
+    - `null_directions`: (k, n) the directions that the data do not determine.
+    - `root`: a root of the covariance for white errors. It is `None` if the motion is not finite;
+      both covariances are NaN then.
     """
 
     covariance: np.ndarray
@@ -359,10 +374,11 @@ class Covariance(eqx.Module):
 def white_covariance(linear: Linearisation) -> Covariance:
     """Return the covariance for white errors, `(JᵀWJ)⁻¹`.
 
-    J holds the derivatives of all residuals, W their weights. Directions with singular values below
-    1e-8 of the largest one are not determined. The numbers that one recording alone has are
-    eliminated first, recording by recording (Schur complement); the singular values are those of
-    the eliminated blocks, and of the remaining matrix of the shared numbers.
+    Here J holds the derivatives of all residuals, and W holds their weights. A direction is not
+    determined if its singular value is below 1e-8 of the largest one. The numbers on which one
+    recording alone depends are eliminated first, recording by recording (Schur complement). The
+    singular values of each eliminated block, and of the matrix that remains for the shared numbers,
+    are computed separately.
     """
     n, dense = linear.free_count, linear.weighted_jacobian
     if not (np.isfinite(dense).all() and np.isfinite(linear.extra_slopes).all()):
@@ -430,19 +446,20 @@ def _factor_of_shared_numbers(
     selected: np.ndarray,
     shared: np.ndarray,
 ) -> np.ndarray:
-    """Return a triangular matrix (QR) that replaces the errors of all recordings without own
-    numbers.
+    """Return a triangular matrix that replaces the derivatives of the errors of all recordings
+    without own numbers.
 
-    The errors of such recordings depend only on the s numbers that recordings share. The matrix
-    (q, s) has the same Gram matrix as the derivatives of the errors with respect to these numbers.
+    The errors of a recording without own numbers depend only on the s numbers that recordings
+    share. The matrix A (q, s) is computed by a QR decomposition. Its product AᵀA is the same as
+    that of the derivatives of the errors with respect to the shared numbers.
 
     **Arguments:**
 
     - `linear`: the derivatives of the errors of all R recordings.
     - `triangles`: (R, q, m) for each recording the triangular factor (QR) of the weighted
       derivatives with respect to its m numbers.
-    - `size`: (n,) for each free number the divisor of the derivatives with respect to it, which
-      makes them of order one.
+    - `size`: (n,) for each free number the factor by which the derivatives with respect to it are
+      divided, to make them of order one.
     - `selected`: (R,) true for recordings whose errors depend on shared numbers only.
     - `shared`: (s,) the indices of the shared numbers among all n.
     """
@@ -455,12 +472,12 @@ def _factor_of_shared_numbers(
 
 def _only_dependent_recordings(linear: Linearisation) -> np.ndarray:
     """Return, for each of n free numbers, the index of the only recording whose errors depend on
-    it.
+    this number.
 
-    The index is −1 for a number on which no recording, or more than one, depends. It is −1, too,
-    for numbers of different recordings that one prior ties together. The argument `linear` holds
-    the numbers of each recording, and the derivatives of the residuals of such priors
-    (`extra_slopes`).
+    The index is −1 for a number on which no recording depends, or more than one recording. It is −1
+    as well for numbers of different recordings that one prior ties together. The argument `linear`
+    holds the indices of the numbers of each recording (`places`), and the derivatives of the
+    residuals of priors that tie numbers together (`extra_slopes`).
     """
     records, n = len(linear.places), linear.free_count
     owner, used = np.full(n + 1, -1), np.zeros((records, n + 1), bool)
@@ -480,13 +497,17 @@ def _range_and_null_space(
     """Compute the range and the null space of a matrix by a singular value decomposition.
 
     The argument `rows` (q, k) holds derivatives of q residuals with respect to k numbers, with
-    columns of order one. A direction is taken as null if its singular value is at most 1e-8 of the
-    largest one (of 1 if all are smaller than 1); the other r directions are determined.
+    columns of order one. A direction is a null direction if its singular value is at most 1e-8 of
+    the largest one (or at most 1e-8 if all are smaller than 1). The other r directions are called
+    determined.
 
-    **Returns** four things: an orthonormal basis (q, r) of the range; a root (k, r) of the inverse
-    of the Gram matrix `rowsᵀ rows`, within the determined directions; the null directions (j, k),
-    which the rows do not determine; and all singular values. A root of a matrix A is a matrix B
-    with B Bᵀ = A.
+    **Returns** four things:
+
+    - an orthonormal basis (q, r) of the range;
+    - a root (k, r) of the inverse of `rowsᵀ rows` within the determined directions, where a root of
+      a matrix A is a matrix B with B Bᵀ = A;
+    - the null directions (j, k);
+    - all singular values.
     """
     u, singular, directions = np.linalg.svd(rows, full_matrices=False)
     determined = singular > BLIND * singular.max(initial=1.0)
@@ -498,17 +519,18 @@ def white_or_sandwich_covariance(
     linear: Linearisation, times: "CorrelationTimes", white: Covariance | None = None
 ) -> Covariance:
     """Return the covariance for white errors, or the sandwich covariance `H⁻¹ M H⁻¹` if the errors
-    are autocorrelated; H⁻¹ is the covariance for white errors.
+    are autocorrelated.
 
-    M is `Jᵀ C J` plus the information of priors, where C is the covariance of the errors in time.
-    In each channel the second differences of the errors give the variance of a white part. The
-    remaining variance belongs to a part whose autocorrelation decays exponentially. The decay time
-    cannot be found well from the errors of a fit. Each number therefore gets the largest variance
-    over all decay times from two samples to half a record. The errors of a fit are smaller than the
-    true errors: `Jᵀ C J` is multiplied by n/(n − p) for n independent errors and p free numbers. If
-    there are many recordings, the scatter between recordings gives a second estimate of the
-    variance, and the larger estimate is used. Source: White 1980, doi:10.2307/1912934; Liang and
-    Zeger 1986, doi:10.1093/biomet/73.1.13.
+    Here H⁻¹ is the covariance for white errors, and M is `Jᵀ C J` plus the information of the
+    priors, where J holds the derivatives of the errors and C is the covariance of the errors in
+    time. In each channel the second differences of the errors give the variance of a white part.
+    The remaining variance belongs to a part whose autocorrelation decays exponentially. The decay
+    time cannot be found well from the errors of a fit. Each number therefore gets the largest
+    variance over all decay times from two samples to half a record. The errors of a fit are smaller
+    than the true errors: `Jᵀ C J` is multiplied by n/(n − p) for n independent errors and p free
+    numbers. If there are many recordings, the scatter between recordings gives a second estimate of
+    the variance, and the larger estimate is used. Source: White 1980, doi:10.2307/1912934; Liang
+    and Zeger 1986, doi:10.1093/biomet/73.1.13.
 
     **Arguments:**
 
@@ -542,8 +564,9 @@ def covariance_root(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two things: a root (n, m) of the inverse of the matrix `information` (n, n), and the
     null directions (k, n) of this matrix.
 
-    A root of a matrix A is a matrix B with B Bᵀ = A. The null directions are those of the n numbers
-    that the information does not determine; the inverse is taken within the other directions.
+    A root of a matrix A is a matrix B with B Bᵀ = A. A null direction is a direction of the n
+    numbers that the information does not determine. The inverse is taken within all other
+    directions.
     """
     size = np.sqrt(np.diag(information))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-150))
@@ -557,11 +580,13 @@ def covariance_root(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def distance_to_minimum(
     linear: Linearisation, white: Covariance, directions: Sequence[np.ndarray] = ()
 ) -> float:
-    """Return the distance to the least misfit in standard deviations, `√(gᵀ(JᵀWJ)⁻¹g)`.
+    """Return the distance from a point to the minimum of the misfit in standard deviations,
+    `√(gᵀ(JᵀWJ)⁻¹g)`.
 
-    Here g is the gradient of the misfit, and (JᵀWJ)⁻¹ the covariance `white`. MINUIT ends a search
-    if this distance is small (James and Roos 1975, doi:10.1016/0010-4655(75)90039-9). The minimum
-    is sought with fixed values of the functions whose derivatives (n,) are in `directions`.
+    Here g is the gradient of the misfit at the point, and (JᵀWJ)⁻¹ is the covariance `white` for
+    white errors. MINUIT ends a search if this distance is small (James and Roos 1975,
+    doi:10.1016/0010-4655(75)90039-9). Each entry of `directions` is the derivative (n,) of a
+    function that keeps its value on the way to the minimum, such as the flatness of a body.
     """
     covariance = white.determined
     for row in directions:
@@ -575,12 +600,14 @@ def _sandwich_covariance(
 ) -> np.ndarray:
     """Return the covariance (n, n) of a fit for errors that are correlated in time.
 
-    It is the sandwich `H⁻¹ M H⁻¹`, where H⁻¹ is the covariance for white errors, and M is `Jᵀ C J`
-    with the derivatives J of the errors and the covariance C of the errors in time, plus the
-    information of priors. Each number gets the largest of several variances: for several decay
-    times of the autocorrelation, for white errors and, with many recordings, from the scatter
-    between recordings. The derivatives J are first written in orthonormal columns (QR), since
-    round-off in products of the derivatives themselves could make variances negative.
+    It is the sandwich `H⁻¹ M H⁻¹`, where H⁻¹ is the covariance for white errors. The matrix M is
+    `Jᵀ C J` plus the information of the priors, where J holds the derivatives of the errors, and C
+    is the covariance of the errors in time.
+
+    The variance of each number is the largest of several estimates: one for white errors, one for
+    each of several decay times of the autocorrelation and, if there are many recordings, one from
+    the scatter between recordings. The derivatives J are first written in orthonormal columns (QR),
+    since round-off in products of the derivatives themselves could make variances negative.
 
     **Arguments:**
 
@@ -606,8 +633,8 @@ def _sandwich_covariance(
                 linear.misfit_gradients_by_recording[:, None], linear.places, between
             )
         )
-    # The estimate with the largest variances is scaled up for each number whose variance is larger
-    # in another estimate, or for white errors.
+    # Take the estimate with the largest variances on average. Scale it up for each number whose
+    # variance is larger in another estimate, or for white errors.
     all_ = np.stack([np.diag(white.determined), *(np.diag(c) for c in estimates)])
     least = np.maximum(all_[0], 1e-300)
     out = estimates[int(np.argmax((all_[1:] / least).mean(axis=1)))]
@@ -619,18 +646,20 @@ def _sandwich_covariance(
 def _spectra_and_smooth_shares(
     linear: Linearisation, columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays for all k channels: the spectra in time of the derivatives of a fit; and
-    the part of the variance of the errors that is not white.
+    """Return two arrays for all k channels: the spectra in time of the derivatives of the errors of
+    a fit; and the fraction of the variance of the errors that is not white.
 
     A channel is one component of one sensor.
 
     **Arguments:** `linear` the errors of R recordings at T times, with their weights; `columns`
     (R, N, m) orthonormal columns that span the derivatives of the N errors of each recording.
 
-    **Returns** two things: the spectra (R, k, 2, T + 1, m) of the columns, with the real and the
-    imaginary part at each of T + 1 frequencies, multiplied by the standard deviation of the errors
-    of the channel; and for each channel the fraction (k, 1, 1) of the variance of its errors that
-    is smooth in time, 0 to 1.
+    **Returns** two things:
+
+    - the spectra (R, k, 2, T + 1, m) of the columns, multiplied by the standard deviation of the
+      errors of the channel: the real and the imaginary part at each of T + 1 frequencies;
+    - for each channel the fraction (k, 1, 1) of the variance of its errors that is smooth in time,
+      between 0 and 1.
     """
     first, slopes, shares = 0, [], []
     for error, weight in zip(linear.errors, linear.weights, strict=True):
@@ -664,9 +693,9 @@ def _correlated_information(
 
     **Arguments:**
 
-    - `spectra`: (R, k, 2, T + 1, m) the Fourier transforms in time of J, the real and the imaginary
-      part at each of T + 1 frequencies, for k channels (components of sensors), multiplied by the
-      standard deviation of the errors of the channel.
+    - `spectra`: (R, k, 2, T + 1, m) the Fourier transforms in time of J for k channels (components
+      of sensors), multiplied by the standard deviation of the errors of the channel. They have a
+      real and an imaginary part at each of T + 1 frequencies.
     - `smooth_shares`: (k, 1, 1) the fraction of the variance of each channel that is smooth.
     - `decay_time`: the decay time, in samples.
     """
@@ -680,7 +709,7 @@ def _correlated_information(
 
 
 def smooth_variance_share(errors: np.ndarray, mask: np.ndarray) -> float:
-    """Return the share of the variance of `errors` (R, T) that is not white noise, from 0 to 1.
+    """Return the fraction of the variance of `errors` (R, T) that is not white noise, from 0 to 1.
 
     The variance of the white noise in the R rows of T samples is estimated from the second
     differences of the errors; the rest of the variance belongs to a part that is smooth in time.
@@ -732,9 +761,9 @@ def correlation_times(linear: Linearisation) -> CorrelationTimes:
     correlated.
 
     The autocorrelation time is `1 + 2 Σ ρ_l`, with the correlation ρ_l of errors that are l samples
-    apart. The sum ends at the first ρ_l that is below twice its standard deviation, or that has
-    fewer than ten pairs of errors. Readings at full scale are left out. The argument `linear` holds
-    the errors with their weights.
+    apart. The sum ends before the first ρ_l that is below twice the standard deviation of ρ_l for
+    white errors, or for which there are fewer than ten pairs of errors. Readings at full scale are
+    left out. The argument `linear` holds the errors with their weights.
     """
     spans, longest, closest, independent = [], 1.0, 0.0, 0.0
     for error, weight, kept in zip(linear.errors, linear.weights, linear.mask, strict=True):
@@ -757,9 +786,10 @@ def _autocorrelation_time_and_first_correlation(
     neighbouring errors.
 
     The autocorrelation time is `1 + 2 Σ ρ_l`, with the correlation ρ_l of errors that are l samples
-    apart; it is 1 for white errors. The sum ends before the first ρ_l that is below twice its
-    standard deviation, or that has fewer than ten pairs of errors. The correlation of neighbours is
-    0 if they have fewer than ten pairs.
+    apart; it is 1 for white errors. The sum ends before the first ρ_l that is below twice the
+    standard deviation of ρ_l for white errors, or for which there are fewer than ten pairs of
+    errors. The correlation of neighbouring errors is 0 if there are fewer than ten pairs of
+    neighbours.
 
     **Arguments:** `errors` (R, T) for R recordings and T times, the errors of one component of a
     sensor; `mask` (R, T) true for the errors to use.

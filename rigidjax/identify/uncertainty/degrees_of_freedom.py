@@ -19,20 +19,23 @@ class Freedom(eqx.Module):
     free numbers are computed.
 
     A width is the estimated `spread` of a `Free`: the standard deviation of the values of single
-    recordings about the shared value.
+    recordings about the value that the recordings share.
 
     **Fields:**
 
     - `covariance`: (n, n) the covariance of the n free numbers, for white errors.
-    - `places`: (R, m) the places, among the free numbers, of the m numbers of each recording.
-    - `groups`: (R,) the group of each recording; the recordings of a group share their noise.
-    - `blocks`: for each sensor, (R, m, m), the information in its readings.
-    - `left`: for each sensor, (G,), the number of its independent errors in each group minus the
-      number of free numbers that these errors determine; infinite for a given noise.
-    - `widths`: for each estimated width, the places of the deviations of recordings, the square of
-      the width, and its degrees of freedom.
-    - `considered`: (n, c) the shifts of the free numbers by considered errors, which have known
-      variances (`Consideration.shifts`).
+    - `places`: (R, m) the indices, among the free numbers, of the m numbers of each of R
+      recordings.
+    - `groups`: (R,) the index of the group of each recording. The recordings of a group share their
+      noise.
+    - `blocks`: for each sensor the information matrices (R, m, m) of its readings.
+    - `left`: for each sensor the degrees of freedom (G,) of its noise in each of G groups: the
+      number of its independent errors minus the number of free numbers that these errors determine.
+      They are infinite if the noise is given.
+    - `widths`: for each width three things: the indices, among the free numbers, of the deviations
+      of recordings from the shared value; the square of the width; and its degrees of freedom.
+    - `considered`: (n, c) the changes of the free numbers by one standard deviation of each error
+      that a sensor may have and that the fit does not estimate (`Consideration.shifts`).
     """
 
     covariance: np.ndarray
@@ -48,9 +51,9 @@ class Freedom(eqx.Module):
         free numbers.
 
         The argument `slope` (…, n) holds the derivative of each function with respect to the n free
-        numbers. Considered errors add a known variance. The degrees of freedom of the estimated
-        variance are therefore multiplied by the square of the ratio of the whole variance to the
-        estimated variance.
+        numbers. Considered errors of sensors add a known variance to the estimated variance. The
+        degrees of freedom of the estimated variance are therefore multiplied by the square of a
+        ratio: the sum of both variances, divided by the estimated variance.
         """
         estimated = np.sum((slope @ self.covariance) * slope, axis=-1)
         known = np.sum((slope @ self.considered) ** 2, axis=-1)
@@ -61,11 +64,13 @@ class Freedom(eqx.Module):
         """Return the degrees of freedom (…,) of the estimated part of the variance of each of
         several functions.
 
-        The degrees follow from the share of each noise and of each width in the variance
-        (Satterthwaite 1946, doi:10.2307/3002019). If every noise has more than `PLENTY` degrees of
-        freedom, the shares of the noises are not computed: the smallest number of degrees is used
-        for all noises. The argument `slope` (…, n) holds the derivative of each function with
-        respect to the n free numbers.
+        The variance of a function is a sum of parts: one for the noise of each sensor in each group
+        of recordings, and one for each estimated `spread` of a `Free`. The degrees of freedom of
+        the sum follow from the fraction of each part and from its degrees of freedom (Satterthwaite
+        1946, doi:10.2307/3002019). If every noise has more than `PLENTY` degrees of freedom, the
+        fractions of single noises are not computed: the smallest number of degrees is used for all
+        noises. The argument `slope` (…, n) holds the derivative of each function with respect to
+        the n free numbers.
         """
         along = slope @ self.covariance
         variance = np.maximum(np.sum(along * slope, axis=-1), 1e-300)
@@ -133,10 +138,11 @@ def prepare_degrees_of_freedom(
 def counts_of_determined_numbers(
     linear: Linearisation, information: tuple[np.ndarray, ...], covariance: np.ndarray
 ) -> list[np.ndarray]:
-    """Return, for each sensor, how many free numbers its readings determine in each of R recordings
-    (R,): the sum of the leverages of the readings.
+    """Return, for each sensor, the number (R,) of free numbers that its readings determine in each
+    of R recordings.
 
-    A number that readings and priors determine together counts in part.
+    It is the sum of the leverages of the readings. A number that the readings determine together
+    with priors, other sensors or other recordings counts as a fraction.
 
     **Arguments:**
 

@@ -27,12 +27,14 @@ ONE_SIDED = 1.645
 class Limit(eqx.Module):
     """Hold the distance of a body from a flat body, `(I1 + I2 − I3) / I3`, called its flatness.
 
+    The principal moments of the body are I1 ≤ I2 ≤ I3. The flatness of a flat body is zero.
+
     **Fields:**
 
-    - `where`: the suffix that the names of this body's quantities have.
+    - `where`: the suffix of the names of this body's quantities, such as " [moon]".
     - `flatness`: the flatness at the best point of the fit.
-    - `free`: the flatness at the minimum of the linearised model if this is smaller than
-      `flatness`, else `flatness`; it may be negative.
+    - `free`: the flatness at the minimum of the linearised model, or `flatness` if that is smaller.
+      It is negative if the minimum lies beyond the limit of real bodies.
     - `slope`: (n,) the derivative of the flatness with respect to the n free numbers.
     """
 
@@ -71,17 +73,19 @@ def interval_ends_at_flat_body(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends (low, high) of an interval that stops at a flat body, in standard deviations.
 
-    The ends are differences from the best value of a number y, divided by its standard deviation.
-    They follow from the likelihood ratio of two normally distributed numbers, y and the flatness z,
-    where z is not negative and m² is the squared Mahalanobis distance from the best point: `m²(y) =
-    min over z ≥ 0 of m²(y, z)`.
+    The interval is for a number y that is correlated with the flatness z of a body. An end is the
+    difference from the best value of y, divided by the standard deviation of y.
+
+    The ends follow from a likelihood ratio. Both y and z are taken as normally distributed, and
+    m²(y, z) is their squared Mahalanobis distance from the minimum of the linearised model. Since a
+    real body has z ≥ 0, the distance for one number y is `m²(y) = min over z ≥ 0 of m²(y, z)`.
 
     **Arguments:**
 
-    - `half_width`: the half-width of the interval without the limit, in standard deviations.
-    - `correlation`: the correlation of the number y with the flatness z.
-    - `flatness`: the flatness at the minimum of the linearised model, divided by its standard
-      deviation.
+    - `half_width`: the half-width of the interval without the limit z ≥ 0, in standard deviations.
+    - `correlation`: the correlation of y with z.
+    - `flatness`: the value of z at the minimum of the linearised model, divided by the standard
+      deviation of z.
     """
     rho = np.clip(np.asarray(correlation), -1.0, 1.0)
     past = min(flatness, 0.0)
@@ -99,11 +103,11 @@ def interval_ends_at_flat_body(
 def thicken_flat_bodies(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     """Return the free numbers x (n,) with each flat body made thicker; `None` if no body is flat.
 
-    A flat body has the moments I1 + I2 = I3, or nearly so. The derivative of a flat body with
-    respect to x is zero, so that derivatives are computed at a slightly thicker body. The
-    information on the inertia tensor itself is regular at a flat body, and hardly different at the
-    thicker body. The `model` gives the chart of each body, which is its parametrisation by free
-    numbers.
+    A flat body has the principal moments I1 + I2 = I3, or nearly so. The numbers x describe a
+    square root of the second moments of the body, so that the derivative of its thickness with
+    respect to x is zero at a flat body. Therefore derivatives are computed at a slightly thicker
+    body. The information on the inertia tensor itself is hardly different there. The `model` gives
+    the chart of each body, which is its parametrisation by free numbers.
     """
     thick = list(map(_numbers_of_thicker_body, chart_list(model.chart), bodies_at(model, x)))
     if all(one is None for one in thick):
@@ -126,8 +130,8 @@ def bodies_at(model: Model, x: Float[Array, " n"]) -> list[Any]:
 def _compiled_bodies(model: Model, x: Float[Array, " n"]) -> list[Any]:
     """Return the bodies of a `model` at its free numbers x (n,), computed in one compiled program.
 
-    They are in the order of the charts of the model (the maps from free numbers to a possible
-    body).
+    The bodies are in the order of the model's charts. A chart is the parametrisation of one body by
+    free numbers.
     """
     # Compile one program: outside of a trace each operation of JAX takes as long as a run of 100
     # steps.
@@ -139,12 +143,15 @@ def _numbers_of_thicker_body(
 ) -> Array | None:
     """Return the free numbers of a slightly thicker body, or `None` for a body that is not flat.
 
-    A flat body has the moments I1 + I2 = I3, or nearly so. The result is also `None` for a `body`
-    with NaN, for a `chart` that leaves the moments fixed, and for a chart that a user wrote, of
-    which it is not known how it becomes flat.
+    A flat body has the principal moments I1 + I2 = I3, or nearly so. The result is also `None` for
+    a `body` with NaN, for a `chart` that leaves the moments fixed, and for a chart that a user
+    wrote, since it is not known how such a chart describes flat bodies.
 
-    **Arguments:** `chart` the chart (a map from free numbers to a possible body), whose free
-    numbers are returned; `body` the body that may be flat.
+    **Arguments:**
+
+    - `chart`: the chart, a map from free numbers to a possible body. The free numbers are those of
+      this chart.
+    - `body`: the body that may be flat.
     """
     # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
     if isinstance(body, MassProperties):
@@ -165,11 +172,11 @@ def _numbers_of_thicker_body(
 
 
 def _is_bounded_by_flat_bodies(chart: AbstractBodyChart) -> bool:
-    """Return whether flat bodies, those with the moments I1 + I2 = I3, are the limit of the bodies
-    that a `chart` can describe.
+    """Return whether flat bodies are the limit of the bodies that a `chart` can describe.
 
-    A chart is a map from free numbers to a possible body. The result is true if the chart is one of
-    this package and changes moments of inertia, not the mass alone.
+    A chart is a map from free numbers to a possible body. A flat body has the principal moments I1
+    + I2 = I3. The result is true if the chart is one of this package and changes moments of
+    inertia, not the mass alone.
     """
     return type(chart).__module__ == AbstractBodyChart.__module__ and any(
         name != "mass" for name in chart.log_names
@@ -204,7 +211,9 @@ def distances_from_flat_bodies(
     step_to_minimum: np.ndarray,
     body_suffixes: list[str],
 ) -> tuple[Limit, ...]:
-    """Return, for each body whose moments are free, how far it is from a flat body, I1 + I2 = I3.
+    """Return how far each body with free moments is from a flat body.
+
+    A flat body has the principal moments I1 + I2 = I3.
 
     **Arguments:**
 
@@ -213,7 +222,7 @@ def distances_from_flat_bodies(
       reported numbers, with the flatness of each body at the end; and their derivatives with
       respect to the n free numbers.
     - `step_to_minimum`: (n,) the step of the free numbers from the best point to the minimum of the
-      linear model.
+      linearised model.
     - `body_suffixes`: for each body the suffix of the names of its quantities.
     """
     rows = zip(

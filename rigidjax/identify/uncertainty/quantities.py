@@ -27,14 +27,16 @@ class Quantity(eqx.Module):
     **Fields:**
 
     - `name`, `value`, `unit`: the name, the value and the unit of the number.
-    - `deviation`: the standard deviation of the number, in the same unit.
-    - `positive`: whether the number is always positive. Its logarithm then has normal errors:
-      `deviation` is the value times the standard deviation of the logarithm, and an interval
-      reaches farther up than down.
-    - `cuts`: for each body the correlation of the number with the body's flatness, and the flatness
-      in standard deviations; intervals end where a body would be flat.
-    - `most`: the largest value that any body can have.
-    - `freedom`: the degrees of freedom of its variance; infinite if all noise is given.
+    - `deviation`: the standard deviation of the number, in its unit.
+    - `positive`: whether the number is always positive. If it is, the errors of its logarithm are
+      taken as normal: `deviation` is the value times the standard deviation of the logarithm, and
+      an interval reaches farther up than down.
+    - `cuts`: for each body two things: the correlation of the number with the flatness of the body,
+      which is (I1 + I2 − I3) / I3; and the flatness divided by its standard deviation. Intervals
+      end where a body would be flat.
+    - `most`: the largest value of the number that a real body can have.
+    - `freedom`: the degrees of freedom of the variance of the number; infinite if all noise is
+      given.
 
     >>> mass = Quantity("mass", 2.0, 0.02, "kg", True)
     >>> low, high = mass.interval(0.95)
@@ -52,12 +54,13 @@ class Quantity(eqx.Module):
     freedom: float = np.inf
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Return the low and the high end of the interval of a probability `level`.
+        """Return the low and the high end of the interval of the number.
 
-        The interval of a positive number is computed for its logarithm. An interval ends where the
-        body would be flat. The ends are 0 and `most`, infinity by default, for a positive number
-        whose uncertainty is more than a factor of 1e3. **Arguments:** `level` the probability that
-        the interval holds the true value. **Raises** `ValueError` for a level outside (0, 1).
+        The interval of a positive number is computed for its logarithm. An interval ends where a
+        body would be flat. If an end of the interval of a positive number differs from the value by
+        more than a factor of 1e3, the ends are 0 and the field `most` (infinity by default).
+        **Arguments:** `level` the probability that the interval holds the true value. **Raises**
+        `ValueError` for a level outside (0, 1).
         """
         reach = float(two_sided_student_quantile(level, self.freedom))
         wide = deviation_of_value_or_logarithm(self)
@@ -70,8 +73,8 @@ class Quantity(eqx.Module):
 
 
 def deviation_of_value_or_logarithm(quantity: Quantity) -> float:
-    """Return the standard deviation of a reported `quantity`, or that of its logarithm if it is
-    positive.
+    """Return the standard deviation of a reported `quantity`, or the standard deviation of its
+    logarithm if the quantity is always positive.
     """
     if not quantity.positive:
         return quantity.deviation
@@ -81,16 +84,16 @@ def deviation_of_value_or_logarithm(quantity: Quantity) -> float:
 def interval_cut_at_flat_bodies(
     half_width: np.ndarray | float, cuts: Sequence[tuple[np.ndarray | float, float]]
 ) -> tuple[np.ndarray | float, np.ndarray | float]:
-    """Return the ends (low, high) of an interval in standard deviations, which is cut where a body
-    would be flat.
+    """Return the ends (low, high) of the interval of a quantity, cut where a body would be flat.
 
-    A body is flat if its moments are I1 + I2 = I3.
+    The ends are differences from the best value, in standard deviations of the quantity. A body is
+    flat if its principal moments are I1 + I2 = I3.
 
     **Arguments:**
 
     - `half_width`: the half-width of the interval if it is not cut, in standard deviations.
-    - `cuts`: for each body two numbers: the correlation of the quantity with the flatness of the
-      body; and the flatness in standard deviations.
+    - `cuts`: for each body two numbers: the correlation of the quantity with the flatness (I1 + I2
+      − I3) / I3 of the body; and the flatness divided by its standard deviation.
     """
     low: Any = -half_width
     high: Any = half_width
@@ -126,13 +129,15 @@ def names_units_and_signs(model: Model) -> list[tuple[str, str, bool]]:
 def reports_initial_states(model: Model) -> bool:
     """Return whether a fit of the `model` reports the initial states of its recordings.
 
-    It does not for windows (short parts of a record), which have many initial states.
+    The initial states are not reported for a model of windows (short parts of a record), which has
+    too many of them.
     """
     return model.clusters is None
 
 
 def name_suffixes_and_charts(model: Model) -> list[tuple[str, AbstractBodyChart]]:
-    """Return, for each body of a `model`, the suffix of the names of its quantities, and its chart.
+    """Return two things for each body of a `model`: the suffix of the names of its quantities; and
+    its chart.
 
     A chart is the parametrisation of a body by free numbers. The suffix is empty for a single body;
     otherwise it is the name of the body in brackets.
@@ -145,8 +150,8 @@ def name_suffixes_and_charts(model: Model) -> list[tuple[str, AbstractBodyChart]
 def recording_suffixes(model: Model) -> list[str]:
     """Return for each recording the suffix of the names of its quantities.
 
-    The suffix is empty for a single recording; otherwise it has the number of the recording among
-    the recordings of its body.
+    The suffix is empty for a single recording. Otherwise it has, in brackets, the name of the body,
+    if it has one, and the number of the recording among the recordings of this body.
     """
     if model.count == 1:
         return [""]
@@ -244,8 +249,9 @@ def reported_quantities(
       values; and their derivatives.
     - `covariance`: (n, n) the covariance of the free numbers within the determined directions.
     - `null_directions`: (k, n) the directions of the free numbers that are not determined.
-    - `limits`: the flat bodies at which intervals end.
-    - `degrees_of_freedom`: the degrees of freedom of the variances.
+    - `limits`: for each body with free moments its distance from a flat body; intervals end where
+      the body would be flat.
+    - `degrees_of_freedom`: the degrees of freedom of the variance of each quantity.
     """
     names = names_units_and_signs(model)
     values, slope = (part[: len(names)] for part in values_and_slopes)
@@ -282,11 +288,13 @@ def interval_about(
     **Arguments:**
 
     - `value`: (…) the best values of the functions.
-    - `slope`: (…, n) their derivatives with respect to the free numbers.
-    - `covariance`: (n, n) the covariance of the free numbers within the determined directions.
+    - `slope`: (…, n) the derivatives of the functions with respect to the free numbers.
+    - `covariance`: (n, n) the covariance of the free numbers within the directions that the data
+      determine.
     - `null_directions`: (k, n) the directions that the data do not determine.
-    - `half_width`: the half-width of the interval, in standard deviations, if no limit cuts it.
-    - `limits`: the flat bodies at which intervals end.
+    - `half_width`: the half-width of the interval, in standard deviations, if no flat body cuts it.
+    - `limits`: for each body with free moments its distance from a flat body; intervals end where
+      the body would be flat.
     """
     wide = standard_deviations(slope, covariance, null_directions)
     low, high = interval_cut_at_flat_bodies(
@@ -313,8 +321,9 @@ def correlations_with_flatness(
     - `deviations`: (…) the standard deviations of the functions.
     - `limits`: the distance of each body from a flat body.
 
-    **Returns** two things for each body with a flatness of finite deviation: the correlations (…)
-    of the functions with the flatness; and the flatness in standard deviations.
+    **Returns** two things for each body whose flatness has a finite standard deviation: the
+    correlations (…) of the functions with the flatness; and the flatness divided by its standard
+    deviation.
     """
     out = []
     for limit in limits:
@@ -338,9 +347,10 @@ def standard_deviations(
     covariance of the free numbers within the determined directions; `null_directions` (k, n) the
     directions that the data do not determine.
 
-    A deviation is infinite if the function changes along a null direction. It is NaN if the
-    variance is negative or round-off, or if the function depends on a free number whose correlation
-    with another free number is larger than one in magnitude. All intervals use these deviations.
+    A standard deviation is infinite if the function changes along a null direction. It is NaN if
+    the variance is negative or no larger than round-off. It is NaN as well if the function depends
+    on a free number whose correlation with another free number is larger than one in magnitude. All
+    intervals use these standard deviations.
     """
     if not np.isfinite(covariance).all():
         return np.full(slope.shape[:-1], np.nan)

@@ -22,20 +22,23 @@ from rigidjax.identify.uncertainty.covariance import (
 )
 from rigidjax.identify.uncertainty.quantities import names_units_and_signs
 
-# A quantity hangs on one stretch if this stretch causes more than the fraction HANGS of the
-# variance of the quantity. With fewer stretches than FEWEST this is not tested.
+# A quantity hangs on one stretch of windows if this stretch causes more than the fraction HANGS of
+# the variance of the quantity. This is not tested if there are fewer than FEWEST stretches.
 HANGS, FEWEST = 0.85, 6
 
 
 class Stretches(eqx.Module):
     """Hold the changes of a fit if one of its C stretches of windows is left out.
 
+    A stretch is a run of neighbouring windows. A shared number is a free number on which several
+    windows depend.
+
     **Fields:**
 
-    - `steps`: (C, s) the changes of the s shared numbers if each stretch is left out.
-    - `places`: (s,) the indices of the shared numbers among all n numbers.
-    - `null`: for each stretch, (k, n), the directions of the n numbers that all other stretches
-      together do not determine; if there is only one stretch, all directions.
+    - `steps`: (C, s) for each stretch the changes of the s shared numbers if it is left out.
+    - `places`: (s,) the indices of the shared numbers among all n free numbers.
+    - `null`: for each stretch the directions (k, n) of the shared numbers that all other stretches
+      and the priors together do not determine.
     """
 
     steps: Float[np.ndarray, "stretches s"]
@@ -44,19 +47,21 @@ class Stretches(eqx.Module):
 
     @property
     def directions_shown_by_one_stretch(self) -> Float[np.ndarray, "k n"]:
-        """Return the directions (k, n) of the free numbers that only one stretch of windows shows,
-        so that their scatter between stretches is not known.
+        """Return the directions (k, n) of the n free numbers that only one stretch of windows
+        determines.
+
+        The variance along them is not known, since it comes from the scatter between stretches.
         """
         return np.concatenate(self.null)
 
 
 def leave_out_each_stretch(model: Model, linear: Linearisation) -> Stretches | None:
-    """Return the changes of a fit of windows if each stretch of windows is left out; `None` for
-    other recordings.
+    """Return the changes of a fit of windows if one stretch of windows is left out, for each
+    stretch.
 
-    A stretch is a run of neighbouring windows. The result is `None`, too, if the motion is not
-    finite. The numbers that one window alone has are eliminated window by window (Schur
-    complement).
+    A stretch is a run of neighbouring windows. The result is `None` if the model is not one of
+    windows, or if the motion is not finite. The numbers on which one window alone depends are
+    eliminated window by window (Schur complement).
 
     **Arguments:** `model` the fitted model; `linear` the errors at the best point, with their
     derivatives and weights.
@@ -83,8 +88,8 @@ def leave_out_each_stretch(model: Model, linear: Linearisation) -> Stretches | N
         both = np.linalg.solve(inner, np.concatenate([sides, pull[..., None]], axis=2))
         gram = gram - sides.swapaxes(1, 2) @ both[..., :-1]
         slope = slope - np.einsum("rks,rk->rs", sides, both[..., -1])
-    # A number may have a value for each group of windows; its column then stands for another place
-    # in each group.
+    # A free number may have one value for each group of windows. The same column then stands for
+    # another number in each group.
     places, columns = np.unique(linear.places[:, shared], return_inverse=True)
     columns = columns.reshape(len(gram), shared.size)
     grams, slopes = np.zeros((count, places.size, places.size)), np.zeros((count, places.size))
@@ -110,8 +115,8 @@ def jackknife_covariance(stretches: Stretches, white: Covariance) -> Covariance:
     """Return the covariance of a fit of windows from its changes if one stretch of windows is left
     out.
 
-    The jackknife gives the covariance of the numbers that windows share. The numbers that one
-    window alone has, such as its initial state, keep their covariance for white errors.
+    The jackknife gives the covariance of the numbers that windows share. Numbers on which one
+    window alone depends, such as its initial state, keep their covariance for white errors.
 
     **Arguments:** `stretches` the changes of the shared numbers if each stretch (a run of
     neighbouring windows) is left out; `white` the covariance for white errors.
@@ -140,7 +145,8 @@ def remarks_on_dependence_on_one_stretch(
 
     **Arguments:**
 
-    - `stretches`, `model`: the changes of a fit if each stretch is left out; and its model.
+    - `stretches`: the changes of a fit if one stretch is left out, for each stretch.
+    - `model`: the fitted model.
     - `values_and_slopes`: the reported quantities and their derivatives, as
       `quantities.quantities_and_derivatives_in_numpy` returns them.
     - `white`: the covariance for white errors.
@@ -172,10 +178,10 @@ def remarks_on_dependence_on_one_stretch(
 def _quantities_change_along(
     directions: Float[np.ndarray, "k n"], slopes: Float[np.ndarray, "q n"]
 ) -> Bool[np.ndarray, " q"]:
-    """Return a mask (q,), true for each of q quantities that changes along any of the `directions`
-    (k, n).
+    """Return a mask (q,), true for each of q quantities that changes along one or more of the
+    `directions` (k, n).
 
-    The directions are directions of the n free numbers of a fit; `slopes` (q, n) holds the
+    A direction is a change of the n free numbers of a fit. The argument `slopes` (q, n) holds the
     derivatives of the quantities with respect to these numbers.
     """
     size = np.abs(slopes).max(axis=-1, initial=1e-300)
