@@ -48,7 +48,7 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
 
 
 def table(lines: list[Row]) -> str:
-    """Return `lines` as a table of text, in which each number is rounded by its interval.
+    """Return `lines` as a table of text, with each number rounded by the width of its interval.
 
     **Arguments:** `lines` one or more rows (name, value, low, high, unit), such as those that
     `rows` returns.

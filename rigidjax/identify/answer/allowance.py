@@ -1,4 +1,6 @@
-"""Describe the errors of sensors, besides random errors, that the intervals of a fit allow for."""
+"""Describe for which constant errors of sensors, such as an error of scale, the intervals of a fit
+allow.
+"""
 
 from collections.abc import Sequence
 

@@ -303,8 +303,10 @@ def _is_white(
 def _masked_entries_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return the selected entries of each row minus their mean, moved to the front of the row.
 
-    The entries of `rows` (R, T, m), in R rows of T times, are selected where `mask` (R, T) is true.
-    They keep their order, and zeros follow them, so that the result has the shape (R, T, m), too.
+    The argument `rows` (R, T, m) holds R rows of T entries, and each entry has m numbers. An entry is
+    selected where `mask` (R, T) is true. The mean is that of the selected entries of the row. The
+    selected entries keep their order, and zeros follow them, so that the result has the shape
+    (R, T, m), too.
     """
     order = np.argsort(~mask, axis=1, kind="stable")
     valid = np.take_along_axis(mask, order, axis=1)[..., None]

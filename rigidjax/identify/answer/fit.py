@@ -185,7 +185,7 @@ _ON_CPU = "computed on the CPU, which is faster than a GPU for so few readings"
 
 
 def _cpu_if_faster(model: Model) -> Any:
-    """Return the CPU if a fit of the `model` is faster there than on the default device, else
+    """Return the CPU if a fit of the `model` is faster on the CPU than on the default device, else
     `None`.
 
     The result is `None` in four cases: the arrays of the model hold so many numbers that a GPU is
@@ -233,11 +233,15 @@ def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     """Estimate the unknown noise of sensors and the best point alternately, until the noise settles
     or a largest number of rounds is reached.
 
-    If all noise is known, the arguments are returned.
+    If all noise is known, the arguments are returned unchanged.
 
-    **Arguments:** `best` the best point for the present noise; `task` the model and the noise of
-    its sensors, with the tolerance and the largest number of steps of a search. **Returns** two
-    things: the new best point; and the task with the new noise.
+    **Arguments:**
+
+    - `best`: the best point for the noise in `task`.
+    - `task`: the model and the noise of its sensors, with the tolerance and the largest number of
+      steps of a search.
+
+    **Returns** two things: the new best point; and the task with the new noise.
     """
     if all(reading.has_known_noise for reading in task.model.records.readings):
         return best, task
@@ -367,15 +371,16 @@ def _errors_without_derivatives(
     """Return the errors of all sensors at the free numbers x (n,) of a `model`, without
     derivatives.
 
-    There is one array (R, T, k) for each sensor, for R recordings, T times and k components. A
-    program without derivatives takes less time to compile.
+    There is one array (R, T, k) for each sensor, for R recordings, T times and k components of an
+    error. A program without derivatives takes less time to compile.
     """
     return all_errors(model, x)
 
 
 def _with_integrator(model: Model, integrator: AbstractIntegrator | None) -> Model:
-    """Return the model with this `integrator` in place of its own, or the unchanged model for
-    `None`.
+    """Return the `model` with the `integrator` in place of its own integrator.
+
+    If `integrator` is `None`, the model is returned unchanged.
     """
     if integrator is None:
         return model
@@ -431,11 +436,15 @@ def _estimate_spreads_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]
     alternately, until the spreads settle or a largest number of rounds is reached.
 
     The spread of a `Free` is the standard deviation, between recordings, of its value about the
-    value that the recordings share. If no spread is unknown, the arguments are returned.
+    value that the recordings share. If no spread is unknown, the arguments are returned unchanged.
 
-    **Arguments:** `best` the best point for the present spreads; `task` the model with these
-    spreads and the noise of its sensors, with the tolerance and the largest number of steps of a
-    search. **Returns** two things: the new best point; and the task with the new spreads.
+    **Arguments:**
+
+    - `best`: the best point for the spreads in `task`.
+    - `task`: the model with its spreads, and the noise of its sensors, with the tolerance and the
+      largest number of steps of a search.
+
+    **Returns** two things: the new best point; and the task with the new spreads.
     """
     indices = [index for index, slot in enumerate(task.model.slots) if slot.estimated]
     if not indices:

@@ -172,8 +172,8 @@ class Fit(eqx.Module):
         return f"{report.table(report.rows(self))}\n\n{report.verdict(self)}"
 
     def _repr_html_(self) -> str:
-        """Return the fit as HTML, with its status, its quantities and its verdict, as a notebook
-        shows it.
+        """Return HTML with the status, the quantities and the verdict of the fit, which a notebook
+        shows.
         """
         from rigidjax.identify import report
 
@@ -216,10 +216,11 @@ class Fit(eqx.Module):
 
     @property
     def jitter(self) -> tuple[Float[Array, "*records"] | None, ...]:
-        """Return the standard deviation of the time stamps of each sensor, s, given or estimated.
+        """Return the standard deviation, in seconds, of the time stamps of each sensor, given or
+        estimated.
 
-        The entry of a sensor is `None` if it has no jitter; for R > 1 recordings it has the shape
-        (R,).
+        The entry of a sensor without jitter (random errors of its time stamps) is `None`. For R > 1
+        recordings an entry has the shape (R,).
         """
         index = 0 if self.model.count == 1 else slice(None)
         jitters = (getattr(sensor, "jitter", None) for sensor in self.model.records.sensors)
@@ -270,9 +271,9 @@ class Fit(eqx.Module):
     def interval(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Return the intervals of all reported quantities, as a dict of name → (low, high).
 
-        The interval of a positive quantity is symmetric in its logarithm. **Arguments:** `level` is
-        the probability that an interval holds the true value. **Raises** `ValueError` for a level
-        outside (0, 1).
+        The interval of a positive quantity is computed for its logarithm, and then transformed
+        back. **Arguments:** `level` is the probability that an interval holds the true value.
+        **Raises** `ValueError` for a level outside (0, 1).
         """
         return {quantity.name: quantity.interval(level) for quantity in self.quantities}
 

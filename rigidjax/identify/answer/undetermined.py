@@ -1,4 +1,4 @@
-"""Describe in words the numbers that a fit determines and the numbers that it does not."""
+"""Describe in words which numbers a fit determines, and which numbers it leaves undetermined."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -80,7 +80,9 @@ class Combination(eqx.Module):
 
     @property
     def in_words(self) -> str:
-        """Describe the combination, which the data do not determine, in one or two sentences."""
+        """Say in one or two sentences which numbers may change without changing a reading, and
+        how they change together.
+        """
         names, sizes = self.names, np.array(self.changes)
         if self.unseen_switch:
             return (

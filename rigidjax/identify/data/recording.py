@@ -191,8 +191,10 @@ class Recording(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return how many numbers all sensors read together: for each sensor the number of unmasked
-        readings times the number of components of its error.
+        """Return how many numbers all sensors read together.
+
+        One sensor reads the number of its unmasked readings times the number of components of its
+        error.
         """
         return sum(count_numbers_read(reading) for reading in self.readings)
 
@@ -232,7 +234,8 @@ def inputs_as_functions(recording: Recording) -> dict[str, Callable[[Any], Any]]
     """Return the inputs (logged quantities such as a motor command) of a `recording` as a dict of
     name → function of time.
 
-    Samples of an input are held constant over each step and need evenly spaced times.
+    A sample of an input is held constant until the next sample. If an input is an array of samples,
+    the times of the recording must be evenly spaced.
     """
     t, out = recording.t, {}
     for name, source in recording.inputs.items():
@@ -258,8 +261,8 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
 
     - `t`: (T,) the times of the recording, s.
     - `inputs`: a mapping of name → input. An input that is a function of time is returned
-      unchanged; samples (T, *k), an array of shape k for each time, become an array. An error is
-      raised for anything else.
+      unchanged. An input may also be samples (T, *k), one array of shape k for each time; they are
+      returned as a JAX array. An error is raised for anything else.
     """
     _checks.require_instance(
         inputs, Mapping, "inputs", requirement="samples or functions of time by name"

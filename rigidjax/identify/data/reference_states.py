@@ -86,10 +86,11 @@ def _attitudes_by_wahba(sums: ArrayLike) -> Array:
     """Return the attitudes (n, 4), quaternions body → world, that best (in the least-squares sense)
     turn directions in the body into directions in the world.
 
-    `sums` (n, 3, 3) holds the sum Σ w bᵀ over pairs of a direction w in the world and the same
-    direction b in the body, at each of n times. This is `so3.wahba` without its check: a `Model`
-    calls this function within `jax.ensure_compile_time_eval`, where `equinox.error_if` in a
-    compiled function always raises.
+    The argument `sums` (n, 3, 3) holds for each of n times the sum Σ w bᵀ over several directions,
+    where w is a direction in the world, and b is the same direction in the body. The function is
+    `so3.wahba` without the check of `so3.wahba`: a `Model` calls this function within
+    `jax.ensure_compile_time_eval`, where `equinox.error_if` in a compiled function always raises an
+    error.
     """
     return jax.vmap(lambda one: quaternion.from_matrix(nearest_rotation(one)))(sums)
 

@@ -35,9 +35,9 @@ class Horizons(NamedTuple):
     **Fields:**
 
     - `steps`: (L,) the horizons 1 to L.
-    - `mean_absolute`: for each kind, (L,) the mean absolute value of a component of the error.
-    - `mean_norm`: for each kind, (L,) the mean length of the error vector.
-    - `rms`: for each kind, (L,) the root of the mean squared length of the error vector.
+    - `mean_absolute`: for each kind the mean absolute value (L,) of a component of the error.
+    - `mean_norm`: for each kind the mean length (L,) of the error vector.
+    - `rms`: for each kind the square root (L,) of the mean squared length of the error vector.
 
     >>> t = np.arange(6.0)
     >>> spin = rj.Spin(np.stack([t, 0 * t, 0 * t], 1))
@@ -142,7 +142,8 @@ class Windows(eqx.Module):
         """Return the windows as recordings with a leading axis.
 
         Each recording has one sensor, which reads the whole state. The first time of a recording is
-        the start of the window, at which the reading is masked.
+        the start of the window. The reading at this time is masked, because predictions begin
+        there.
         """
         kind, scales = type(self.starts), np.asarray(self.scales)
         steps = np.arange(self.length + 1, dtype=self.wanted.omega.dtype)

@@ -77,8 +77,9 @@ class Linearisation(eqx.Module):
         return int(self.extra_slopes.shape[-1])
 
     def first_times(self, count: int) -> "Linearisation":
-        """Return the errors and derivatives at the first `count` times, without the padding of a
-        fit.
+        """Return the errors and derivatives at the first `count` times.
+
+        A fit pads recordings with masked readings at later times, which are left out in this way.
         """
         long = ("raw", "raw_slopes", "errors", "slopes", "weights", "mask")
         parts = {name: tuple(a[:, :count] for a in getattr(self, name)) for name in long}
@@ -548,11 +549,11 @@ def white_or_sandwich_covariance(
 
 
 def with_infinite_variance(null: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the `covariance` (n, n) with an infinite variance for each number that is not
-    determined.
-
-    Such a number changes along a direction of `null` (k, n), the directions that the data do not
+    """Return the `covariance` (n, n) with an infinite variance for each number that the data do not
     determine.
+
+    The rows of `null` (k, n) are the directions that the data do not determine. A number is not
+    determined if it changes along one of these directions.
     """
     shown = covariance.copy()
     blind = np.abs(null).max(axis=0, initial=0.0) > 1e-6
@@ -738,10 +739,11 @@ class CorrelationTimes(eqx.Module):
 
     **Fields:**
 
-    - `spans`: for each channel of each sensor the number of samples over which errors are
-      autocorrelated; 1 for white errors.
-    - `closeness`: the correlation of neighbouring errors in the channel of the longest span.
-    - `independent`: the number of independent errors.
+    - `spans`: for each channel of each sensor (each component of its errors) the number of samples
+      over which errors are autocorrelated; 1 for white errors.
+    - `closeness`: the correlation of neighbouring errors in the channel with the largest span; 0 if
+      the errors of all channels are white.
+    - `independent`: the number of independent errors of all channels together.
     """
 
     spans: tuple[tuple[float, ...], ...]

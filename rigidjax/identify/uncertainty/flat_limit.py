@@ -1,4 +1,7 @@
-"""Compute derivatives and intervals at the limit of real bodies: flat bodies, I1 + I2 = I3."""
+"""Compute derivatives and intervals at flat bodies, the limit of real bodies.
+
+The principal moments of a flat body are I1 + I2 = I3.
+"""
 
 from typing import Any
 
@@ -44,9 +47,10 @@ class Limit(eqx.Module):
     slope: np.ndarray
 
     def flatness_deviation(self, covariance: np.ndarray) -> float:
-        """Return the standard deviation of the flatness; NaN if its variance is negative.
+        """Return the standard deviation of the flatness, or NaN if the variance of the flatness is
+        negative.
 
-        The `covariance` (n, n) is that of the n free numbers.
+        The argument `covariance` (n, n) is the covariance of the n free numbers.
         """
         with np.errstate(invalid="ignore"):
             return float(np.sqrt(self.slope @ covariance @ self.slope))
@@ -54,7 +58,9 @@ class Limit(eqx.Module):
     def flatness_upper_bound(self, covariance: np.ndarray) -> float:
         """Return the one-sided 95 % upper bound of the flatness.
 
-        The `covariance` (n, n) is that of the n free numbers.
+        The bound is `z + √((1.645 σ)² + min(z, 0)²)`, where z is the field `free`, and σ is the
+        standard deviation of the flatness. The argument `covariance` (n, n) is the covariance of
+        the n free numbers.
         """
         wide = self.flatness_deviation(covariance)
         return self.free + float(np.hypot(ONE_SIDED * wide, min(self.free, 0.0)))
@@ -63,7 +69,7 @@ class Limit(eqx.Module):
         """Return whether a flat body lies within this number of standard `deviations` of the best
         point.
 
-        The `covariance` (n, n) is that of the n free numbers.
+        The argument `covariance` (n, n) is the covariance of the n free numbers.
         """
         return bool(self.free < deviations * self.flatness_deviation(covariance))
 
@@ -186,8 +192,8 @@ def _is_bounded_by_flat_bodies(chart: AbstractBodyChart) -> bool:
 def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
     """Return the flatness (I1 + I2 − I3) / I3 of each body of a `model` at the free numbers x (n,).
 
-    I1 ≤ I2 ≤ I3 are the principal moments of the body; a flat body has the flatness 0. The flatness
-    is set to 1 for a body whose moments are not free.
+    Here I1 ≤ I2 ≤ I3 are the principal moments of the body. A flat body has the flatness 0. For a
+    body whose moments are not free the result is 1.
     """
     out = []
     bodies = bodies_as_list(model.bodies(x))
