@@ -1,5 +1,5 @@
-"""Describe for which constant errors of sensors, such as an error of scale, the intervals of a fit
-allow.
+"""Describe the constant errors of sensors, such as an error of scale, that the intervals of a fit
+allow for.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ MOST = 3
 # readings. The bias of a real gyro is about a hundredth of the rates in a record that is worth a
 # fit.
 REMARKABLE = 0.2
-# The words for the small constant errors whose sizes are in `considered.USUAL`.
+# These words describe the small constant errors of a sensor whose sizes are in `considered.USUAL`.
 _WAYS = {
     "scale": "an error of 1 % in the scale of one axis",
     "cross_axis": "an axis that leans by 1°",

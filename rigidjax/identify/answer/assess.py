@@ -62,7 +62,8 @@ RARE = 1e-5
 LAGS = 10
 # These numbers are fractions of the variance of the readings. A model fails if the mean square of
 # its errors exceeds HALF of the variance, or if the autocorrelated part of this mean square exceeds
-# a TENTH of the variance. Errors whose mean square is at most a QUARTER of the variance are small.
+# a TENTH of the variance; but it does not fail if the errors are as small as a given noise. Errors
+# whose mean square is at most a QUARTER of the variance are small.
 HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
@@ -73,7 +74,7 @@ def goodness_of_fit(
     times: CorrelationTimes,
     covariance: np.ndarray,
 ) -> tuple[float, int, Answer, tuple[int, ...]]:
-    """Return the χ² of a fit, and the answer whether its model explains the readings.
+    """Return the χ² of a fit, and an answer that says whether its model explains the readings.
 
     The errors of a sensor count as larger than its given noise if their χ² exceeds the expected χ²
     by more than five standard deviations of χ². Under a robust loss the median of the squared
@@ -127,7 +128,8 @@ def goodness_of_fit(
             word = FAILS
         word = LEAVES if word == EXPLAINS else word
         sensors.append(index)
-        # An error has the unit of the reading only if both have the same number of components.
+        # An error has the unit of the reading only if both have the same number of components: an
+        # attitude is read as a quaternion, for example, but its error is a rotation vector.
         alike = int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
         share = left / varies if varies > tiny and alike else None
         span = None if white else times.longest_span
@@ -179,11 +181,11 @@ def _describe_errors(
 
 
 def _describe_time_of_largest_errors(model: Model, error: np.ndarray, mask: np.ndarray) -> str:
-    """Describe the shortest interval of time in which a sensor has half of its sum of squared
-    errors.
+    """Describe in words at which times the errors of a sensor are largest.
 
-    The interval is sought in the recording with the largest sum of squared errors. If the interval
-    is longer than 40 % of this recording, the words are "all along".
+    The words give the shortest interval of time that contains half of the sum of squared errors of
+    one recording: the recording in which this sum is largest. If the interval is longer than 40 %
+    of the recording, the words are "all along".
 
     **Arguments:**
 
@@ -303,9 +305,9 @@ def _is_white(
 def _masked_entries_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return the selected entries of each row minus their mean, moved to the front of the row.
 
-    The argument `rows` (R, T, m) holds R rows of T entries, and each entry has m numbers. An entry is
-    selected where `mask` (R, T) is true. The mean is that of the selected entries of the row. The
-    selected entries keep their order, and zeros follow them, so that the result has the shape
+    The argument `rows` (R, T, m) holds R rows of T entries, and each entry has m numbers. An entry
+    is selected where `mask` (R, T) is true. The mean is that of the selected entries of the row.
+    The selected entries keep their order, and zeros follow them, so that the result has the shape
     (R, T, m), too.
     """
     order = np.argsort(~mask, axis=1, kind="stable")
@@ -323,7 +325,7 @@ AT_THE_END = 0.05
 def _answer_on_search(
     best_cost: float, ended: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
 ) -> Answer:
-    """Return the answer whether the search of a fit found the best point.
+    """Return an answer that says whether the search of a fit found the best point.
 
     The word of the answer is `found`, `not alone` (another motion fits as well) or `not ended`.
 
@@ -505,8 +507,8 @@ def _describe_constant_sensor_errors(
     quantities: Sequence[Quantity],
     slopes: np.ndarray,
 ) -> str:
-    """Say for which constant errors of sensors, such as an error of scale, the intervals of a fit
-    allow.
+    """Return sentences that say which constant errors of sensors, such as an error of scale, the
+    intervals of a fit allow for.
 
     The intervals allow for the errors of a sensor that has a `Tolerance`. For a sensor without a
     tolerance, the sentences say how far a small error of its scale or of its axes would move the
@@ -518,8 +520,8 @@ def _describe_constant_sensor_errors(
     - `model`, `noise`: the fitted model, and the standard deviations of the errors of its sensors.
     - `linear`: the errors and their derivatives at the best point.
     - `covariance`: (n, n) the covariance of the free numbers, computed as if the errors were white.
-    - `considered_errors`: the constant errors, within the `Tolerance` of a sensor, for which the
-      intervals allow.
+    - `considered_errors`: the constant errors, within the `Tolerance` of a sensor, that the
+      intervals allow for.
     - `quantities`: the q reported quantities.
     - `slopes`: the derivatives (q, n) of the quantities with respect to the n free numbers. Further
       rows at the end, for the flatness of bodies, are not used.

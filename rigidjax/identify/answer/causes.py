@@ -91,7 +91,8 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None
             ratios[name] = _relative_rate_difference(recordings, changed, _SAME)
     elif depends_on_rate_only(torque):
         bound, margin = _euler_residual_and_tensor_margin(recordings, torque, _SAME)
-        # Sensor errors alone can make the best body slightly unreal, but not far from real bodies.
+        # Sensor errors alone can make the body that fits best slightly unreal, but they cannot move
+        # it far away from real bodies.
         bound *= BETTER if margin > -0.8 else EQUAL
         fits = {
             name: _euler_residual_and_tensor_margin(recordings, torque, turn)

@@ -251,8 +251,9 @@ def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
         model, noise = estimate_noise(task.model, best.x, blocks, task.noise)
         return task._replace(model=model, noise=noise)
 
-    # Repeat the estimate, because it changes three things on which it depends: the weights of the
-    # sensors, the weights of the robust loss, and the degrees of freedom that the fit uses up.
+    # Repeat the estimate of the noise, because a new noise changes three things on which the
+    # estimate depends: the weights of the sensors, the weights of the robust loss, and the degrees
+    # of freedom that the fit uses up.
     for turn in range(_ROUNDS):
         before, task = task.noise, estimate(best, task)
         pairs = zip(before, task.noise, strict=True)
@@ -312,13 +313,13 @@ def _search_from_each(
       which each new end is saved; `None` for no file.
     - `progress`: a function that is called with a line of text after each search, or `None`.
     - `interrupts`: a list, to which a line is added after an interrupt (Ctrl-C). The remaining
-      starts are then left out. If no search has reached a finite cost, the interrupt is raised
-      again.
+      starts are then left out. If no search has ended or reached a finite cost, the interrupt is
+      raised again.
     """
     like, print_of = Attempt(points[0]), ""
     if checkpoint is not None:
-        # Put the costs in the fingerprint, too: without the costs it would be the same for two
-        # different torque functions with one name.
+        # Put the costs in the fingerprint, too: without the costs the fingerprint would be the same
+        # for two different torque functions with one name.
         costs = [cost_of(task.model, point, task.noise) for point in points]
         print_of = fingerprint(points, task, costs)
     keep = Checkpoint(checkpoint, like, print_of)
@@ -332,7 +333,8 @@ def _search_from_each(
         for number, point in enumerate(points[len(keep.done) :], len(keep.done) + 1):
             latest = like
             # Once one search has explained the record, later searches only have to show whether
-            # another motion explains the record as well: they may end at the same misfit.
+            # another motion explains the record as well. A later search is therefore given up if it
+            # is not likely to reach the least misfit so far.
             ended = [float(one.cost) for one in attempts if bool(one.converged)]
             aim = min(ended, default=np.inf)
             aim = aim if aim <= sufficient_misfit(task.model) else 0.0

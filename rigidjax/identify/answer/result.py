@@ -128,8 +128,10 @@ class Fit(eqx.Module):
 
     @property
     def ok(self) -> bool:
-        """Return whether the search converged, the model explains the data, and no other motion
-        fits as well.
+        """Return whether the `status` is `ok`.
+
+        The search has then converged, the model explains the data, and no other motion fits as
+        well.
         """
         return self.status == "ok"
 

@@ -80,9 +80,7 @@ class Combination(eqx.Module):
 
     @property
     def in_words(self) -> str:
-        """Say in one or two sentences which numbers may change without changing a reading, and
-        how they change together.
-        """
+        """Describe in a sentence or two a combination of numbers that the data do not determine."""
         names, sizes = self.names, np.array(self.changes)
         if self.unseen_switch:
             return (

@@ -180,8 +180,8 @@ def _numbers_of_thicker_body(
 def _is_bounded_by_flat_bodies(chart: AbstractBodyChart) -> bool:
     """Return whether flat bodies are the limit of the bodies that a `chart` can describe.
 
-    A chart is a map from free numbers to a possible body. A flat body has the principal moments I1
-    + I2 = I3. The result is true if the chart is one of this package and changes moments of
+    A chart is a map from free numbers to a possible body. A flat body has the principal moments
+    `I1 + I2 = I3`. The result is true if the chart is one of this package and changes moments of
     inertia, not the mass alone.
     """
     return type(chart).__module__ == AbstractBodyChart.__module__ and any(

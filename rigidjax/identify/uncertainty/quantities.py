@@ -14,8 +14,8 @@ from rigidjax.identify.model.terms import jacobian_and_value
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
 
-# If one end of the interval of a positive number differs from its value by more than this factor,
-# the interval goes from 0 to infinity.
+# If one end of the interval of a positive number differs from the value of the number by more than
+# this factor, the interval goes from 0 to the largest possible value (often infinity).
 FARTHEST = 1e3
 # A correlation whose magnitude differs from one by less than this counts as ±1.
 ROUND_OFF = 1e-13
@@ -92,8 +92,8 @@ def interval_cut_at_flat_bodies(
     **Arguments:**
 
     - `half_width`: the half-width of the interval if it is not cut, in standard deviations.
-    - `cuts`: for each body two numbers: the correlation of the quantity with the flatness (I1 + I2
-      − I3) / I3 of the body; and the flatness divided by its standard deviation.
+    - `cuts`: for each body two numbers: the correlation of the quantity with the flatness of the
+      body, which is `(I1 + I2 − I3) / I3`; and the flatness divided by its standard deviation.
     """
     low: Any = -half_width
     high: Any = half_width
@@ -247,8 +247,9 @@ def reported_quantities(
     - `model`: the model.
     - `values_and_slopes`: the two arrays that `quantities_and_derivatives_in_numpy` returns: the
       values; and their derivatives.
-    - `covariance`: (n, n) the covariance of the free numbers within the determined directions.
-    - `null_directions`: (k, n) the directions of the free numbers that are not determined.
+    - `covariance`: (n, n) the covariance of the free numbers within the directions that the data
+      determine.
+    - `null_directions`: (k, n) the directions of the free numbers that the data do not determine.
     - `limits`: for each body with free moments its distance from a flat body; intervals end where
       the body would be flat.
     - `degrees_of_freedom`: the degrees of freedom of the variance of each quantity.
@@ -343,9 +344,12 @@ def standard_deviations(
 ) -> np.ndarray:
     """Return the standard deviations (…) of functions of the n free numbers of a fit.
 
-    **Arguments:** `slope` (…, n) the derivatives of the functions; `covariance` (n, n) the
-    covariance of the free numbers within the determined directions; `null_directions` (k, n) the
-    directions that the data do not determine.
+    **Arguments:**
+
+    - `slope`: (…, n) the derivatives of the functions with respect to the free numbers.
+    - `covariance`: (n, n) the covariance of the free numbers within the directions that the data
+      determine.
+    - `null_directions`: (k, n) the directions that the data do not determine.
 
     A standard deviation is infinite if the function changes along a null direction. It is NaN if
     the variance is negative or no larger than round-off. It is NaN as well if the function depends

@@ -35,7 +35,7 @@ class Stretches(eqx.Module):
 
     **Fields:**
 
-    - `steps`: (C, s) for each stretch the changes of the s shared numbers if it is left out.
+    - `steps`: (C, s) the changes of the s shared numbers, in row c if stretch c is left out.
     - `places`: (s,) the indices of the shared numbers among all n free numbers.
     - `null`: for each stretch the directions (k, n) of the shared numbers that all other stretches
       and the priors together do not determine.
@@ -56,8 +56,7 @@ class Stretches(eqx.Module):
 
 
 def leave_out_each_stretch(model: Model, linear: Linearisation) -> Stretches | None:
-    """Return the changes of a fit of windows if one stretch of windows is left out, for each
-    stretch.
+    """Return, for each stretch of windows, the changes of a fit if this stretch is left out.
 
     A stretch is a run of neighbouring windows. The result is `None` if the model is not one of
     windows, or if the motion is not finite. The numbers on which one window alone depends are
@@ -112,14 +111,14 @@ def leave_out_each_stretch(model: Model, linear: Linearisation) -> Stretches | N
 
 
 def jackknife_covariance(stretches: Stretches, white: Covariance) -> Covariance:
-    """Return the covariance of a fit of windows from its changes if one stretch of windows is left
-    out.
+    """Return the covariance of a fit of windows, computed from the changes of the fit if one
+    stretch of windows is left out.
 
     The jackknife gives the covariance of the numbers that windows share. Numbers on which one
     window alone depends, such as its initial state, keep their covariance for white errors.
 
-    **Arguments:** `stretches` the changes of the shared numbers if each stretch (a run of
-    neighbouring windows) is left out; `white` the covariance for white errors.
+    **Arguments:** `stretches` for each stretch (a run of neighbouring windows) the changes of the
+    shared numbers if this stretch is left out; `white` the covariance for white errors.
     """
     count, places = len(stretches.steps), stretches.places
     covariance = np.array(white.determined)
@@ -145,7 +144,7 @@ def remarks_on_dependence_on_one_stretch(
 
     **Arguments:**
 
-    - `stretches`: the changes of a fit if one stretch is left out, for each stretch.
+    - `stretches`: for each stretch the changes of a fit if this stretch is left out.
     - `model`: the fitted model.
     - `values_and_slopes`: the reported quantities and their derivatives, as
       `quantities.quantities_and_derivatives_in_numpy` returns them.
