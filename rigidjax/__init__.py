@@ -1,11 +1,11 @@
 """Compute rigid-body and rotating-frame mechanics that JAX can differentiate.
 
-From the ground up: `quaternion`, `so3`, `euler` and `body`, `motion` and `torques`, `frames`,
-`exact` and `solve` (the motion in closed form, or by a solver), and the packages that use them:
-`identify`, `batch`, `workprecision`, `plot`. `elliptic`, `lagrangian`, `orbits` and `tumblers` are
-loaded when they are first used. Most programs begin with `simulate`.
+The modules are, from the ground up: `quaternion`, `so3`, `euler` and `body`; `motion` and
+`torques`; `frames`; `exact` and `solve` (the motion in closed form, or by a solver); and
+`identify`, `batch`, `workprecision` and `plot`, which use the others. `elliptic`, `lagrangian`,
+`orbits` and `tumblers` are loaded when they are first used. Most programs begin with `simulate`.
 
-Every function raises `TypeError` for an argument of another type (also half precision) and
+Every function raises `TypeError` for an argument of a wrong type (also for half precision) and
 `ValueError` for a wrong shape; docstrings list the other errors. Under `jit` the errors are errors
 of `equinox`. A container of many states or bodies has equal leading axes in all of its parts;
 functions and methods take one state or body. The examples assume `import rigidjax as rj` and

@@ -27,13 +27,13 @@ _UNITS = {
     "t": "s", "ts": "s", "dt": "s", "delay": "s", "mass": "kg", "com": "m", "gravity": "m/s²",
     "i1": "kg m²", "i2": "kg m²", "i3": "kg m²", "inertia tensor": "kg m²", "torque": "N m",
 }  # fmt: skip
-# The powers of SI units in each unit, without angles.
+# Each unit as powers of SI base units; the radian counts as 1.
 _DIMENSIONS: dict[str, dict[str, int]] = {
     "rad": {}, "rad/s": {"s": -1}, "s": {"s": 1}, "kg": {"kg": 1}, "m": {"m": 1},
     "m/s": {"m": 1, "s": -1}, "m/s²": {"m": 1, "s": -2}, "kg m²": {"kg": 1, "m": 2},
     "N m": {"kg": 1, "m": 2, "s": -2},
 }  # fmt: skip
-# The SI units of the dimensions of pint.
+# The SI base unit of each dimension, by the name that the package pint has for the dimension.
 _PINT = {"[length]": "m", "[mass]": "kg", "[time]": "s"}
 
 
@@ -50,11 +50,12 @@ def array_of_shape(
 
     Integers become the default float type. With `batched`, `value` may have leading axes before
     `shape`. `name` is the argument's name in messages, and `hint` a likely cause of a wrong shape.
-    A quantity with a unit must have the dimension of `unit`; if `unit` is empty, it must have the
-    dimension of the unit that `_UNITS` lists for `name`, if any.
+    A quantity with a unit must have the dimension of `unit`. If `unit` is empty, the table `_UNITS`
+    may contain a unit for `name`; without an entry there, any dimension is accepted.
 
     **Raises:** `TypeError` for anything but an array of real numbers, for half precision (its 3
-    digits cannot hold a rotation), and for another unit; `ValueError` for a wrong shape.
+    digits cannot hold a rotation), and for a unit of another dimension; `ValueError` for a wrong
+    shape.
     """
     array = numeric_array(value, name, unit)
     got_shape = array.shape[array.ndim - len(shape) :] if batched else array.shape
@@ -68,9 +69,10 @@ def array_of_shape(
 
 
 def array_of_rows(value: object, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
-    """Return `value` as an array (n, *shape) of any number n of rows, each of the given `shape`,
-    converted as by `array_of_shape`. **Raises:** the same errors; the texts `name` (of the
-    argument) and `hint` (a likely cause) are for messages.
+    """Return `value` as a float32 or float64 array (n, *shape) of any number n of rows, each of the
+    given `shape`. **Raises:** `TypeError` for anything but real numbers, and for half precision;
+    `ValueError` for another shape. The texts `name` (of the argument) and `hint` (a likely cause)
+    are for messages.
     """
     array = numeric_array(value, name)
     if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
@@ -98,8 +100,15 @@ def type_name(value: object) -> str:
 
 
 def numeric_array(value: object, name: str, unit: str = "") -> Array:
-    """Return `value` as a float32 or float64 array of any shape, converted as by `array_of_shape`;
-    `name` and `unit` are the arguments of `array_of_shape`.
+    """Return `value` as a float32 or float64 array of any shape. **Raises:** `TypeError` for
+    anything but real numbers, for half precision, and for a unit of another dimension than that of
+    `unit`.
+
+    Integers become the default float type. A quantity with a unit is converted to SI units.
+
+    - `name`: the name of the argument, for messages
+    - `unit`: an SI unit, whose dimension a quantity must have; if it is empty, the table `_UNITS`
+      may contain a unit for `name`; without an entry there, any dimension is accepted
     """
     value = _convert_to_si(value, name, unit)
     try:
@@ -262,8 +271,8 @@ def error_if(value: PyTree, bad: Bool[ArrayLike, "..."], message: str) -> Any:
     true.
 
     If `bad` is known, the error is a `ValueError` with `message` alone. If JAX traces `bad`,
-    `equinox.error_if` raises the error when the program runs; the result must be used, or the check
-    is dropped.
+    `equinox.error_if` raises the error when the program runs; the caller must use the returned
+    value, or XLA drops the check.
     """
     if is_known(bad):
         if bool(np.any(np.asarray(bad))):
@@ -356,26 +365,30 @@ def require_finite(value: Numbers, name: str) -> Numbers:
 
 
 def finite_array(value: object, shape: tuple[int, ...], name: str, **options: Any) -> Array:
-    """Return `value` as an array of the given `shape`, as `array_of_shape` does. **Raises:** also
-    `ValueError` for a NaN or an infinity, unless JAX traces the array.
+    """Return `value` as a float32 or float64 array of the given `shape`. **Raises:** `TypeError`
+    for anything but real numbers; `ValueError` for another shape, and, unless JAX traces the array,
+    for a NaN or an infinity.
 
-    - `options`: further arguments of `array_of_shape`
+    - `name`: the name of the argument, for messages
+    - `options`: further arguments of `array_of_shape`, such as `hint` and `unit`
     """
     array = array_of_shape(value, shape, name, **options)
     return require_finite(array, name) if is_known(array) else array
 
 
 def scalar_arrays_of_one_dtype(**named: object) -> list[Array]:
-    """Return a list of scalar arrays of one dtype, the widest, from numbers that are given as
-    `name=number`; the names are for messages. **Raises:** as `array_of_shape`.
+    """Return numbers, which are given as `name=number`, as a list of scalar arrays, all of the
+    widest dtype among them. **Raises:** `TypeError` or `ValueError` for an argument that is not one
+    real number; its name stands in the message.
     """
     numbers = [array_of_shape(value, (), name) for name, value in named.items()]
     return [value.astype(jnp.result_type(*numbers)) for value in numbers]
 
 
 def checked_time(value: object, name: str = "t") -> Array:
-    """Return a time, s, as a scalar array. **Raises:** as `array_of_shape`, and `ValueError` for a
-    NaN or an infinity, unless JAX traces the time; the text `name` names the time in messages.
+    """Return a time, s, as a scalar array. **Raises:** `TypeError` for anything but a real number;
+    `ValueError` for several numbers, and for a NaN or an infinity, unless JAX traces the time. The
+    text `name` names the time in messages.
     """
     return finite_array(value, (), name)
 
@@ -446,8 +459,8 @@ def require_unbatched_instance(
     hint: str = "",
 ) -> Any:
     """Return `value` if it is an instance of a class in `kinds`, and one body or one state, not a
-    batch. **Raises:** `TypeError` for another class, `ValueError` for a batch. The texts are those
-    of `require_instance`.
+    batch. **Raises:** `TypeError` for another class, `ValueError` for a batch. The texts `name` (of
+    the argument), `requirement` (what was wanted) and `hint` (a likely cause) are for messages.
 
     A batch of bodies has the class of one body; without this check its shape would raise an error
     in the middle of the arithmetic.
@@ -515,9 +528,10 @@ def python_float(value: object, name: str) -> float:
 
 
 def positive_float(value: object, name: str, requirement: str = "a positive number") -> float:
-    """Return `value` as a Python float that is positive and finite. **Raises:** `ValueError` for
-    any other float, and as `python_float`; the texts `name` (of the argument) and `requirement`
-    (what was wanted) are for messages.
+    """Return `value` as a Python float that is positive and finite. **Raises:** `TypeError` for a
+    number that JAX traces, and for what is no number; `ValueError` for several numbers, and for any
+    other float. The texts `name` (of the argument) and `requirement` (what was wanted) are for
+    messages.
     """
     number = python_float(value, name)
     if not 0 < number < np.inf:
@@ -526,8 +540,9 @@ def positive_float(value: object, name: str, requirement: str = "a positive numb
 
 
 def fraction(value: object, name: str, requirement: str = "a number between 0 and 1") -> float:
-    """Return `value` as a Python float above 0 and below 1. **Raises:** as `positive_float`, and
-    `ValueError` for 1 and more.
+    """Return `value` as a Python float above 0 and below 1. **Raises:** `TypeError` for a number
+    that JAX traces, and for what is no number; `ValueError` for several numbers, and for any other
+    float. The texts `name` (of the argument) and `requirement` (what was wanted) are for messages.
     """
     number = positive_float(value, name, requirement)
     if not number < 1:
@@ -536,16 +551,17 @@ def fraction(value: object, name: str, requirement: str = "a number between 0 an
 
 
 def nonnegative_float(value: object, name: str) -> float:
-    """Return `value` as a finite Python float ≥ 0. **Raises:** `ValueError` for any other float,
-    and as `python_float`.
+    """Return `value` as a finite Python float ≥ 0. **Raises:** `TypeError` for a number that JAX
+    traces, and for what is no number; `ValueError` for several numbers, and for any other float.
+    The text `name` names the argument in messages.
     """
     number = python_float(value, name)
     return 0.0 if number == 0 else positive_float(number, name, "a number ≥ 0")
 
 
 def host_array(value: object, name: str) -> np.ndarray:
-    """Return numbers as a NumPy array of floats. **Raises:** `TypeError` for numbers that JAX
-    traces, and for what are no numbers; the text `name` names the argument in the message.
+    """Return the numbers `value` as a NumPy array of floats. **Raises:** `TypeError` for numbers
+    that JAX traces, and for what are no numbers; the text `name` names the argument in the message.
     """
     if isinstance(value, Tracer):
         raise TypeError(
@@ -574,15 +590,15 @@ def file_path(value: Any, name: str = "path") -> Path:
 
 
 def escape_controls(text: object) -> str:
-    """Return the text in which control characters, such as an end of line, are replaced by what
-    Python writes for them, such as a backslash and n.
+    """Return `text` with its control characters, such as an end of line, replaced by what Python
+    writes for them, such as a backslash and n.
     """
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
 
 
 def escape_formulas(text: object) -> str:
-    """Return the text in a form that matplotlib shows unchanged: no formula between `$`, and no `_`
-    at the beginning, which would hide a label.
+    """Return `text` in a form that matplotlib shows unchanged. A `$` no longer begins a formula,
+    and an initial `_`, with which matplotlib would hide a label, gets a space before it.
     """
     text = str(text).replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
@@ -653,8 +669,8 @@ def float_type(value: Any, name: str = "dtype") -> np.dtype:
 
 
 def advice_for_large_times(dtype: DTypeLike) -> str:
-    """Return the end of a message for times that are so large that a step is lost when it is added
-    to a time of this `dtype`: an advice what to do.
+    """Return advice, as the end of a message, for times that are too large for their `dtype`: a
+    step that is added to such a time is lost to rounding.
     """
     if np.dtype(dtype) == np.float64:
         return "count time from a later origin, such as the first time of the run"

@@ -14,7 +14,8 @@ _NOT_MODELLED = ("joint", "contact", "hinge", "constraint", "collide", "render",
 
 def define_dir_and_getattr(module_name: str) -> None:
     """Define `__dir__` and `__getattr__` of a module: `dir` then lists the names in its `__all__`,
-    and a name that the module lacks calls `raise_attribute_error`.
+    and a look-up of a name that the module lacks raises `AttributeError` with the nearest public
+    names.
 
     - `module_name`: the full name of the module, which its code gives as `__name__`
     """
@@ -35,12 +36,13 @@ def raise_attribute_error(module_name: str, name: str) -> NoReturn:
             "; contact, joints, trees of bodies, flexibility and rendering are not modelled: take "
             "MuJoCo MJX, Brax or Drake"
         )
-    # No near name is searched for a hidden name, for which tools ask, nor for a module that is not
-    # loaded yet, for which the import system asks.
+    # No near name is searched for in two cases: for a name that begins with an underscore, since
+    # tools ask for such names; and for a module that is not loaded yet, since the import system
+    # asks for it.
     elif name[0] != "_" and not (hasattr(here, "__path__") and find_spec(f"{module_name}.{name}")):
         paths = _public_paths_by_name()
-        # `fit` and `Fit` are two names: the name as it was written is looked up before the name in
-        # small letters.
+        # `fit` and `Fit` are two names: the name is looked up first as it was written, and then in
+        # lower case.
         same = next((one for one in (name, name.lower()) if one in paths), None)
         near = [same] if same else difflib.get_close_matches(name.lower(), paths, n=4, cutoff=0.75)
         nearest = list(dict.fromkeys(paths[one] for one in near))[:2]

@@ -12,7 +12,7 @@ from rigidjax import _checks
 
 # An array with more numbers than this is printed as its shape.
 MOST = 16
-# How many of each unit are one rad/s, for the units in which reports show angular rates.
+# For each unit in which reports show angular rates: the factor that converts rad/s to this unit.
 _RATE_UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
 
 
@@ -38,14 +38,16 @@ def as_text(value: object) -> str:
 
 
 def time_as_text(t: Any, duration: Any, digits: int = 6) -> str:
-    """Return the time `t` as text, with so many digits that the difference of two times of a record
-    is known to `digits` digits of its `duration`.
+    """Return the time `t` of a record as text, rounded by less than 10^(1 − `digits`) times the
+    `duration` of the record.
 
     A time that is large beside the duration, such as seconds since 1970, is written with more
     digits.
 
     - `t`: one number, s
     - `duration`: one number, s, the time from the first to the last reading of the record
+    - `digits`: how many significant digits are written for a time that is not longer than the
+      duration
     """
     t, duration = float(t), float(duration)
     more = np.log10(abs(t) / duration) if duration > 0 and 0 < abs(t) < np.inf else 0.0

@@ -1,7 +1,8 @@
 """Define names for the arrays that all parts of the library exchange.
 
-Functions return `Vec3`, `Mat3`, `Quat`, `Scalar`: JAX arrays. They take the `…Like` forms: anything
-NumPy-like of the same shape. A function takes one body at a time; batch with `jax.vmap`.
+Functions return the JAX arrays `Vec3`, `Mat3`, `Quat` and `Scalar`. Their arguments may have the
+`…Like` forms: anything of the same shape that JAX takes for an array, such as a NumPy array. A
+function takes one body at a time; batch with `jax.vmap`.
 """
 
 import sys
@@ -33,8 +34,8 @@ Mat3Like = Float[ArrayLike, "3 3"]
 QuatLike = Float[ArrayLike, "4"] | Rotation
 
 if not typing.TYPE_CHECKING and sys.version_info >= (3, 12):
-    # So that `help` and editors show the name in place of a union. (beartype does not read such a
-    # type on Python 3.11.)
+    # The names are given so that `help` and editors show a name in place of a long union of types.
+    # (beartype does not read such a type on Python 3.11.)
     ScalarLike = typing.TypeAliasType("ScalarLike", ScalarLike)
     Vec3Like = typing.TypeAliasType("Vec3Like", Vec3Like)
     Mat3Like = typing.TypeAliasType("Mat3Like", Mat3Like)
@@ -78,8 +79,8 @@ class HasAttitude(HasSpin, Protocol):
 
 @runtime_checkable
 class HasPose(HasAttitude, Protocol):
-    """Describe a state with a rate, an attitude, and `x`, `v` of the centre of mass (m, m/s, world
-    frame).
+    """Describe a state with a body rate, an attitude, and the position `x` (in metres) and velocity
+    `v` (in m/s) of the centre of mass, world frame.
 
     >>> isinstance(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), HasPose)  # it has no position
     False

@@ -18,10 +18,11 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     `D = Tr(J₀⁻¹ J) − log det(J₀⁻¹ J) − 4`, where J is the 4×4 pseudo-inertia of `body`, and J₀ that
     of `reference`: `J = [[𝔖 + m c cᵀ, m c], [m cᵀ, m]]`, with the mass m, the centre of mass c and
     the second moment 𝔖 about it. The divergence is zero only if the bodies are equal, convex in J,
-    and infinite at plates and rods. It does not change if both bodies are expressed in another
-    frame or in other units. It is twice the Kullback–Leibler divergence of the masses as Gaussians.
-    Its error is the round-off of the trace. Add `weight * divergence(body, guess)` to a loss:
-    quantities that the data do not determine then stay near the guess.
+    and infinite for a `body` that is a plate or a rod. It does not change if both bodies are
+    expressed in another frame or in other units. It is twice the Kullback–Leibler divergence of two
+    Gaussian distributions in four dimensions, with mean zero and the covariances J and J₀. Its
+    error is the round-off of Tr(J₀⁻¹ J). Add `weight * divergence(body, guess)` to a loss:
+    quantities that the data do not determine then stay near those of `guess`.
 
     **Arguments:** `body`; `reference`, a body with a positive definite 𝔖, in the frame and units of
     `body`. Source: Lee, Wensing and Park 2020, "Geometric robot dynamic identification: a convex

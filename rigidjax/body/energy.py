@@ -55,8 +55,9 @@ def kinetic_energy_about(
 ) -> Scalar:
     """Return the kinetic energy from the velocity of a point other than the centre of mass, J.
 
-    `T = ½ m |V|² + m V·R(Ω × c) + ½ Ω·I_o Ω`. The notes (eqs 54–57) have no cross term: their
-    origin is the centre of mass.
+    `T = ½ m |V|² + m V·R(Ω × c) + ½ Ω·I_o Ω`, with the mass m, the rotation matrix R of `q`, the
+    centre of mass c as seen from the point, and the inertia tensor I_o about the point. The notes
+    (eqs 54–57) have no cross term: their origin is the centre of mass.
 
     **Arguments:** `body`; the point is its origin, the zero of `com`. `q` (4,) (w, x, y, z), body →
     world; `velocity` (3,) V of that point, m/s, world frame; `omega` (3,) Ω, rad/s, body frame.
@@ -78,11 +79,12 @@ def kinetic_energy_about(
 
 
 def kinetic_energy_of_matrix_rate(second_moment: Matrix, matrix_rate: Matrix) -> Scalar:
-    """Return the kinetic energy of rotation, J, from the rate of the rotation matrix M: `½ Tr(Ṁ 𝔖
-    Ṁᵀ) = ½ Tr(J'ᵀ J' 𝔖)` (notes, eqs 63, 65 with the factor ½).
+    """Return the kinetic energy of rotation, in joules, from the rate Ṁ of the rotation matrix M
+    and the second moment 𝔖: `½ Tr(Ṁ 𝔖 Ṁᵀ) = ½ Tr(J'ᵀ J' 𝔖)` with `J' = Mᵀ Ṁ` (notes, eqs 63, 65
+    with the factor ½).
 
-    **Arguments:** `second_moment` (3, 3) 𝔖, kg m², body frame; `matrix_rate` (3, 3), 1/s: either
-    Ṁ = dM/dt, where M is body → world, or the matrix `J' = Mᵀ Ṁ = hat(Ω)` of the cross product with
+    **Arguments:** `second_moment` (3, 3) 𝔖, kg m², body frame; `matrix_rate` (3, 3), 1/s: either Ṁ
+    = dM/dt, where M is body → world, or J', which is the matrix hat(Ω) of the cross product with
     the body rate Ω; both give the same energy.
 
     >>> kinetic_energy_of_matrix_rate(jnp.eye(3), jnp.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]))
@@ -108,8 +110,8 @@ def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) ->
 
 
 def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude) -> Vec3:
-    """Return the angular momentum in the world frame, `R Π`, (3,), kg m²/s: constant for a free
-    body.
+    """Return the angular momentum in the world frame, (3,), kg m²/s, which is constant for a free
+    body: `R Π`, with the momentum Π in the body frame and the rotation matrix R of the attitude.
 
     **Arguments:** as `angular_momentum`; `state` has `.q` (4,), body → world, and `.omega`. For
     `MassProperties` and a state with `.x` and `.v`, the orbital part `m x × v` about the world's
@@ -136,19 +138,20 @@ def ellipsoid(
     """Return the ellipsoid of all rates Ω with one energy or momentum, or the solid ellipsoid with
     the inertia of the body.
 
-    **Arguments:** `body`; `kind` and `size`:
+    **Arguments:** `body`, with the inertia tensor I and the principal moments I_k; `kind` and
+    `size`:
 
     - `"energy"`: `½ Ω·IΩ = T`, semi-axes `√(2T/I_k)` rad/s; `size` T ≥ 0, J;
     - `"momentum"`: `|IΩ| = h`, semi-axes `h/I_k` rad/s; `size` h ≥ 0, kg m²/s;
-    - `"mass"`: the uniform solid ellipsoid with the mass, centre and 𝔖 of the body, semi-axes `√(5
-      λ_k/m)`, m, of `MassProperties`, without a `size`. This ellipsoid moves exactly as the body
-      does.
+    - `"mass"`: the uniform solid ellipsoid with the mass, centre and 𝔖 of the body, of
+      `MassProperties`, without a `size`; semi-axes `√(5 λ_k/m)`, in metres, with the eigenvalues
+      λ_k of 𝔖 and the mass m. This ellipsoid moves exactly as the body does.
 
-    **Returns** `(semi_axes, q)`: (3,) in the order of ascending moments (`"mass"`: ascending), and
-    (4,) the rotation principal axes → body axes. In free motion Ω stays on the intersection of the
-    ellipsoids of energy and momentum (Poinsot; Landau and Lifshitz, Mechanics, § 37). **Raises:**
-    `ValueError` for a zero moment or a negative number; `TypeError` for a `size` that is missing or
-    not wanted.
+    **Returns** `(semi_axes, q)`: the semi-axes (3,), in the order of ascending moments I_k (for
+    `"mass"`: in ascending order), and the rotation (4,) principal axes → body axes. In free motion
+    Ω stays on the intersection of the ellipsoids of energy and momentum (Poinsot; Landau and
+    Lifshitz, Mechanics, § 37). **Raises:** `ValueError` for a moment I_k that is zero, and for a
+    negative `size`; `TypeError` for a `size` that is missing or not wanted.
 
     >>> ellipsoid(Inertia.from_principal(1.0, 2.0, 2.0), "energy", 4.0)[0]
     Array([2.82842712, 2.        , 2.        ], dtype=float64)

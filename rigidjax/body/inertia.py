@@ -1,8 +1,9 @@
 """Hold the inertia of a body, and its mass, centre of mass and second moment.
 
-The second moment `𝔖 = ∫ r rᵀ dm` (notes, eq 60) and the inertia tensor `I = Tr(𝔖) 1 − 𝔖`
-(eqs 76–78) have the same information. A matrix is the 𝔖 of a real body exactly if it is positive
-semi-definite; for the moments of I this is the triangle inequality.
+The second moment `𝔖 = ∫ r rᵀ dm` (notes, eq 60) and the inertia tensor `I = Tr(𝔖) 1 − 𝔖` (eqs
+76–78) have the same information. A matrix is the 𝔖 of a real body exactly if it is positive
+semi-definite; for the principal moments of I this condition is the triangle inequality I1 + I2 ≥
+I3.
 """
 
 from typing import TypeVar
@@ -42,9 +43,9 @@ class Inertia(eqx.Module):
 
     **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor checks shape and dtype only;
     `from_tensor`, `from_principal`, `from_second_moment`, and every function that takes a body,
-    check that some mass has this inertia. `scale` "arbitrary" if only the ratios of the components
-    are known, as after a fit of free motion: `simulate` then warns of torques, and `shift` raises
-    `ValueError`.
+    check that some mass has this inertia. `scale` is `None`, or "arbitrary" if only the ratios of
+    the components are known, as after a fit of free motion: `simulate` then warns if a torque acts,
+    and `shift` raises `ValueError`.
 
     The object stores I, not 𝔖: `from_tensor` changes no digit, and the small moment of a rod keeps
     all its digits. Source: notes, eqs 76–78.
@@ -73,8 +74,9 @@ class Inertia(eqx.Module):
 
         **Arguments:** `tensor` (3, 3), kg m², body frame, about the point that the body turns
         about. Plates, rods and points (zero second moments) are bodies. **Raises:** `ValueError`
-        (`equinox` error under `jit`) if the tensor is not symmetric to a few units of round-off,
-        has a negative moment, or breaks `I1 + I2 ≥ I3`.
+        (`equinox` error under `jit`) if the tensor is not symmetric to a few units of round-off, or
+        if its principal moments I1 ≤ I2 ≤ I3 are negative or break the triangle inequality `I1 + I2
+        ≥ I3`.
 
         >>> Inertia.from_tensor([[2.0, 0.1, 0], [0.1, 2, 0], [0, 0, 3]]).tensor.shape
         (3, 3)
@@ -169,11 +171,15 @@ class Inertia(eqx.Module):
         return validation.require_physical_body(self, self.tensor, None, throw=True)
 
     def __add__(self, other: "Inertia") -> "Inertia":
-        """Return the inertia of two bodies that turn as one about one point, in common axes."""
+        """Return the inertia of two bodies that are joined into one; both inertias are about the
+        same point, in the same axes.
+        """
         return Inertia(self.tensor + other.tensor)
 
     def __sub__(self, other: "Inertia") -> "Inertia":
-        """Return the inertia of the body without a part, about one point, in common axes."""
+        """Return the inertia of the body after the part `other` is taken away; both inertias are
+        about the same point, in the same axes.
+        """
         return Inertia(self.tensor - other.tensor)
 
 
@@ -239,10 +245,11 @@ class MassProperties(eqx.Module):
         return validation.require_physical_body(self, self.inertia.tensor, self.mass, throw=True)
 
     def second_moment_about(self, point: Vector) -> Mat3:
-        """Return 𝔖 about another point, (3, 3), kg m², body axes: `𝔖 + m d dᵀ`, `d = c − point`.
+        """Return the second moment about another point, (3, 3), kg m², body axes: `𝔖 + m d dᵀ`,
+        with the second moment 𝔖 about the centre of mass c, the mass m, and `d = c − point`.
 
-        **Arguments:** `point` (3,) m, body frame. Source: eq 60 of the notes with
-        `r' = (r' − c) + d`; the cross terms vanish.
+        **Arguments:** `point` (3,) m, body frame. Source: eq 60 of the notes with `r − point = (r −
+        c) + d`; the cross terms vanish.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> body.second_moment_about([0.0, 0, 0])[0, 0]
@@ -272,8 +279,8 @@ class MassProperties(eqx.Module):
         return MassProperties(self.mass, com, self.second_moment)
 
     def rotate(self, q: Quaternion) -> "MassProperties":
-        """Return the body turned about its origin by `q` (4,), unit, active: `c → R c`, `𝔖 → R 𝔖
-        Rᵀ`.
+        """Return the body turned about its origin by `q` (4,), unit, active. The centre of mass c
+        becomes `R c`, and the second moment 𝔖 becomes `R 𝔖 Rᵀ`, with the rotation matrix R of `q`.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> body.rotate([0.0, 0, 0, 1]).com
@@ -284,8 +291,9 @@ class MassProperties(eqx.Module):
         return MassProperties(self.mass, apply(m, self.com), second_moment)
 
     def __add__(self, other: "MassProperties") -> "MassProperties":
-        """Return two bodies as one, in common axes: `𝔖 = 𝔖a + 𝔖b + (ma mb / m) d dᵀ` with `d = cb −
-        ca`.
+        """Return two bodies joined into one; both are given in the same frame. The second moment is
+        `𝔖 = 𝔖a + 𝔖b + (ma mb / m) d dᵀ`, with the two masses ma and mb, their sum m, and the vector
+        `d = cb − ca` from the first centre of mass to the second.
 
         >>> part = MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> (part + part.shift([2.0, 0, 0])).second_moment[0, 0]
@@ -300,7 +308,7 @@ class MassProperties(eqx.Module):
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
     def __sub__(self, other: "MassProperties") -> "MassProperties":
-        """Return the body without a part, in common axes.
+        """Return the body after the part `other` is taken away; both are given in the same frame.
 
         **Raises:** `ValueError` if the part has more mass than the body.
 
@@ -329,8 +337,8 @@ OneBody = TypeVar("OneBody", bound=Body)
 
 def with_tensor(body: OneBody, tensor: Mat3) -> OneBody:
     """Return a copy of `body`, an `Inertia` or `MassProperties`, with another inertia tensor. The
-    tensor is not checked, since the inertia of a part of a body, such as what is left without its
-    wheels, need not be that of a real body.
+    tensor is not checked: what is left of an inertia when that of the wheels is subtracted, for
+    example, need not be the inertia of a real body.
 
     - `tensor`: (3, 3), kg m², body frame; of `MassProperties`, about the centre of mass
     """

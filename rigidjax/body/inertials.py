@@ -23,16 +23,19 @@ _KEYS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     """Return the bodies with inertia in a URDF or MuJoCo XML file, by name, each in its own frame.
 
-    URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`, `inertia`. MuJoCo: `<inertial>` with
-    `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`; an inertia that MuJoCo would compute from
-    geometry is not read, and included files are not read.
+    In both formats the element `<inertial>` is read. In URDF it contains `origin` (`xyz`, `rpy`),
+    `mass` and `inertia`. In MuJoCo's format it has the attributes `mass`, `pos`, `quat`, and
+    `diaginertia` or `fullinertia`; an inertia that MuJoCo would compute from geometry is not read,
+    and included files are not read.
 
-    **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in order.
+    **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in the order of the
+    file.
 
     It **warns** of each body that is left out: a body without mass, with an invalid number, with an
-    orientation in another form, or with an inertia that no real body has. It also warns of settings
-    by which MuJoCo changes the masses that are written in the file. **Raises** `ValueError`, with
-    file and body, where no body is left, and for a file that is missing or of another format.
+    orientation that MuJoCo's format gives in another form than `quat`, or with an inertia that no
+    real body has. It also warns of settings by which MuJoCo changes the masses that are written in
+    the file. **Raises** `ValueError` if every body is left out (the message names the file and the
+    first of the bodies), and for a file that is missing or of another format.
 
     >>> read_inertials("missing.urdf")
     Traceback (most recent call last):
@@ -76,9 +79,9 @@ _CHANGES = {
 
 
 def _mujoco_setting_warnings(root: Tree.Element) -> list[str]:
-    """Return a list of warnings: one for each setting of an XML file because of which MuJoCo would
-    not take the masses and inertias as they are written in the file; and one if the file includes
-    other files.
+    """Return the texts of warnings about an XML file: one for each setting with which MuJoCo would
+    change the masses or inertias that are written in the file; and one if the file includes other
+    files.
 
     - `root`: the root element of the file
     """
@@ -114,7 +117,8 @@ def write_inertials(
 
     **Arguments:** `path` of the new file; `bodies` name → `MassProperties`, in the frames of the
     file's links or bodies; `source` the file to copy; the rest of the file does not change.
-    **Raises:** `ValueError` as `read_inertials`, and for a name that is not in the file.
+    **Raises:** `ValueError` if the file `source` is missing, is of another format, or has two
+    bodies of one name, and for a name in `bodies` that is not in the file.
 
     >>> write_inertials("new.urdf", {}, "old.urdf")
     Traceback (most recent call last):
@@ -183,9 +187,9 @@ def _body_from_urdf(inertial: Tree.Element) -> MassProperties:
 
 def _body_from_mujoco(inertial: Tree.Element) -> MassProperties:
     """Return the body that an `<inertial>` element of a MuJoCo file describes, in the frame of the
-    file's body. **Raises:** `ValueError` for missing numbers, for a mass or moments that no real
-    body can have, and for an orientation that is not given as a quaternion (`quat`), but as Euler
-    angles or axes.
+    `<body>` element around it. **Raises:** `ValueError` for missing numbers, for a mass or moments
+    that no real body can have, and for an orientation that is not given as a quaternion (`quat`),
+    but as Euler angles or axes.
     """
     other = [key for key in ("axisangle", "xyaxes", "zaxis", "euler") if key in inertial.attrib]
     if other:
@@ -240,7 +244,8 @@ def _read_numbers(
     - `element`: the element, or `None` if it is missing
     - `key`: the name of the attribute
     - `count`: how many numbers are wanted
-    - `default`: the numbers that a missing attribute stands for, or `None`
+    - `default`: the numbers that are returned if the attribute is missing, or `None` if a missing
+      attribute is an error
     """
     text = None if element is None else element.get(key)
     if text is None:

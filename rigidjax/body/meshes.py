@@ -1,10 +1,11 @@
 """Integrate the mass properties of the solid inside a closed triangle mesh, exactly.
 
-The solid is a signed sum of tetrahedra from one inner point to each face. Over a tetrahedron with
+The solid is a sum of tetrahedra, each with its tip at one common point and a face of the mesh as
+its base; a tetrahedron on the outer side of its face counts as negative. Over a tetrahedron with
 corners 0, a, b, c the integrals of 1, r and r rᵀ are polynomials of a, b, c, so that the result is
-exact to round-off and differentiable in the vertices. The mesh is first shifted to its centroid:
-far from the origin, a sum about the origin would subtract numbers that grow as the fifth power of
-the distance.
+exact to round-off and differentiable in the vertices. The mesh is first shifted, so that the common
+point, the origin, is inside or near the mesh: for a mesh far from the origin, a sum would subtract
+numbers that grow as the fifth power of the distance.
 """
 
 import os
@@ -30,9 +31,10 @@ def mesh(
     """Return the solid of one density inside a closed triangle mesh.
 
     **Arguments:** `vertices` (n, 3) m, body frame; `faces` (m, 3) vertex numbers from 0,
-    counter-clockwise seen from outside (a hole inside is a closed mesh with the opposite order);
-    `density` kg/m³. The body is differentiable in `vertices` and `density`. Faces without area are
-    allowed. Source: integrals over a tetrahedron, e.g. Tonon 2004, J. Math. Stat. 1:8.
+    counter-clockwise seen from outside (the faces around a hole inside the solid are a closed mesh
+    with the opposite order); `density` kg/m³. The body is differentiable in `vertices` and
+    `density`. Faces without area are allowed. Source: integrals over a tetrahedron, e.g. Tonon
+    2004, J. Math. Stat. 1:8.
 
     **Raises:** `ValueError` for a mesh that is open, whose faces disagree about which side is
     outside, that is inside out, or that has a face with a repeated or missing vertex. Under `jit`

@@ -1,9 +1,10 @@
 """Convert unconstrained numbers to real bodies, and back.
 
-The second moment is the square of a symmetric matrix, 𝔖 ∝ (1 + V)² with V trace-free. Every vector
-is then a real body, and an optimiser needs no constraint. Plates and rods are ordinary points: for
-them 1 + V has a zero eigenvalue. If 1 + V has a negative eigenvalue, another vector, without a
-negative eigenvalue, describes the same body; `pack` returns this other vector.
+The second moment 𝔖 is proportional to the square of a symmetric matrix, (1 + V)², where 1 is the
+unit matrix and V has the trace zero. Every vector of numbers then describes a real body, and an
+optimiser needs no constraint. Plates and rods are no exception: for them 1 + V has a zero
+eigenvalue. If 1 + V has a negative eigenvalue, another vector, without a negative eigenvalue,
+describes the same body; `pack` returns this other vector.
 """
 
 from collections.abc import Callable
@@ -21,18 +22,19 @@ from rigidjax.body.symmetric3 import apply, from_components, product
 from rigidjax.body.validation import require_physical_moments, require_physical_second_moment
 from rigidjax.rotation.linalg3 import cross
 
-# A body is flat if its least second moment is below this fraction of their sum.
+# A body counts as flat if its least principal second moment is below this fraction of the sum of
+# its three principal second moments.
 FLAT = 1e-3
 
 
 def pack(body: MassProperties) -> Float[Array, "10"]:
     """Return ten unconstrained numbers that describe a body.
 
-    **Arguments:** `body`, also a plate or a rod. **Returns** (10,)
-    `(α, ρ, d1, d2, s12, s23, s13, t1, t2, t3)`: `mass = e^{2α}`, `com = t` (m, body frame), and
-    `𝔖 / mass` as in `pack_second_moment`, where 𝔖 is the second moment about the centre of mass,
-    and ρ the logarithm of a length (m). **Raises:** `ValueError` (`equinox` error under `jit`) for
-    a point.
+    **Arguments:** `body`, also a plate or a rod. **Returns** (10,) `(α, ρ, d1, d2, s12, s23, s13,
+    t1, t2, t3)`: `mass = e^{2α}`, `com = t` (m, body frame), and `𝔖 / mass` as in
+    `pack_second_moment`, where 𝔖 is the second moment about the centre of mass, and ρ the logarithm
+    of a length in metres. **Raises:** `ValueError` (`equinox` error under `jit`) for a point mass,
+    whose 𝔖 is zero.
 
     >>> vector = pack(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
     >>> round(float(unpack(vector).mass), 12)
@@ -48,9 +50,9 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
 def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     """Return the body that ten unconstrained numbers describe; any ten numbers describe a body.
 
-    **Arguments:** `vector` (10,) as `pack` returns it. The exponents α and α + ρ beyond the range
-    of the dtype (330 in float64, 31 in float32) are replaced by numbers that grow logarithmically:
-    a step of an optimiser that is much too long gives a large body, not an infinite one.
+    **Arguments:** `vector` (10,) as `pack` returns it. An exponent α or α + ρ beyond ±330 (in
+    float32 ±31) is replaced by one that grows only logarithmically, since the mass or size would
+    overflow: a step of an optimiser that is much too long gives a large body, not an infinite one.
 
     >>> unpack(jnp.zeros(10)).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -118,8 +120,9 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
     """Return three unconstrained numbers that describe principal moments whose axes are known.
 
     **Arguments:** `moments` (3,) I1, I2, I3 in any order, kg m². **Returns** (3,) `(ρ, d1, d2)` as
-    in `pack_second_moment`, of the second moments `λ1 = ½(I2 + I3 − I1)`, … (notes, eqs 76–78).
-    **Raises:** `ValueError` (`equinox` error under `jit`) for moments of no body, or of a point.
+    in `pack_second_moment`, for the principal second moments `λ1 = ½(I2 + I3 − I1)`, … (notes, eqs
+    76–78). **Raises:** `ValueError` (`equinox` error under `jit`) for moments that no body has, and
+    for moments of zero.
 
     >>> pack_moments([2.0, 2.0, 2.0])
     Array([0., 0., 0.], dtype=float64)
@@ -150,14 +153,15 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
 def flat_bend(
     shape: Float[ArrayLike, "5"] | Numbers, slope: Float[ArrayLike, "5"] | Numbers
 ) -> Float[Array, "3 5"]:
-    """Return three rows b (3, 5); the sum of b bᵀ over the rows is what the curvature of the
-    coordinates `shape` adds to the second derivative of a misfit.
+    """Return three rows b of five numbers, (3, 5). The sum of the matrices b bᵀ is what products of
+    first derivatives (Gauss–Newton) lack in the second derivative of a misfit near a flat body.
 
-    Near a flat body the least second moment is a square, λ = a², where a is the least eigenvalue of
-    the root A = 1 + V and n is its axis. Products of first derivatives do not contain the curvature
-    `d²λ = 2 |dA n|²`. The derivative of the misfit with respect to λ follows from the component
-    along n nᵀ of the derivative with respect to A. The rows are zero for a body that is not flat,
-    and for a misfit that does not decrease towards λ < 0.
+    Let A = 1 + V be the root of the second moment, where V is the matrix of `pack_shape`, a the
+    least eigenvalue of A, and n the unit eigenvector of a. The least second moment is the square λ
+    = a². Its second derivative `d²λ = 2 |dA n|²` is multiplied by the derivative of the misfit with
+    respect to λ, which follows from the component along n nᵀ of the derivative with respect to A.
+    The rows are zero for a body that is not flat, and for a misfit that does not decrease as λ
+    decreases.
 
     **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the derivative of the misfit with
     respect to `shape`.

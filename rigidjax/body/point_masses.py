@@ -44,10 +44,11 @@ def voxels(
 ) -> MassProperties:
     """Return the body whose density is given on the cells of a box, constant in each cell.
 
-    The result is exact for this density: the second moment of each cell about the centre of the
-    cell, `m h²/12`, is included. **Arguments:** `density` (nx, ny, nz) kg/m³, none negative,
-    indexed x, y, z; `spacing` (3,) edges of a cell, m; `corner` (3,) of cell [0, 0, 0] with the
-    smallest x, y, z, m, body frame. **Raises:** `ValueError` for a negative density.
+    The result is exact for this density: the second moment of each cell about its own centre, `m
+    h²/12` for a cell of mass m with the edge h, is included. **Arguments:** `density` (nx, ny, nz)
+    kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, m; `corner` (3,) of cell
+    [0, 0, 0] with the smallest x, y, z, m, body frame. **Raises:** `ValueError` for a negative
+    density.
 
     >>> voxels(jnp.ones((1, 2, 3)), [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]).com
     Array([0.5, 1. , 1.5], dtype=float64)
@@ -78,7 +79,8 @@ def quadrature(
     place: Callable[[Float[Array, "3"]], Float[Array, "3"]],
     order: int = 12,
 ) -> MassProperties:
-    """Return the body that fills a parametrised volume: `∫ ρ(r(u)) |∂r/∂u| d³u` over the unit cube.
+    """Return the body of density ρ that fills the image r(u) of the unit cube. The mass of the
+    body, for example, is the integral `∫ ρ(r(u)) |det ∂r/∂u| d³u` over the cube.
 
     `order` Gauss–Legendre points in each direction are exact for polynomials of degree `2·order −
     1`. The body is differentiable in all numbers of `density` and `place`. **Arguments:** `density`
@@ -100,9 +102,9 @@ def quadrature(
     cube, weight = jnp.asarray(cube, dtype), jnp.asarray(weight, dtype)
 
     def mass_density_and_position(u: Float[Array, "3"]) -> tuple[Array, Float[Array, "3"]]:
-        """Return two things at the point `u` (3,) of the unit cube, over which the mass of the body
-        is integrated: the mass in the body for each unit of volume of the cube, kg, which is the
-        density times |det ∂r/∂u|; and the position r (3,), m, in the body that belongs to u.
+        """Return two things for a point `u` (3,) of the unit cube. The first is the mass of the
+        body per unit of volume of the cube, kg: the density at the position r(u), times |det
+        ∂r/∂u|. The second is the position r(u) (3,), in metres, in the body frame.
         """
         r = _checks.array_of_shape(place(u), (3,), "place(u)")
         volume = determinant(jax.jacfwd(place)(u))

@@ -44,8 +44,8 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
 
     **Arguments:** `tensor` (3, 3) symmetric: I (kg m²) or 𝔖 (kg m²), body frame. **Returns**
     `(moments, q)`: (3,), ascending, in the units of `tensor`, and (4,), a unit quaternion (w, x, y,
-    z) with `A = R(q) diag(moments) R(q)ᵀ`. Of the four right-handed choices q is the smallest turn,
-    hence `w ≥ ½`.
+    z) with `A = R(q) diag(moments) R(q)ᵀ`, where A is the tensor and R(q) the rotation matrix of q.
+    Of the four right-handed choices q is the smallest turn, hence `w ≥ ½`.
 
     The derivative is exact if the moments differ. Moments that are equal to round-off have one
     eigenspace: their derivatives are the diagonal entries of the change of the tensor, and the axes
@@ -163,9 +163,11 @@ def _sort_eigenvalues(
 
 
 def _reverse_axes_towards_identity(axes: Sequence[tuple[Scalar, ...]]) -> Mat3:
-    """Return the rotation matrix (3, 3) with three orthonormal `axes` as columns, after two of the
-    axes, or none, are reversed: the one of the four right-handed choices that turns least, which
-    has the largest trace.
+    """Return the rotation matrix (3, 3) with three orthonormal `axes` as columns; two of the axes,
+    or none, are reversed, so that the rotation turns by the smallest angle.
+
+    Four choices of the signs are right-handed. The matrix with the largest trace turns by the
+    smallest angle.
 
     - `axes`: three triples of scalars, right-handed
     """
@@ -185,14 +187,15 @@ def _quaternion_of_small_turn(m: Mat3) -> Quat:
 
 
 def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> Mat3:
-    """Return `f(A) = R diag(f(λ)) Rᵀ` of a symmetric matrix A, such as its square root or
-    exponential.
+    """Return a function of a symmetric matrix A, such as its square root or exponential: `f(A) = R
+    diag(f(λ)) Rᵀ`, with the eigenvalues λ of A, and its unit eigenvectors as the columns of R.
 
     Its first and second derivatives are correct for every body, also for a sphere and a symmetric
-    top, whose principal axes have no derivatives; third derivatives are not available. With fixed
-    axes and the change `E = Rᵀ dA R`, `f(Λ + E)_ij = f(λ_i) δ_ij + f[λ_i, λ_j] E_ij + Σ_k f[λ_i,
-    λ_k, λ_j] E_ik E_kj + …`; the divided differences f[…] are smooth at equal eigenvalues (Daleckii
-    and Krein 1965; Higham 2008, "Functions of Matrices", section 3.2).
+    top, whose principal axes have no derivatives; third derivatives are not available. With the
+    fixed axes R, Λ = diag(λ) and the change `E = Rᵀ dA R`, the derivatives follow from `f(Λ + E)_ij
+    = f(λ_i) δ_ij + f[λ_i, λ_j] E_ij + Σ_k f[λ_i, λ_k, λ_j] E_ik E_kj + …`; the divided differences
+    f[…] are smooth at equal eigenvalues (Daleckii and Krein 1965; Higham 2008, "Functions of
+    Matrices", section 3.2).
 
     **Arguments:** `function` f, scalar → scalar, written in `jax.numpy`, smooth on the spectrum; it
     may depend on differentiated values; `tensor` (3, 3) symmetric, I or 𝔖, any units. **Returns**

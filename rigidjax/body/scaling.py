@@ -18,8 +18,8 @@ def largest_binary_exponent(x: Float[Array, "..."]) -> Int[Array, ""]:
 
 
 def times_power_of_two(x: Float[Array, "..."], n: Int[Array, ""]) -> Float[Array, "..."]:
-    """Return the array `x` times 2ⁿ, for an integer n with |n| ≤ 2044 (float32: 252); it is exact,
-    with its derivatives, if the result is a normal number.
+    """Return the array `x` times 2ⁿ, for an integer n with |n| ≤ 2044 (float32: 252). The product
+    and its derivatives are exact if the product is a normal number.
     """
     half = n // 2
     # Without the barrier, XLA would first multiply the two powers where it knows n, and the product
@@ -30,8 +30,9 @@ def times_power_of_two(x: Float[Array, "..."], n: Int[Array, ""]) -> Float[Array
 
 
 def _power_of_two(n: Int[Array, ""], dtype: jnp.dtype) -> Float[Array, ""]:
-    """Return the number 2ⁿ of the given `dtype`, made from its bits, for an integer n with which 2ⁿ
-    is a normal number: `jnp.ldexp` would be fifty operations to compile.
+    """Return the number 2ⁿ of the given `dtype`, for an integer n for which 2ⁿ is a normal number.
+    The number is made from its bits, because `jnp.ldexp` would give XLA fifty operations to
+    compile.
     """
     info = jnp.finfo(dtype)
     bits = (n.astype(f"int{info.bits}") + (info.maxexp - 1)) << info.nmant

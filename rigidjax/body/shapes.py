@@ -22,8 +22,8 @@ from rigidjax.body.point_masses import points as points, quadrature as quadratur
 
 
 def box(mass: ScalarLike, size: Vector) -> MassProperties:
-    """Return a solid box of `mass` kg and full edge lengths `size` (3,) = (a, b, c), m. The
-    second moment ∫ r rᵀ dm is `𝔖 = m diag(a², b², c²)/12`.
+    """Return a solid box of `mass` m, kg, and full edge lengths `size` (3,) = (a, b, c), in metres.
+    The second moment ∫ r rᵀ dm is `𝔖 = m diag(a², b², c²)/12`.
 
     >>> box(12.0, [1.0, 2.0, 3.0]).inertia.moments
     Array([ 5., 10., 13.], dtype=float64)
@@ -33,8 +33,8 @@ def box(mass: ScalarLike, size: Vector) -> MassProperties:
 
 
 def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
-    """Return a solid ellipsoid of `mass` kg and `semi_axes` (3,) = (a, b, c), m. The second
-    moment ∫ r rᵀ dm is `𝔖 = m diag(a², b², c²)/5`.
+    """Return a solid ellipsoid of `mass` m, kg, and `semi_axes` (3,) = (a, b, c), in metres. The
+    second moment ∫ r rᵀ dm is `𝔖 = m diag(a², b², c²)/5`.
 
     >>> ellipsoid(5.0, [1.0, 2.0, 3.0]).inertia.moments
     Array([ 5., 10., 13.], dtype=float64)
@@ -44,8 +44,8 @@ def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
 
 
 def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
-    """Return a solid sphere of `mass` kg, `radius` m. The second moment ∫ r rᵀ dm is `𝔖 = m
-    r²/5 · 1`, so `I = ⅖ m r² · 1`.
+    """Return a solid sphere of `mass` m, kg, and `radius` R, in metres. The second moment ∫ r rᵀ dm
+    is `𝔖 = m R²/5 · 1`, with the unit matrix 1, and the inertia tensor is `I = ⅖ m R² · 1`.
 
     >>> sphere(5.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -55,8 +55,8 @@ def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
 
 
 def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> MassProperties:
-    """Return a ball with a concentric hole. `λ = m/5 · (R⁵ − r⁵)/(R³ − r³)`, with the factor R − r
-    cancelled.
+    """Return a ball with a concentric hole. Its three principal second moments are `λ = m/5 · (R⁵ −
+    r⁵)/(R³ − r³)`, computed with the factor R − r cancelled.
 
     **Arguments:** `mass` kg; `inner` r ≤ `outer` R radii, m; equal radii give a shell.
 
@@ -72,8 +72,8 @@ def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> Mas
 
 
 def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
-    """Return a thin spherical shell of `mass` kg, `radius` m. The second moment ∫ r rᵀ dm is `𝔖
-    = m r²/3 · 1`.
+    """Return a thin spherical shell of `mass` m, kg, and `radius` R, in metres. The second moment ∫
+    r rᵀ dm is `𝔖 = m R²/3 · 1`, with the unit matrix 1.
 
     >>> shell(3.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -83,8 +83,8 @@ def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
 
 
 def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
-    """Return a solid cylinder along z of `mass` kg, `radius`, `height` m. The second moment ∫ r
-    rᵀ dm is `𝔖 = m diag(r²/4, r²/4, h²/12)`.
+    """Return a solid cylinder along z of `mass` m, kg, `radius` R and `height` h, in metres. The
+    second moment ∫ r rᵀ dm is `𝔖 = m diag(R²/4, R²/4, h²/12)`.
 
     >>> cylinder(12.0, 1.0, 1.0).inertia.moments
     Array([4., 4., 6.], dtype=float64)
@@ -111,9 +111,10 @@ def hollow_cylinder(
 def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassProperties:
     """Return a cylinder along z with a half ball on each end, of one density.
 
-    With `f = h/(h + 4r/3)` of the mass in the cylinder: across, `f r²/4 + (1 − f) r²/5`; along,
-    `f h²/12 + (1 − f)(r²/5 + 3hr/8 + h²/4)`. **Arguments:** `mass` kg; `radius` r > 0, m; `length`
-    h of the cylindrical part alone, m.
+    The cylinder has the fraction `f = h/(h + 4r/3)` of the mass. The principal second moments,
+    divided by the mass, are `f r²/4 + (1 − f) r²/5` across the axis and `f h²/12 + (1 − f)(r²/5 +
+    3hr/8 + h²/4)` along the axis. **Arguments:** `mass` kg; `radius` r > 0, m; `length` h of the
+    cylindrical part alone, m.
 
     >>> capsule(5.0, 1.0, 0.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -144,8 +145,8 @@ def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassPropert
     """Return a solid ring around z. The second moment ∫ r rᵀ dm is `𝔖 = m diag(R²/2 + 3r²/8,
     R²/2 + 3r²/8, r²/4)`; `minor` 0 gives a hoop.
 
-    **Arguments:** `mass` kg; `major` R from the centre to the middle of the tube, `minor` r ≤ R of
-    the tube, m.
+    **Arguments:** `mass` kg; `major` radius R, from the centre of the ring to the middle of the
+    tube, and `minor` radius r ≤ R of the tube, in metres.
 
     >>> torus(2.0, 1.0, 0.0).inertia.moments
     Array([1., 1., 2.], dtype=float64)
@@ -157,8 +158,8 @@ def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassPropert
 
 
 def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
-    """Return a thin rod along z of `mass` kg, `length` m (no moment about z). The second moment
-    ∫ r rᵀ dm is `𝔖 = m diag(0, 0, ℓ²/12)`.
+    """Return a thin rod along z of `mass` m, kg, and `length` ℓ, in metres; its moment of inertia
+    about z is zero. The second moment ∫ r rᵀ dm is `𝔖 = m diag(0, 0, ℓ²/12)`.
 
     >>> rod(12.0, 1.0).inertia.moments
     Array([0., 1., 1.], dtype=float64)
@@ -168,8 +169,8 @@ def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
 
 
 def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProperties:
-    """Return a plate in the x–y plane of `mass` kg and `size` (2,), m. The second moment ∫ r rᵀ
-    dm is `𝔖 = m diag(a², b², 0)/12`.
+    """Return a thin rectangular plate in the x–y plane of `mass` m, kg, and full edge lengths
+    `size` (2,) = (a, b), in metres. The second moment ∫ r rᵀ dm is `𝔖 = m diag(a², b², 0)/12`.
 
     >>> plate(12.0, [1.0, 2.0]).inertia.moments
     Array([1., 4., 5.], dtype=float64)

@@ -18,8 +18,9 @@ from rigidjax.rotation.linalg3 import (
 def inverse(a: Mat3) -> Mat3:
     """Return the inverse of a symmetric 3×3 matrix with trace > 0, by cofactors.
 
-    The matrix is divided by its trace first: 1e-20 or 1e37 kg m² neither underflow nor overflow. A
-    zero moment gives infinities; `Inertia.require_invertible` raises an error for it.
+    The matrix is divided by its trace first, so that the products of entries such as 1e-20 or 1e37
+    kg m² neither underflow nor overflow. If an eigenvalue is zero, the result is infinite;
+    `Inertia.require_invertible` raises an error for such an inertia tensor.
     """
     # All entries come from one split: an entry taken by an index would be a kernel of its own.
     xx, _, _, _, yy, _, _, _, zz = entries(a)

@@ -164,8 +164,8 @@ def index_of_first_impossible_inertia(
     """Return the index, a scalar, of the first of n matrices that is the inertia tensor of no body
     or has a principal moment of zero, or −1 if there is none.
 
-    A matrix with a NaN is skipped: in a batch the result of such a body is `nonfinite_input`, and
-    the other bodies are computed.
+    A matrix with a NaN is skipped, since one such body must not stop a batch: its result is
+    reported as `nonfinite_input`, and the other bodies are computed.
 
     - `tensors`: (n, 3, 3) inertia tensors, kg m², that are not traced.
     """
@@ -202,7 +202,8 @@ def _zero_impossible_asymmetric_flags(
     xp: ModuleType, tensor: Array | np.ndarray, allow_zero_moment: bool
 ) -> tuple[Any, Any, Any]:
     """Return three booleans (...) for each inertia tensor: whether a principal moment is zero or
-    NaN; whether no real body can have its principal moments; and whether it is not symmetric.
+    NaN; whether no real body can have its principal moments; and whether the tensor is not
+    symmetric.
 
     The second value comes from the minors (subdeterminants) of the second moment 𝔖 = ½ Tr(I) 1 − I
     divided by the trace of I: a real body has an 𝔖 that is positive semi-definite.

@@ -21,7 +21,8 @@ def box(size: Vector) -> Scalar:
 
 
 def ellipsoid(semi_axes: Vector) -> Scalar:
-    """Return the volume of an ellipsoid, m³, `4π abc/3`. **Arguments:** `semi_axes` (3,) m.
+    """Return the volume of an ellipsoid, m³, `4π abc/3`. **Arguments:** `semi_axes` (3,) = (a, b,
+    c), m.
 
     >>> round(float(ellipsoid([1.0, 1.0, 0.75])), 12)
     3.14159265359
@@ -39,8 +40,8 @@ def sphere(radius: ScalarLike) -> Scalar:
 
 
 def hollow_sphere(inner: ScalarLike, outer: ScalarLike) -> Scalar:
-    """Return the volume between two concentric spheres, m³. **Arguments:** radii `inner`, `outer`,
-    m.
+    """Return the volume between two concentric spheres, m³, `4π (R³ − r³)/3`. **Arguments:**
+    `inner` radius r and `outer` radius R, m.
 
     >>> round(float(hollow_sphere(0.0, 1.0)), 12)
     4.188790204786
@@ -50,7 +51,7 @@ def hollow_sphere(inner: ScalarLike, outer: ScalarLike) -> Scalar:
 
 
 def cylinder(radius: ScalarLike, height: ScalarLike) -> Scalar:
-    """Return the volume of a cylinder, m³, `π r² h`. **Arguments:** `radius`, `height` m.
+    """Return the volume of a cylinder, m³, `π r² h`. **Arguments:** `radius` r, `height` h, m.
 
     >>> round(float(cylinder(1.0, 1.0)), 12)
     3.14159265359
@@ -63,8 +64,8 @@ def cylinder(radius: ScalarLike, height: ScalarLike) -> Scalar:
 
 
 def hollow_cylinder(inner: ScalarLike, outer: ScalarLike, height: ScalarLike) -> Scalar:
-    """Return the volume of a tube, m³, `π (R² − r²) h`. **Arguments:** `inner`, `outer`, `height`
-    m.
+    """Return the volume of a tube, m³, `π (R² − r²) h`. **Arguments:** `inner` radius r, `outer`
+    radius R, `height` h, m.
 
     >>> round(float(hollow_cylinder(0.0, 1.0, 1.0)), 12)
     3.14159265359
@@ -84,7 +85,8 @@ def capsule(radius: ScalarLike, length: ScalarLike) -> Scalar:
 
 
 def cone(radius: ScalarLike, height: ScalarLike) -> Scalar:
-    """Return the volume of a cone, m³, `π r² h/3`. **Arguments:** `radius`, `height` m.
+    """Return the volume of a cone, m³, `π r² h/3`. **Arguments:** `radius` r of the base, `height`
+    h, m.
 
     >>> round(float(cone(1.0, 3.0)), 12)
     3.14159265359
@@ -93,7 +95,8 @@ def cone(radius: ScalarLike, height: ScalarLike) -> Scalar:
 
 
 def torus(major: ScalarLike, minor: ScalarLike) -> Scalar:
-    """Return the volume of a ring, m³, `2π² R r²`. **Arguments:** `major`, `minor` radii, m.
+    """Return the volume of a ring, m³, `2π² R r²`. **Arguments:** `major` radius R of the ring,
+    `minor` radius r of the tube, m.
 
     >>> round(float(torus(0.5, 1.0)), 12)
     9.869604401089

@@ -88,8 +88,10 @@ class Film(eqx.Module):
 
 
 def _write_mp4(gif: bytes, path: Path) -> None:
-    """Write an animated picture, the bytes of a file `gif`, as a film to the file `path`, which
-    ends in `.mp4`; raise `FileNotFoundError` without the program ffmpeg.
+    """Write an animated picture as a film to the file `path`, whose name ends in `.mp4`.
+    **Raises:** `FileNotFoundError` if the program ffmpeg is missing.
+
+    - `gif`: the bytes of a GIF file
     """
     program = shutil.which("ffmpeg")
     if program is None:
@@ -113,16 +115,17 @@ def tumble(
     size: int = 400,
     title: str = "",
 ) -> Film:
-    """Return a GIF of a box that tumbles as the body does, with the path of its longest axis.
+    """Return a GIF of a box that tumbles as the body does; a line shows the path of the end of its
+    longest axis.
 
     The box is solid and uniform, and has the second moment 𝔖 of the body (the integral of r rᵀ over
     the mass), hence the same motion. The faces across the shortest, middle and longest axis are
     blue, orange and green; the faces on the negative side of an axis are pale, so that a flip is
     seen. The centre of the box is fixed.
 
-    **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, with
-    less than a quarter turn between consecutive states; `seconds` the duration of the film, by
-    default that of the motion, but 20 at most; `fps` pictures a second; `size` the width and the
+    **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, with less
+    than a quarter turn between consecutive states; `seconds` the duration of the film, by default
+    the duration of the motion, but at most 20 s; `fps` pictures a second; `size` the width and the
     height, px; `title`. **Returns** a `Film`, which a notebook shows and `.save(path)` writes.
     **Raises** `ValueError` if `seconds`, `fps` or `size` is not positive.
 
@@ -203,10 +206,11 @@ def player(
 ) -> Film:
     """Return a page that plays the motion in 3-D; you can turn and zoom the view while it plays.
 
-    The box is that of `tumble`; the line is the path of its longest axis. The page contains
-    everything, also viser's program (0.8 MB): a notebook shows it without a network or a running
-    kernel, and `.save("tumble.html")` writes it to a file. **Arguments:** as `tumble`; `height` px
-    in a notebook. **Returns** a `Film`. **Raises** as `tumble`.
+    The picture is as in `tumble`: a box that moves as the body does, and the path of the end of its
+    longest axis. The page contains everything, also viser's program (0.8 MB): a notebook shows it
+    without a network or a running kernel, and `.save("tumble.html")` writes it to a file.
+    **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises** as
+    `tumble`.
     """
     seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
     _, q = evenly_spaced_times_and_attitudes(ts, states, pictures)
@@ -276,7 +280,8 @@ def _html_of_tumbling_box(
 def evenly_spaced_times_and_attitudes(
     ts: NumbersLike, states: PyTree, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays: `count` evenly spaced times; and the attitudes (count, 4) at these times.
+    """Return two arrays: `count` evenly spaced times, s; and the attitudes (count, 4) at these
+    times, from the `states` of a body at the times `ts` (T,), s.
 
     Between two consecutive states the attitude is interpolated along the shorter arc.
     """
@@ -309,11 +314,12 @@ def _box_corners_axis_end_and_half_diagonal(
 
 
 def box_half_lengths_and_axes(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays: the half-lengths a (3,) of the body's box; and the axes of the box (3, 3).
+    """Return two arrays for the uniform box that moves as the body does: its half-lengths a (3,);
+    and its axes (3, 3).
 
-    The uniform box of mass m has the second moments λ = m a²/3 of the body about its principal
-    axes. The columns of the second array are the axes of the box, in body axes. The half-lengths
-    are in m for `MassProperties`; for an `Inertia` they are scaled so that the longest is 1.
+    The box has the mass m and the principal second moments λ of the body, and hence λ = m a²/3. The
+    columns of the second array are the axes of the box, in body axes. The half-lengths are in m for
+    `MassProperties`; for an `Inertia` they are scaled so that the longest is 1.
     """
     second, q = principal(body.second_moment)
     size = np.sqrt(np.maximum(np.asarray(second, dtype=float), 0.0))

@@ -22,7 +22,7 @@ def inertia_ellipsoid(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """Draw the outline of a body's ellipsoid from three sides, for a fit with the uncertainty.
+    """Draw the outline of a body's ellipsoid from three sides; for a fit also draw its uncertainty.
 
     The ellipsoid `r·𝔖⁻¹r = const`, with the body's second moment 𝔖, is long along the body's long
     axis and moves as the body does. For `MassProperties` it is the uniform solid ellipsoid of equal
@@ -91,8 +91,9 @@ def _draw_ellipsoid_outlines(ax: Any, matrices_by_name: dict[str, np.ndarray], u
     """Draw the outlines of ellipsoids r·A⁻¹r = 1 on the planes xy, xz and yz, with a legend.
 
     - `ax`: (3,) matplotlib axes, one for each plane.
-    - `matrices_by_name`: the matrices A (n, 3, 3) of n ellipsoids by name: `body` (n = 1), and if
-      given `cloud` (bodies sampled from the uncertainty) and `truth` (n = 1).
+    - `matrices_by_name`: arrays (n, 3, 3) of the matrices A of n ellipsoids, by name: `body` (n =
+      1); and, each of them optional, `cloud` (n bodies sampled from the uncertainty) and `truth`
+      (the body to compare with, n = 1).
     - `unit`: the unit of length, in the labels.
     """
     # The outline of r·A⁻¹r = 1 reaches √A_ii along axis i. All three panels have the same scale,

@@ -103,7 +103,8 @@ def _draw_readings_and_residuals(
 
     - `upper_axes`, `lower_axes`: matplotlib axes.
     - `ts`: (T,) the times of the readings, s.
-    - `reading`: the sensor with its readings and their mask.
+    - `reading`: an object with the sensor, its readings and their mask, which is true at times with
+      a reading.
     - `errors`: (T, k) the residuals (reading minus prediction) at T times in k components, in the
       unit of the sensor.
     - `dense_states`: evenly spaced times, s, and the fitted states there, for a smooth line; or

@@ -25,8 +25,8 @@ def phase_portrait(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """Draw the motion of a symmetric top in the (θ, θ̇) plane, θ the tilt, with curves of equal
-    energy.
+    """Draw the motion of a symmetric top in the plane of the tilt θ and its rate θ̇, with curves of
+    equal energy.
 
     `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ` with I₁ the moment of inertia
     across the axis, the mass m, gravity g, the distance l of the centre of mass from the pivot, and

@@ -56,10 +56,10 @@ def polhode(
     The path of a free body lies on the sphere |Π| = h and on the ellipsoid ΣΠᵢ²/Iᵢ = 2T, with the
     principal moments Iᵢ and the kinetic energy T.
 
-    The coordinate axes are the principal axes, with the smallest moment first; the unit is h, the
-    initial |Π|. Thin lines are the paths of other energies at the same h; broken lines are the
-    separatrix through the middle axis. Behind the sphere the path of this motion is dotted, and all
-    other lines are faint. Source: Landau and Lifshitz, Mechanics, § 37.
+    The coordinate axes are the principal axes, with the smallest moment first; the unit of Π is h,
+    the length of the initial Π. Thin lines are the paths of other energies at the same h; broken
+    lines are the separatrix through the middle axis. Behind the sphere the path of this motion is
+    dotted, and all other lines are faint. Source: Landau and Lifshitz, Mechanics, § 37.
 
     **Arguments:** `inertia`; `states` of one body with a leading time axis; `energies` the number
     of thin lines; `title`; `ax` your 3-D axes. **Returns** the axes. **Raises** `ValueError`
@@ -154,10 +154,10 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
 
     The invariable plane is perpendicular to the angular momentum. The motion must be free: the
     component of ω along the angular momentum h is then constant, 2T/h with the kinetic energy T.
-    The circles have the least and the largest distance of this path from the momentum as radius.
-    **Arguments:** `inertia`; `states` (`Attitude`) of one body with a leading time axis; `title`;
-    `ax`. **Returns** the axes. **Raises** `ValueError` for a body at rest, and for an angular
-    momentum whose direction changes by more than 1e-3 rad.
+    The radii of the two circles are the least and the largest distance of the path from the line
+    along h. **Arguments:** `inertia`; `states` (`Attitude`) of one body with a leading time axis;
+    `title`; `ax`. **Returns** the axes. **Raises** `ValueError` for a body at rest, and for an
+    angular momentum whose direction changes by more than 1e-3 rad.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], [0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])

@@ -131,10 +131,12 @@ def _draw_sensor_residuals(
 
 
 def power_spectrum(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays (F,): frequencies; and the power of `values` at these frequencies.
+    """Return two arrays: F frequencies (F,), in cycles per unit of `t`; and the power (F,) of
+    `values` at these frequencies.
 
     **Arguments:** `t` (T,) times; `values` (T,) residuals divided by their standard deviation.
-    White noise has the power 1 at all frequencies; for fewer than eight times F is 0.
+    White noise of standard deviation 1 has the power 1 at all frequencies. If there are fewer than
+    eight times, the arrays are empty.
     """
     from scipy.signal import lombscargle, welch
 
@@ -153,8 +155,8 @@ def power_spectrum(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _autocorrelation(values: np.ndarray, lags: np.ndarray) -> np.ndarray:
-    """Return the correlation (L,) of a series with itself, at each of L given lags, as a share of
-    that at lag 0; it is zero for a constant series.
+    """Return the correlation (L,) of a series with itself at each of L given lags, divided by the
+    correlation at lag 0; the result is zero for a constant series.
 
     - `values`: (T,) the series; its mean is subtracted.
     - `lags`: (L,) the lags, positive whole numbers of samples.

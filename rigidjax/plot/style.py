@@ -37,8 +37,9 @@ def pyplot() -> Any:
 def unit_factor(unit: str, units: dict[str, float], name: str) -> float:
     """Return `units[unit]`, the conversion factor of a unit; raise an error for an unknown unit.
 
-    **Arguments:** `unit` such as `day`; `units` `TIMES` (seconds in the unit) or `RATES` (how many
-    of the unit are 1 rad/s); `name` the name of the caller's argument, for the error.
+    **Arguments:** `unit` such as `day`; `units` is `TIMES` (the number of seconds in each unit of
+    time) or `RATES` (the factor that converts rad/s to each unit of angular rate); `name` the name
+    of the caller's argument, for the error.
     """
     return units[_checks.require_option(unit, tuple(units), name)]
 
@@ -121,8 +122,8 @@ def draw_legend_below(ax: Any, *entries: Any, distance: float = 0.16) -> None:
 def times_on_host(ts: object, count: int, words_about_count: str = "the states have") -> np.ndarray:
     """Return the times `ts` (T,) as NumPy float64.
 
-    **Raises:** `ValueError` unless T is `count`; the message names what has `count` entries by
-    `words_about_count`.
+    **Raises:** `ValueError` unless T is `count`. The text `words_about_count`, such as "the states
+    have", says in the message what has `count` entries.
     """
     t = _checks.host_array(ts, "ts")
     if t.shape != (count,):
@@ -163,7 +164,9 @@ def rotation_matrices(q: np.ndarray) -> np.ndarray:
 
 
 def points_on_unit_sphere(longitude: np.ndarray, colatitude: np.ndarray) -> np.ndarray:
-    """Return points (3, …) on the unit sphere from their `longitude` and `colatitude`, rad."""
+    """Return points (3, …) on the unit sphere from their `longitude` and their `colatitude` (the
+    angle from the z axis), rad.
+    """
     ring, height = np.sin(colatitude), np.cos(colatitude)
     return np.stack(np.broadcast_arrays(np.cos(longitude) * ring, np.sin(longitude) * ring, height))
 

@@ -34,7 +34,8 @@ def motion(
     """Draw the body rate against time, and above it the attitude if the states have one.
 
     The lines of the three components (or angles) are solid, dashed and dash-dotted in this order,
-    and the line of w is dotted, so that they can be told apart in grey.
+    and the line of the scalar part w of the quaternion is dotted, so that the lines can be told
+    apart in grey.
 
     **Arguments:** `ts` (T,) s; `states` of one body with a leading time axis, such as `sol.ys`;
     `attitude` the form of the attitude: `quaternion` (w, x, y, z), `axes` (the world z component of

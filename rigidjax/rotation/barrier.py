@@ -37,7 +37,8 @@ def barrier(tree: Tree) -> Tree:
     """Return the arrays of `tree` unchanged, such that XLA on CPU computes each once for all its
     uses, instead of repeating its operations at each use.
 
-    This is `lax.optimization_barrier`, or `prevent_recomputation` where XLA drops barriers.
+    This is done by `lax.optimization_barrier`, or, where XLA drops such barriers, by a division by
+    one (`prevent_recomputation`).
 
     On a GPU each barrier would end a kernel, which costs more than computing some numbers twice; no
     barrier is set there.
@@ -54,15 +55,16 @@ def prevent_recomputation(x: Array) -> Array:
     """Return the array `x` unchanged, such that XLA on CPU computes it once, here and in the
     gradient.
 
-    The array is divided by one (by 2 where it is NaN). XLA on CPU computes a quotient once; XLA
-    repeats any cheaper operation, with all that the operation depends on, at each use.
+    The array is divided by one, or by two where it is NaN, so that XLA cannot know the divisor and
+    leave the division out. XLA on CPU computes a quotient once; XLA repeats any cheaper operation,
+    with all that the operation depends on, at each use.
     """
     return x / jnp.where(x == x, 1, 2)
 
 
 def compiled_as_one_kernel(function: Function) -> Function:
-    """Return a function with the same arguments and result as `function`, trees of arrays, that XLA
-    compiles as one kernel if no argument is batched by `jax.vmap`.
+    """Return a function with the arguments and the result of `function`, which are trees of arrays.
+    XLA compiles the returned function as one kernel, unless `jax.vmap` batches an argument.
 
     Many small kernels for one body take long to compile; XLA on CPU makes one kernel of a loop with
     a small state. Therefore `function` runs in a loop with one iteration. XLA knows neither the

@@ -62,9 +62,10 @@ def to_matrix(angles: Vec3Like, sequence: str = "ZXZ") -> Mat3:
 def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
     """Return the Euler angles of a rotation matrix, rad, in the order of `sequence`.
 
-    **Arguments:** `matrix` (3, 3) rotation, body → world; values are not checked (`so3.check`).
-    **Returns:** (3,): outer angles in (−π, π], the middle one in [0, π] if the first and the last
-    letter agree, else in [−π/2, π/2]. The last is 0 in the singular case.
+    **Arguments:** `matrix` (3, 3) rotation, body → world. **Returns:** (3,): outer angles in (−π,
+    π], the middle one in [0, π] if the first and the last letter agree, else in [−π/2, π/2]. The
+    last is 0 in the singular case. **Raises:** as `so3.check` for known values; traced values are
+    not checked.
 
     >>> angles = jnp.array([0.3, 0.2, 0.1])
     >>> bool(abs(from_matrix(to_matrix(angles, "xyz"), "xyz") - angles).max() < 1e-15)
@@ -78,8 +79,8 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     same bits.
 
     **Arguments:** `q` (4,) of any length, body → world. **Raises:** `ValueError` for zero or NaN.
-    Half the sum and half the difference of the outer angles come from two atan2, so that the matrix
-    keeps all its digits near the singular case (Bernardes & Viollet 2022,
+    Half the sum and half the difference of the outer angles come from two calls of atan2, so that
+    the rotation keeps all its digits near the singular case (Bernardes & Viollet 2022,
     doi:10.1371/journal.pone.0276302).
 
     >>> from_quaternion(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
@@ -167,8 +168,8 @@ def omega_to_rates(
     """Return the rates of the Euler angles for an angular velocity: eqs 81–83 of the notes, solved.
 
     **Arguments:** `angles` (3,), rad, in the order of `sequence`; `omega` (3,), rad/s, in `frame`.
-    **Returns:** (3,) rad/s. In the singular case (`is_singular`) the last rate is 0, and the part
-    of `omega` that no rates give is dropped.
+    **Returns:** (3,) rad/s. In the singular case (`is_singular`) the last rate is 0, and the
+    component of `omega` that no rates can produce is dropped.
 
     >>> omega_to_rates(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 2.0]
@@ -193,8 +194,8 @@ def omega_to_rates(
 def _axes_of_sequence(sequence: str) -> tuple[tuple[int, int, int], bool]:
     """Return two things about a sequence of Euler angles: the axis numbers (0 for x, 1 for y, 2 for
     z) of the three intrinsic turns, each about the axis that the turns before it have moved; and
-    whether the angles are listed in the opposite order, as they are for an extrinsic sequence
-    (lower case). **Raises:** `ValueError` for an unknown sequence.
+    whether the user lists the angles in the order opposite to these turns, as in an extrinsic
+    sequence (lower case). **Raises:** `ValueError` for an unknown sequence.
 
     - `sequence`: three letters such as "ZXZ" or "xyz"
     """
@@ -258,8 +259,8 @@ def _rotation_about(axis: int, angle: Scalar) -> Quat:
 
 
 def _wrap_to_half_turn(angle: Scalar) -> Scalar:
-    """Return an angle, rad, in (−2π, 2π), shifted by a full turn into (−π, π] if it lies
-    outside.
+    """Return `angle`, rad, which is between −2π and 2π, shifted by a full turn into the interval
+    (−π, π] if it lies outside this interval.
     """
     angle = jnp.where(angle > np.pi, angle - 2 * np.pi, angle)
     return jnp.where(angle <= -np.pi, angle + 2 * np.pi, angle)
@@ -268,8 +269,9 @@ def _wrap_to_half_turn(angle: Scalar) -> Scalar:
 def _turn_axes_in_body(
     axes: tuple[int, int, int], angles: tuple[Scalar, Scalar, Scalar]
 ) -> tuple[Vec3, Vec3, Vec3]:
-    """Return the axes of the three turns of Euler angles as unit vectors (3,) in the body frame:
-    the angular velocity of the body is the sum of these axes, each times the rate of its angle.
+    """Return the axes of the three turns of Euler angles as unit vectors (3,) in the body frame.
+    The angular velocity of the body is the sum of the three axes, each multiplied by the rate of
+    its angle.
 
     - `axes`: the axis numbers of the three intrinsic turns (0 for x, 1 for y, 2 for z)
     - `angles`: the three angles of these turns, rad
@@ -284,9 +286,9 @@ def _turn_axes_in_body(
 def _triple_product_and_singularity(
     middle_angle: Scalar, axes: tuple[int, int, int]
 ) -> tuple[Scalar, Bool[Array, ""]]:
-    """Return two things that tell how near Euler angles are to the singular case ("gimbal lock"):
-    the product first · (third × second) of the unit axes of the three turns; and whether this
-    product is zero to round-off.
+    """Return two things that tell how near Euler angles are to the singular case ("gimbal lock"),
+    in which the axes of the first and the third turn are parallel: the product first · (third ×
+    second) of the unit axes of the three turns; and whether this product is zero to round-off.
 
     - `middle_angle`: rad
     - `axes`: the axis numbers of the three intrinsic turns (0 for x, 1 for y, 2 for z)

@@ -1,9 +1,11 @@
 """Find the rotation that fits best: projection, alignment, Wahba's problem, the mean of rotations.
 
 Singular values and eigenvectors are not used: their derivatives are NaN at every rotation, where
-all three singular values are 1. The best rotation R of a 3×3 matrix B, with the largest Tr(RᵀB),
-has the derivative dR = R hat(x), where x solves (Tr(S) 1 − S) x = 2 vee(Rᵀ dB) with S = sym(RᵀB).
-The derivative is regular if R is unique.
+all three singular values are 1. Let R be the rotation that fits a 3×3 matrix B best, that is, with
+the largest Tr(RᵀB). A change dB changes R by dR = R hat(x), where hat(x) is the matrix of the cross
+product with x. The vector x solves (Tr(S) 1 − S) x = 2 vee(Rᵀ dB), where S is the symmetric part of
+RᵀB, and vee gives the vector of the antisymmetric part of a matrix. The derivative is regular if R
+is unique.
 """
 
 from functools import partial
@@ -35,8 +37,8 @@ from rigidjax.rotation.validation import (
     require_unit_quaternion,
 )
 
-# In the first estimate of Wahba's problem, no positive weight is below this fraction of the largest
-# weight.
+# In the first estimate for Wahba's problem, a smaller positive weight is raised to this fraction of
+# the largest weight.
 _LIGHT = 1e-3
 
 
@@ -108,8 +110,9 @@ def wahba(
     # where σ3 has the sign of det b. It is 0 where the directions leave one turn free.
     eps = float(jnp.finfo(w.dtype).eps)
     loose, seen, one = jnp.zeros((), bool), jnp.sign(heavy), jnp.eye(3, dtype=w.dtype)
-    # The first two rows test the directions of each frame alone, without weights, at the identity:
-    # `best` is the best rotation of the weighted pairs only.
+    # The first two rows test the directions of each frame by themselves, without weights. The best
+    # rotation from these directions to themselves is the identity; `best` fits the weighted pairs
+    # only.
     for turn, b, least in (
         (one, _weighted_outer_products(seen, those, those), 4 * np.sqrt(eps)),
         (one, _weighted_outer_products(seen, these, these), 4 * np.sqrt(eps)),
@@ -197,7 +200,8 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
 
 
 def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | None = None) -> Mat3:
-    """Return the Karcher mean: the rotation that minimises Σ w_i |angle to R_i|².
+    """Return the Karcher mean of rotations R_i: the rotation that minimises Σ w_i θ_i², with the
+    weights w_i and the angles θ_i to R_i.
 
     **Arguments:** `matrices` (n, 3, 3) rotations within a quarter turn of the mean: the mean is
     then unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative.
@@ -270,7 +274,8 @@ def checked_weights(weights: ArrayLike | None, rows: Array, description: str) ->
     weights that JAX does not trace are negative or all zero.
 
     - `weights`: (n,), or `None` for weights of 1
-    - `rows`: (n,), an array with the dtype of the result and one entry for each item
+    - `rows`: (n,), an array with one entry for each item and with the dtype that the weights get if
+      they are `None`; only its length and dtype are used
     - `description`: the name of the items, for messages
     """
     if rows.shape[0] == 0:
@@ -325,8 +330,8 @@ def _curvature_of_rotation_fit(rotation: Mat3, b: Mat3) -> Mat3:
 
 @jax.custom_jvp
 def nearest_rotation(b: Mat3) -> Mat3:
-    """Return the rotation matrix R (3, 3) nearest to a matrix b (3, 3) of any size: the one with
-    the largest Tr(Rᵀb).
+    """Return the rotation matrix R (3, 3) nearest to a matrix b (3, 3), whose entries may be of any
+    size: the R with the largest Tr(Rᵀb).
     """
     b = scale_to_order_one(b)
     b = b / jnp.sqrt((b * b).sum())
@@ -334,8 +339,8 @@ def nearest_rotation(b: Mat3) -> Mat3:
     kappa = 0.5 * (root * root - 1)
     rough = ((kappa + 1) * b + root * cofactors(b) - product(b, product(b.T, b))) / zeta
     q = matrix_to_quaternion(rough)
-    # The root of the quartic may have only half its digits; Newton steps on the rotation group then
-    # give all digits.
+    # The root of Markley's quartic equation may have only half its digits. Newton steps on the
+    # rotation group then give all digits of the rotation.
     for _ in range(3):
         r = quaternion.to_matrix(q)
         turn = solve(_curvature_of_rotation_fit(r, b), 2 * vee(product(r.T, b)))

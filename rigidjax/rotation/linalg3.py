@@ -62,8 +62,8 @@ def squared_length(v: Sequence[Scalar]) -> Scalar:
 
 
 def power_of_two_scale(*parts: Scalar) -> Scalar:
-    """Return the power of two whose product with the largest of the scalars `parts` is near 1; its
-    derivative is zero.
+    """Return the power of two by which the largest of the scalars `parts`, in absolute value, must
+    be multiplied to be near 1. The derivative of the result is zero.
 
     A formula that does not depend on the length of a vector first multiplies the vector by this
     power of two: no digit is lost, and the squares of its components do not overflow.
@@ -135,7 +135,8 @@ def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def solve(a: Mat3Like, y: Vec3Like) -> Vec3:
-    """Solve a x = y by cofactors (Cramer's rule); `a` (3, 3) well conditioned, `y` (3,).
+    """Solve a x = y for the vector x (3,) by cofactors (Cramer's rule); `a` (3, 3) well
+    conditioned, `y` (3,).
 
     >>> solve(2.0 * jnp.eye(3), jnp.array([2.0, 4.0, 6.0])).tolist()
     [1.0, 2.0, 3.0]
@@ -158,8 +159,8 @@ def determinant(a: Mat3Like) -> Scalar:
 
 
 def cofactors(a: Mat3) -> Mat3:
-    """Return the matrix of cofactors (3, 3) of a matrix `a` (3, 3), det a · a⁻ᵀ; a need not have an
-    inverse.
+    """Return the matrix of cofactors (3, 3) of any matrix `a` (3, 3); if a has an inverse, the
+    cofactors are det a · a⁻ᵀ.
     """
     m = entries(a)
     p, q, r = m[:3], m[3:6], m[6:]

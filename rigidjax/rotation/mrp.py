@@ -1,9 +1,10 @@
 """Convert modified Rodrigues parameters σ = n tan(θ/4), and their shadow set.
 
-The parameters are three numbers, found without a sine and regular up to a full turn, where σ is
-infinite. σ and its shadow −σ/|σ|² are the same rotation; a switch at |σ| = 1 keeps θ ≤ π. Source:
-Schaub & Junkins, 2018, Analytical Mechanics of Space Systems, sec. 3.5.2. Range: any σ; in
-functions of rates, σ and the rates up to 1e75 (float32: 1e9).
+A rotation by the angle θ about the unit vector n has these three parameters. They are computed from
+a quaternion without sine or cosine, and are regular up to a full turn, at which σ is infinite. σ
+and its shadow −σ/|σ|² are the same rotation; a switch at |σ| = 1 keeps θ ≤ π. Source: Schaub &
+Junkins, 2018, Analytical Mechanics of Space Systems, sec. 3.5.2. Range: any σ; in functions of
+rates, σ and the rates up to 1e75 (float32: 1e9).
 """
 
 import jax.numpy as jnp
@@ -29,8 +30,8 @@ def from_quaternion(q: QuatLike) -> Vec3:
 
 
 def to_quaternion(sigma: Vec3Like) -> Quat:
-    """Return the unit quaternion ((1 − s), 2σ)/(1 + s), s = |σ|², of `sigma` (3,); the shadow gives
-    −q.
+    """Return the unit quaternion q = ((1 − s), 2σ)/(1 + s), s = |σ|², of `sigma` (3,); the shadow
+    −σ/|σ|² gives −q.
 
     >>> to_quaternion(jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -45,7 +46,8 @@ def to_quaternion(sigma: Vec3Like) -> Quat:
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
-    """Return the parameters, |σ| ≤ 1, of a rotation `matrix` (3, 3), body → world, unchecked.
+    """Return the parameters, |σ| ≤ 1, of a rotation `matrix` (3, 3), body → world. **Raises:** as
+    `so3.check` for known values; traced values are not checked.
 
     >>> from_matrix(jnp.eye(3)).tolist()
     [0.0, 0.0, 0.0]
@@ -54,7 +56,8 @@ def from_matrix(matrix: Mat3Like) -> Vec3:
 
 
 def to_matrix(sigma: Vec3Like) -> Mat3:
-    """Return the rotation matrix, body → world, of `sigma` (3,); the shadow gives the same matrix.
+    """Return the rotation matrix, body → world, of `sigma` (3,); the shadow −σ/|σ|² gives the same
+    matrix.
 
     >>> to_matrix(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -97,7 +100,8 @@ def _shadow_unchecked(sigma: Vec3) -> Vec3:
 
 def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
     """Return the rates of the parameters σ at the angular velocity Ω, dσ/dt = ¼ [(1 − s) Ω + 2 σ ×
-    Ω + 2 σ (σ·Ω)], 1/s, with s = |σ|²; they are never singular (Schaub & Junkins, eq 3.160).
+    Ω + 2 σ (σ·Ω)], 1/s, with s = |σ|²; the rates are finite for every finite σ (Schaub & Junkins,
+    eq 3.160).
 
     **Arguments:** `sigma` (3,) dimensionless; `omega` (3,) rad/s, body frame.
 

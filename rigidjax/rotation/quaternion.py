@@ -63,10 +63,10 @@ _HINT = "one quaternion is (w, x, y, z), scalar first; batch with jax.vmap"
 def exp(v: Vec3Like) -> Quat:
     """Return the quaternion of a rotation vector: (cos θ/2, ½ v sin(θ/2)/(θ/2)), θ = |v|.
 
-    **Arguments:** `v` (3,) rotation vector, rad (notes, eqs 17, 18, with v = γ y). The angle has an
-    error of ε|v|, where ε is the unit of round-off. **Returns:** (4,) of norm 1; value and
-    derivatives are correct also at v = 0. **Raises:** `ValueError` for NaN, and beyond 1/ε (see the
-    head of this module).
+    **Arguments:** `v` (3,) rotation vector, rad (notes, eqs 17, 18, where v = γ y has the angle γ
+    and the unit axis y). The angle has an error of ε|v|, where ε is the unit of round-off.
+    **Returns:** (4,) of norm 1; value and derivatives are correct also at v = 0. **Raises:**
+    `ValueError` for NaN, and for an angle beyond 1/ε, which has no correct digit.
 
     >>> exp(jnp.array([0.0, 0.0, jnp.pi])).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -118,8 +118,8 @@ def conjugate(q: QuatLike) -> Quat:
 
 
 def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
-    """Return the world components M y of a vector with body components `y` (3,), by `q` (4,) unit
-    (notes, eqs 8, 21).
+    """Return the world components M y of a vector with the body components `y` (3,), where M is the
+    rotation matrix of the unit quaternion `q` (4,) (notes, eqs 8, 21).
 
     >>> rotate(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0])).tolist()
     [-1.0, -2.0, 3.0]
@@ -129,8 +129,8 @@ def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
 
 
 def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
-    """Return the body components Mᵀ y of a vector with world components `y` (3,), by `q` (4,) unit
-    (notes, eqs 8, 22).
+    """Return the body components Mᵀ y of a vector with the world components `y` (3,), where M is
+    the rotation matrix of the unit quaternion `q` (4,) (notes, eqs 8, 22).
 
     >>> rotate_inverse(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0])).tolist()
     [-1.0, -2.0, 3.0]
@@ -172,7 +172,8 @@ def from_xyzw(xyzw: Float[ArrayLike, "4"]) -> Quat:
 
 
 def to_xyzw(q: QuatLike) -> Float[Array, "4"]:
-    """Return scalar-last components (SciPy, ROS, glTF) of `q` (4,), (w, x, y, z).
+    """Return the components (x, y, z, w), scalar last as in SciPy, ROS and glTF, of `q` (4,) = (w,
+    x, y, z).
 
     >>> to_xyzw(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -228,11 +229,12 @@ def rate(q: QuatLike, omega: Vec3Like) -> Quat:
 
 
 def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
-    """Return the point at s of the shortest turn from p (s = 0) to q (s = 1), at a constant rate.
+    """Return the rotation at the fraction s of the shortest turn from p (s = 0) to q (s = 1).
 
-    **Arguments:** `p`, `q` (4,) unit, either sign; `s` dimensionless, also beyond [0, 1]. The point
-    is p exp(s log(p̄ q)), regular at p = q (Shoemake 1985, doi:10.1145/325334.325242). **Raises:**
-    `ValueError` if the product p̄ q is zero or NaN.
+    **Arguments:** `p`, `q` (4,) unit, either sign; `s` dimensionless, also beyond [0, 1]. The
+    result is p exp(s log(p̄ q)), with the conjugate p̄ of p: the angle from p is proportional to s.
+    It is regular at p = q (Shoemake 1985, doi:10.1145/325334.325242). **Raises:** `ValueError` if
+    the product p̄ q is zero or NaN.
 
     >>> p, q = exp(jnp.array([0, 0, 1.0])), exp(jnp.array([0, 0, 2.0]))
     >>> bool(abs(interpolate(p, q, 0.5) - exp(jnp.array([0, 0, 1.5]))).max() < 1e-15)
@@ -247,8 +249,8 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
 
 
 def uniform(key: PRNGKeyArray, dtype: DTypeLike = float) -> Quat:
-    """Return a uniformly distributed random rotation (Haar measure), four normal numbers over their
-    length.
+    """Return a uniformly distributed random rotation (Haar measure): four normally distributed
+    numbers divided by the root of the sum of their squares.
 
     **Arguments:** `key` of `jax.random`; `dtype` float32 or float64 (Muller 1959).
 
@@ -316,7 +318,7 @@ def from_matrix(matrix: Mat3Like) -> Quat:
     **Arguments:** `matrix` (3, 3) rotation, body → world. **Returns:** (4,) with w ≥ 0: the largest
     of the four rows of 4 q qᵀ, normalised (Shepperd 1978, doi:10.2514/3.55767b). No case loses
     digits; the derivative uses the largest row only. **Raises:** as `so3.check` for known values;
-    nothing is checked inside `jit`, `grad` and `vmap`.
+    values that `jit`, `grad` or `vmap` trace are not checked.
 
     >>> from_matrix(jnp.diag(jnp.array([-1.0, -1.0, 1.0]))).tolist()
     [0.0, 0.0, 0.0, 1.0]

@@ -1,6 +1,7 @@
 """Convert Rodrigues (Gibbs, Cayley) parameters g = n tan(θ/2).
 
-The conversions to and from a rotation matrix are rational, and a rotation has only one g. The
+A rotation by the angle θ about the unit vector n has these three parameters, the Rodrigues vector
+g. The conversions to and from a rotation matrix are rational, and a rotation has only one g. The
 parameters are infinite at a half turn, for which `is_singular` tests. M = (1 + hat g)(1 − hat g)⁻¹
 is Cayley's transform. Source: Schaub & Junkins, 2018, Analytical Mechanics of Space Systems, sec.
 3.5.1. Range: any g; in functions of rates, g and the rates up to 1e75 (float32: 1e9).
@@ -45,7 +46,8 @@ def to_quaternion(g: Vec3Like) -> Quat:
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
-    """Return the parameters of a rotation `matrix` (3, 3), unchecked; g is infinite at a half turn.
+    """Return the parameters g (3,) of a rotation `matrix` (3, 3), body → world; g is infinite at a
+    half turn. **Raises:** as `so3.check` for known values; traced values are not checked.
 
     >>> from_matrix(jnp.eye(3)).tolist()
     [0.0, 0.0, 0.0]

@@ -166,8 +166,8 @@ def adjoint(matrix: Mat3Like) -> Mat3:
 
 
 def to_world(matrix: Mat3Like, y: Vec3Like) -> Vec3:
-    """Return the world components M y of body components `y` (3,), by `matrix` (3, 3) (notes, eqs
-    8, 21).
+    """Return the world components M y of a vector with the body components `y` (3,); `matrix` M (3,
+    3) is the rotation body → world (notes, eqs 8, 21).
 
     >>> to_world(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [1.0, 2.0, 3.0]
@@ -176,8 +176,8 @@ def to_world(matrix: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
-    """Return the body components Mᵀ y of world components `y` (3,), by `matrix` (3, 3) (notes, eqs
-    8, 22).
+    """Return the body components Mᵀ y of a vector with the world components `y` (3,); `matrix` M
+    (3, 3) is the rotation body → world (notes, eqs 8, 22).
 
     >>> to_body(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [1.0, 2.0, 3.0]
@@ -198,8 +198,8 @@ def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
 
 
 def rate(matrix: Mat3Like, omega: Vec3Like) -> Mat3:
-    """Return dM/dt = M hat(Ω) of `matrix` (3, 3) and `omega` (3,) Ω, rad/s, body frame (notes, eq
-    50).
+    """Return the rate dM/dt = M hat(Ω) (3, 3), 1/s, of the rotation `matrix` M (3, 3), body →
+    world, at the angular velocity `omega` Ω (3,), rad/s, body frame (notes, eq 50).
 
     >>> rate(jnp.eye(3), jnp.array([0.0, 0.0, 2.0]))[1].tolist()
     [2.0, 0.0, 0.0]
@@ -237,7 +237,8 @@ def world_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
 
 
 def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
-    """Return the point at s of the shortest turn from a (s = 0) to b (s = 1): a exp(s log(aᵀb)).
+    """Return the rotation at the fraction s of the shortest turn from a (s = 0) to b (s = 1): a
+    exp(s log(aᵀb)).
 
     **Arguments:** `a`, `b` (3, 3) rotations; `s` dimensionless, also beyond [0, 1]. **Raises:** as
     `distance`.
@@ -254,8 +255,8 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
 
 
 def uniform(key: PRNGKeyArray, dtype: DTypeLike = float) -> Mat3:
-    """Return a uniformly distributed random rotation (Haar measure): `key` of `jax.random`, `dtype`
-    of floats.
+    """Return a random rotation matrix (3, 3), uniformly distributed (Haar measure). **Arguments:**
+    `key` of `jax.random`; `dtype` float32 or float64.
 
     >>> import jax
     >>> uniform(jax.random.key(0)).shape
@@ -270,8 +271,9 @@ def check(
     """Return a matrix from outside unchanged if it is a rotation; refuse any other matrix.
 
     **Arguments:** `matrix` (..., 3, 3); `name` the name of the matrix in messages. **Raises:**
-    `ValueError` (under `jit` `equinox.error_if`) for NaN, a left-handed frame (det < 0), and |MᵀM −
-    1| above 1e-6 (float32: 1e-3). `project` gives the nearest rotation.
+    `ValueError` (under `jit` `equinox.error_if`) for NaN, for a left-handed frame (det < 0), and if
+    an entry of |MᵀM − 1| is above 1e-6 (float32: 1e-3), where M is the matrix. `project` gives the
+    nearest rotation.
 
     >>> check(jnp.eye(3)).shape
     (3, 3)

@@ -21,8 +21,8 @@ def rotation_tolerance(dtype: object) -> float:
 
 
 def require_nonzero_and_finite(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
-    """Return the vector `v` (n,), any unit. **Raises:** `ValueError` if it has no direction, that
-    is, for zero, NaN and infinity, unless JAX traces it; the text `name` names the vector in the
+    """Return the vector `v` (n,), any unit. **Raises:** `ValueError`, unless JAX traces `v`, if `v`
+    has no direction, that is, for zero, NaN and infinity. The text `name` names the vector in the
     message.
 
     Entries that are all below the least normal number of the dtype, 2e-308 in float64, count as
@@ -43,9 +43,9 @@ def require_nonzero_and_finite(v: Float[Array, "n"], name: str) -> Float[Array, 
 
 
 def require_turn_not_too_large(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
-    """Return the rotation vector or the angle `v`, rad. **Raises:** `ValueError` if it is so large
-    (4.5e15 rad; in float32 8.4e6) that no digit of the rotation is correct, unless JAX traces it;
-    the text `name` names it in the message.
+    """Return the rotation vector or the angle `v`, rad. **Raises:** `ValueError`, unless JAX traces
+    `v`, if it is so large (4.5e15 rad; in float32 8.4e6 rad) that no digit of the rotation is
+    correct. The text `name` names `v` in the message.
     """
     if _checks.is_known(v) and not _largest_absolute_entry(v) <= (
         limit := 1 / float(jnp.finfo(v.dtype).eps)
@@ -70,8 +70,8 @@ def _largest_absolute_entry(v: Float[Array, "*n"]) -> float:
 
 def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
     """Return the matrices m (..., 3, 3). **Raises:** `ValueError` (under `jit` `equinox.error_if`)
-    if any of them is no rotation. The message contains its determinant or its error; the text
-    `name` names the matrix in the message.
+    if any of them is no rotation. For known matrices the message contains the determinant or the
+    largest entry of |mᵀm − 1|. The text `name` names the matrices in the message.
     """
     m = _checks.require_finite(m, name)
     known = _checks.is_known(m)
