@@ -170,7 +170,8 @@ def _convert_to_si(value: Any, name: str, si_unit: str = "") -> Any:
       `name` in the table `_UNITS` is taken; without an entry there, any dimension is accepted.
     """
     if is_rotation(value):
-        # Written out, since `as_quat(scalar_first=True)` needs SciPy 1.14.
+        # The order (w, x, y, z) is made here by indices, since `as_quat(scalar_first=True)` needs
+        # SciPy 1.14.
         return value.as_quat()[..., [3, 0, 1, 2]]
     value = without_mask(value, name)
     if isinstance(value, (list, tuple)):
@@ -298,8 +299,8 @@ _MANY = 4096
 def index_of_first_bad_row(
     are_bad: Callable[[ModuleType, Any], Any], rows: Array | np.ndarray
 ) -> Array | np.ndarray:
-    """Return the index, a scalar, of the first of n rows that is bad, or −1 if none is. The index
-    may be an array of JAX that is still being computed.
+    """Return the index of the first bad row among n rows, as a scalar, or −1 if no row is bad. The
+    index may be an array of JAX that is still being computed.
 
     - `are_bad`: a function (xp, rows) → booleans (n,), true for each bad row, written with the
       functions of the module `xp`, which is `numpy` or `jax.numpy`. Define it once, at the head of
@@ -315,8 +316,8 @@ def index_of_first_bad_row(
 
 
 def _index_of_first_true(xp: ModuleType, booleans: Array | np.ndarray) -> Array | np.ndarray:
-    """Return the index, a scalar, of the first true entry of the `booleans` (n,), or −1 if none is
-    true.
+    """Return the index of the first true entry of the `booleans` (n,), as a scalar, or −1 if no
+    entry is true.
 
     - `xp`: the module of the array, `numpy` or `jax.numpy`
     """
@@ -327,7 +328,7 @@ def _index_of_first_true(xp: ModuleType, booleans: Array | np.ndarray) -> Array 
 def _compiled_index_of_first_bad_row(
     are_bad: Callable[[ModuleType, Any], Any], rows: Array
 ) -> Array | np.ndarray:
-    """Return the index, a scalar, of the first of n rows that is bad, or −1 if none is; JAX
+    """Return the index of the first bad row among n rows, as a scalar, or −1 if no row is bad; JAX
     compiles the search.
 
     - `are_bad`: a function (xp, rows) → booleans (n,), true for each bad row; `xp` is `jax.numpy`
@@ -518,8 +519,8 @@ def integer(value: object, name: str, least: int) -> int:
 
 def python_float(value: object, name: str) -> float:
     """Return `value` as one Python float. **Raises:** `TypeError` for a number that JAX traces, and
-    for what is no number; `ValueError` for several numbers. The text `name` names the argument in
-    messages.
+    for anything that is not a number; `ValueError` for several numbers. The text `name` names the
+    argument in messages.
     """
     array = host_array(value, name)
     if array.shape != ():
@@ -528,10 +529,10 @@ def python_float(value: object, name: str) -> float:
 
 
 def positive_float(value: object, name: str, requirement: str = "a positive number") -> float:
-    """Return `value` as a Python float that is positive and finite. **Raises:** `TypeError` for a
-    number that JAX traces, and for what is no number; `ValueError` for several numbers, and for any
-    other float. The texts `name` (of the argument) and `requirement` (what was wanted) are for
-    messages.
+    """Return `value` as a positive and finite Python float. **Raises:** `TypeError` for a number
+    that JAX traces, and for anything that is not a number; `ValueError` for several numbers, and
+    for any other float. The texts `name` (of the argument) and `requirement` (what was wanted) are
+    for messages.
     """
     number = python_float(value, name)
     if not 0 < number < np.inf:
@@ -540,9 +541,10 @@ def positive_float(value: object, name: str, requirement: str = "a positive numb
 
 
 def fraction(value: object, name: str, requirement: str = "a number between 0 and 1") -> float:
-    """Return `value` as a Python float above 0 and below 1. **Raises:** `TypeError` for a number
-    that JAX traces, and for what is no number; `ValueError` for several numbers, and for any other
-    float. The texts `name` (of the argument) and `requirement` (what was wanted) are for messages.
+    """Return `value` as a Python float between 0 and 1, both excluded. **Raises:** `TypeError` for
+    a number that JAX traces, and for anything that is not a number; `ValueError` for several
+    numbers, and for any other float. The texts `name` (of the argument) and `requirement` (what was
+    wanted) are for messages.
     """
     number = positive_float(value, name, requirement)
     if not number < 1:
@@ -551,9 +553,9 @@ def fraction(value: object, name: str, requirement: str = "a number between 0 an
 
 
 def nonnegative_float(value: object, name: str) -> float:
-    """Return `value` as a finite Python float ≥ 0. **Raises:** `TypeError` for a number that JAX
-    traces, and for what is no number; `ValueError` for several numbers, and for any other float.
-    The text `name` names the argument in messages.
+    """Return `value` as a finite Python float that is not negative. **Raises:** `TypeError` for a
+    number that JAX traces, and for anything that is not a number; `ValueError` for several numbers,
+    and for any other float. The text `name` names the argument in messages.
     """
     number = python_float(value, name)
     return 0.0 if number == 0 else positive_float(number, name, "a number ≥ 0")
@@ -561,7 +563,8 @@ def nonnegative_float(value: object, name: str) -> float:
 
 def host_array(value: object, name: str) -> np.ndarray:
     """Return the numbers `value` as a NumPy array of floats. **Raises:** `TypeError` for numbers
-    that JAX traces, and for what are no numbers; the text `name` names the argument in the message.
+    that JAX traces, and for anything but real numbers; the text `name` names the argument in the
+    message.
     """
     if isinstance(value, Tracer):
         raise TypeError(

@@ -27,7 +27,7 @@ class Rotation(Protocol):
 
 
 ScalarLike = Float[ArrayLike, ""]
-# A real number as diffrax hands it to a solver.
+# The types that a real number may have where diffrax gives it to a solver.
 RealLike = Scalar | np.ndarray | float | int
 Vec3Like = Float[ArrayLike, "3"]
 Mat3Like = Float[ArrayLike, "3 3"]

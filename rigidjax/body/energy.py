@@ -60,7 +60,8 @@ def kinetic_energy_about(
     (eqs 54–57) have no cross term: their origin is the centre of mass.
 
     **Arguments:** `body`; the point is its origin, the zero of `com`. `q` (4,) (w, x, y, z), body →
-    world; `velocity` (3,) V of that point, m/s, world frame; `omega` (3,) Ω, rad/s, body frame.
+    world; `velocity` (3,) V of that point, in metres per second, world frame; `omega` (3,) Ω,
+    rad/s, body frame.
 
     >>> ball = MassProperties(1.0, [1.0, 0, 0], [[0.0, 0, 0], [0, 0, 0], [0, 0, 0]])
     >>> kinetic_energy_about(ball, [1.0, 0, 0, 0], [0.0, 1, 0], [0.0, 0, 1])

@@ -136,9 +136,9 @@ class Inertia(eqx.Module):
     def shift(self, r: Vector, mass: ScalarLike) -> "Inertia":
         """Return the inertia about a point away from the centre of mass: `I + m (|r|² 1 − r rᵀ)`.
 
-        **Arguments:** `self` is about the centre of mass; `r` (3,) from the centre of mass to the
-        new point, or back, m, body frame; `mass` kg; a negative mass undoes a shift. Source:
-        Steiner; Landau and Lifshitz, eq 32.12.
+        **Arguments:** `self`, the inertia I about the centre of mass; `r` (3,) from the centre of
+        mass to the new point, or back, in metres, body frame; `mass` m, kg; a negative mass undoes
+        a shift. Source: Steiner; Landau and Lifshitz, eq 32.12.
 
         >>> Inertia.from_principal(1.0, 1.0, 1.0).shift([0.0, 0.0, 2.0], 3.0).moments
         Array([ 1., 13., 13.], dtype=float64)
@@ -186,7 +186,7 @@ class Inertia(eqx.Module):
 class MassProperties(eqx.Module):
     """Hold the mass, centre of mass and second moment of a body.
 
-    **Arguments:** `mass` m, kg; `com` (3,) centre of mass c, m, body frame (from the body's
+    **Arguments:** `mass` m, kg; `com` (3,) centre of mass c, in metres, body frame (from the body's
     origin); `second_moment` (3, 3) 𝔖 **about the centre of mass**, kg m², body axes (notes, eq 60).
     Known values are checked; for traced values call `check`.
 
@@ -248,8 +248,8 @@ class MassProperties(eqx.Module):
         """Return the second moment about another point, (3, 3), kg m², body axes: `𝔖 + m d dᵀ`,
         with the second moment 𝔖 about the centre of mass c, the mass m, and `d = c − point`.
 
-        **Arguments:** `point` (3,) m, body frame. Source: eq 60 of the notes with `r − point = (r −
-        c) + d`; the cross terms vanish.
+        **Arguments:** `point` (3,), in metres, body frame. Source: eq 60 of the notes with `r −
+        point = (r − c) + d`; the cross terms vanish.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> body.second_moment_about([0.0, 0, 0])[0, 0]
@@ -350,8 +350,8 @@ def with_tensor(body: OneBody, tensor: Mat3) -> OneBody:
 def _add_mass(
     body: MassProperties, mass: Array, com: Array, second_moment: Array
 ) -> MassProperties:
-    """Return the body that consists of a given body and of an added mass; with a negative `mass`
-    and `second_moment`, the body from which this mass is taken away.
+    """Return the body that consists of a given body and of an added mass. If `mass` and
+    `second_moment` are negative, mass is taken away from the given body instead.
 
     - `body`: the given body
     - `mass`: kg, the added mass

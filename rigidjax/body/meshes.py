@@ -30,15 +30,15 @@ def mesh(
 ) -> MassProperties:
     """Return the solid of one density inside a closed triangle mesh.
 
-    **Arguments:** `vertices` (n, 3) m, body frame; `faces` (m, 3) vertex numbers from 0,
+    **Arguments:** `vertices` (n, 3) in metres, body frame; `faces` (m, 3) vertex numbers from 0,
     counter-clockwise seen from outside (the faces around a hole inside the solid are a closed mesh
     with the opposite order); `density` kg/m³. The body is differentiable in `vertices` and
     `density`. Faces without area are allowed. Source: integrals over a tetrahedron, e.g. Tonon
     2004, J. Math. Stat. 1:8.
 
-    **Raises:** `ValueError` for a mesh that is open, whose faces disagree about which side is
-    outside, that is inside out, or that has a face with a repeated or missing vertex. Under `jit`
-    the faces are checked if they are known.
+    **Raises:** `ValueError` for a mesh that is open or inside out, for faces that disagree about
+    which side is outside, and for a face with a repeated or missing vertex. Under `jit` the faces
+    are checked if they are known.
 
     >>> corners = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     >>> body = mesh(corners, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], density=6.0)
@@ -104,10 +104,10 @@ def _sixfold_volumes_and_corners(
     vertices: Float[Array, "n 3"], faces: Array
 ) -> tuple[Float[Array, "m"], list[Array]]:
     """Return two things about the m tetrahedra between the origin and each face of a triangle mesh:
-    six times their signed volumes (m,), m³; and a list of three arrays (m, 3), m, with the first,
-    second and third corner of each face.
+    six times their signed volumes (m,), in cubic metres; and a list of three arrays (m, 3), in
+    metres, with the first, second and third corner of each face.
 
-    - `vertices`: (n, 3) m
+    - `vertices`: (n, 3), in metres
     - `faces`: (m, 3) integers, the three vertex numbers of each face
     """
     a, b, c = rows = [vertices[faces[:, k]] for k in range(3)]
@@ -115,10 +115,11 @@ def _sixfold_volumes_and_corners(
 
 
 def _require_positive_volume(volume: Array, vertices: Array, faces: Array) -> Array:
-    """Return the `volume` of a closed triangle mesh, m³. **Raises:** `ValueError` (`equinox` error
-    under `jit`) if it is negative, that is, if the mesh is inside out, or zero to round-off.
+    """Return the `volume` of a closed triangle mesh, in cubic metres. **Raises:** `ValueError`
+    (`equinox` error under `jit`) if the volume is negative, that is, if the mesh is inside out, and
+    if the volume is zero to round-off.
 
-    - `vertices`: (n, 3) m
+    - `vertices`: (n, 3), in metres
     - `faces`: (m, 3) integers, the three vertex numbers of each face
     """
     # A mesh is flat to round-off if the thickness is as small as the last digit of the length.

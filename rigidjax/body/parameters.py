@@ -288,8 +288,8 @@ def _limit_exponent(exponent: Array, map_excess: Callable[[Array], Array] = jnp.
     `map_excess`(|x| − limit), with the sign of x.
 
     - `exponent`: x, any array
-    - `map_excess`: `log1p`, which compresses what exceeds the limit to a logarithm; or `expm1`,
-      which undoes the compression
+    - `map_excess`: `log1p`, with which the result grows only logarithmically beyond the limit; or
+      its inverse function `expm1`, which restores x from such a result
     """
     limit = 31.0 if exponent.dtype == jnp.float32 else 330.0
     beyond = jnp.maximum(jnp.abs(exponent) - limit, 0.0)

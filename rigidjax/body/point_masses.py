@@ -17,9 +17,10 @@ from rigidjax.rotation.linalg3 import determinant
 def points(
     masses: Float[ArrayLike, "n"] | Numbers, positions: Float[ArrayLike, "n 3"] | Numbers
 ) -> MassProperties:
-    """Return the body made of point masses: `𝔖 = Σ m (r − c)(r − c)ᵀ` (notes, eq 60).
+    """Return the body made of point masses m at the positions r. Its second moment about the centre
+    of mass c is `𝔖 = Σ m (r − c)(r − c)ᵀ` (notes, eq 60).
 
-    **Arguments:** `masses` (n,) kg, none negative; `positions` (n, 3) m, body frame, at any
+    **Arguments:** `masses` (n,) kg, none negative; `positions` (n, 3) in metres, body frame, at any
     distance from the origin: the positions are shifted first, so that no digit is lost. **Raises:**
     `ValueError` for a negative mass.
 
@@ -46,9 +47,9 @@ def voxels(
 
     The result is exact for this density: the second moment of each cell about its own centre, `m
     h²/12` for a cell of mass m with the edge h, is included. **Arguments:** `density` (nx, ny, nz)
-    kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, m; `corner` (3,) of cell
-    [0, 0, 0] with the smallest x, y, z, m, body frame. **Raises:** `ValueError` for a negative
-    density.
+    kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, in metres; `corner` (3,)
+    of cell [0, 0, 0] with the smallest x, y, z, in metres, body frame. **Raises:** `ValueError` for
+    a negative density.
 
     >>> voxels(jnp.ones((1, 2, 3)), [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]).com
     Array([0.5, 1. , 1.5], dtype=float64)

@@ -49,11 +49,11 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
 
     The derivative is exact if the moments differ. Moments that are equal to round-off have one
     eigenspace: their derivatives are the diagonal entries of the change of the tensor, and the axes
-    do not turn inside the eigenspace. This is right for every function of the eigenspaces that is
-    symmetric in the moments. No finite derivative of an axis can describe how axes mix inside an
-    eigenspace. For a smooth function of the whole matrix, such as a square root, use
-    `rigidjax.body.matrix_function`; to solve, use the matrix itself. Source: notes, eqs 71–72;
-    first-order perturbation theory, Kato 1966, II.2.
+    do not turn inside the eigenspace. This rule gives the right derivative of every function that
+    depends on the eigenspaces and is symmetric in the moments. No finite derivative of an axis can
+    describe how axes mix inside an eigenspace. For a smooth function of the whole matrix, such as a
+    square root, use `rigidjax.body.matrix_function`; to solve, use the matrix itself. Source:
+    notes, eqs 71–72; first-order perturbation theory, Kato 1966, II.2.
 
     >>> moments, q = principal(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     >>> moments, q
@@ -117,13 +117,13 @@ def _eigensystem_jvp(
 
 
 def _jacobi_sweep(_: Array | int, state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-    """Apply three Jacobi rotations to a symmetric 3×3 matrix, each of which makes one entry off the
-    diagonal zero, and return the new state.
+    """Apply three Jacobi rotations to a symmetric 3×3 matrix, and return the new matrix and axes in
+    the form of `state`. Each rotation makes one entry off the diagonal zero.
 
     - `_`: the number of the sweep, which the loop passes and which is not used
-    - `state`: three triples, of the same form as the result: the diagonal entries; the entries
-      (2, 3), (1, 3) and (1, 2) off the diagonal; and the axes, which are the columns of the
-      rotation so far, each as a triple of scalars
+    - `state`: three triples: the diagonal entries; the entries (2, 3), (1, 3) and (1, 2) off the
+      diagonal; and the axes, which are the columns of the rotation so far, each as a triple of
+      scalars
     """
     values, opposite, axes = map(list, state)
     for k in range(3):

@@ -58,7 +58,7 @@ def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> Mas
     """Return a ball with a concentric hole. Its three principal second moments are `λ = m/5 · (R⁵ −
     r⁵)/(R³ − r³)`, computed with the factor R − r cancelled.
 
-    **Arguments:** `mass` kg; `inner` r ≤ `outer` R radii, m; equal radii give a shell.
+    **Arguments:** `mass` m, kg; radii `inner` r ≤ `outer` R, in metres; equal radii give a shell.
 
     >>> hollow_sphere(3.0, 1.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -96,10 +96,10 @@ def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassPr
 def hollow_cylinder(
     mass: ScalarLike, inner: ScalarLike, outer: ScalarLike, height: ScalarLike
 ) -> MassProperties:
-    """Return a tube along z. The second moment ∫ r rᵀ dm is `𝔖 = m diag((R² + r²)/4, (R² +
-    r²)/4, h²/12)`; equal radii give a thin tube.
+    """Return a tube along z. The second moment ∫ x xᵀ dm over the positions x is `𝔖 = m diag((R² +
+    r²)/4, (R² + r²)/4, h²/12)`; equal radii give a thin tube.
 
-    **Arguments:** `mass` kg; `inner` r ≤ `outer` R radii and `height` h, m.
+    **Arguments:** `mass` m, kg; radii `inner` r ≤ `outer` R, and `height` h, in metres.
 
     >>> hollow_cylinder(2.0, 1.0, 1.0, 0.0).inertia.moments
     Array([1., 1., 2.], dtype=float64)
@@ -128,11 +128,11 @@ def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassPro
 
 
 def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
-    """Return a solid cone along z. The second moment ∫ r rᵀ dm is `𝔖 = m diag(3r²/20, 3r²/20,
-    3h²/80)`.
+    """Return a solid cone along z. The second moment ∫ x xᵀ dm over the positions x is `𝔖 = m
+    diag(3r²/20, 3r²/20, 3h²/80)`.
 
-    **Arguments:** `mass` kg; `radius` of the base, `height` m. The centre of mass, at the origin,
-    is `height/4` above the base.
+    **Arguments:** `mass` m, kg; `radius` r of the base, and `height` h, in metres. The centre of
+    mass, at the origin, is h/4 above the base.
 
     >>> cone(80.0, 1.0, 2.0).inertia.moments
     Array([24., 24., 24.], dtype=float64)
@@ -142,10 +142,10 @@ def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProper
 
 
 def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassProperties:
-    """Return a solid ring around z. The second moment ∫ r rᵀ dm is `𝔖 = m diag(R²/2 + 3r²/8,
-    R²/2 + 3r²/8, r²/4)`; `minor` 0 gives a hoop.
+    """Return a solid ring around z. The second moment ∫ x xᵀ dm over the positions x is `𝔖 = m
+    diag(R²/2 + 3r²/8, R²/2 + 3r²/8, r²/4)`; `minor` 0 gives a hoop.
 
-    **Arguments:** `mass` kg; `major` radius R, from the centre of the ring to the middle of the
+    **Arguments:** `mass` m, kg; `major` radius R, from the centre of the ring to the middle of the
     tube, and `minor` radius r ≤ R of the tube, in metres.
 
     >>> torus(2.0, 1.0, 0.0).inertia.moments

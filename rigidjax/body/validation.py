@@ -161,8 +161,8 @@ def require_physical_body(
 def index_of_first_impossible_inertia(
     tensors: Float[Array, "n 3 3"],
 ) -> Array | np.ndarray:
-    """Return the index, a scalar, of the first of n matrices that is the inertia tensor of no body
-    or has a principal moment of zero, or −1 if there is none.
+    """Return the index of the first of n matrices that cannot be the inertia tensor of a body, or
+    that has a principal moment of zero. The index is a scalar, and −1 if there is no such matrix.
 
     A matrix with a NaN is skipped, since one such body must not stop a batch: its result is
     reported as `nonfinite_input`, and the other bodies are computed.

@@ -318,8 +318,8 @@ def box_half_lengths_and_axes(body: Inertia | MassProperties) -> tuple[np.ndarra
     and its axes (3, 3).
 
     The box has the mass m and the principal second moments λ of the body, and hence λ = m a²/3. The
-    columns of the second array are the axes of the box, in body axes. The half-lengths are in m for
-    `MassProperties`; for an `Inertia` they are scaled so that the longest is 1.
+    columns of the second array are the axes of the box, in body axes. The half-lengths are in
+    metres for `MassProperties`; for an `Inertia` they are scaled so that the longest is 1.
     """
     second, q = principal(body.second_moment)
     size = np.sqrt(np.maximum(np.asarray(second, dtype=float), 0.0))

@@ -126,9 +126,11 @@ def _draw_ellipsoid_outlines(ax: Any, matrices_by_name: dict[str, np.ndarray], u
 
 
 def _ellipsoid_matrix(body: Inertia | MassProperties) -> Any:
-    """Return the matrix A (3, 3) of the ellipsoid r·A⁻¹r = 1 that is drawn for a body: 5𝔖/m, m²,
-    for a body with mass m, or 𝔖, kg m², for an `Inertia`, where 𝔖 = ∫ r rᵀ dm (3, 3) is its second
-    moment of mass.
+    """Return the matrix A (3, 3) of the ellipsoid r·A⁻¹r = 1 that is drawn for a body with the
+    second moment of mass 𝔖 = ∫ r rᵀ dm (3, 3).
+
+    For `MassProperties` A is 5𝔖 divided by the mass, in square metres; for an `Inertia` A is 𝔖, kg
+    m².
     """
     if isinstance(body, MassProperties):
         return body.second_moment * (5.0 / body.mass)

@@ -76,7 +76,8 @@ def _dense_times_and_states(
     The result is `None` for a body under a torque, and for a recording with more than 300 times.
 
     - `fit_result`: a `Fit`, the result of a fit.
-    - `record`: one of its recordings, which has the times of the readings.
+    - `record`: one of the recordings of the fit; the evenly spaced times are between its first and
+      its last time.
     - `index`: the index of this recording in the fit.
     """
     model, body, state0 = fit_result.model, fit_result.body, fit_result.state0
@@ -99,7 +100,8 @@ def _draw_readings_and_residuals(
     dense_states: tuple[np.ndarray, PyTree] | None,
     units: tuple[float, float, str],
 ) -> None:
-    """Draw the readings of one sensor with the fitted line above, and the residuals below.
+    """Draw the readings of one sensor and the fitted line in the upper axes, and the residuals in
+    the lower axes.
 
     - `upper_axes`, `lower_axes`: matplotlib axes.
     - `ts`: (T,) the times of the readings, s.

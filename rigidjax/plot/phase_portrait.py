@@ -28,11 +28,11 @@ def phase_portrait(
     """Draw the motion of a symmetric top in the plane of the tilt θ and its rate θ̇, with curves of
     equal energy.
 
-    `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ` with I₁ the moment of inertia
-    across the axis, the mass m, gravity g, the distance l of the centre of mass from the pivot, and
-    two momenta of the initial state: p_φ about the vertical and p_ψ about the axis of the top. The
-    cross marks steady precession, where the energy is least. Source: Landau and Lifshitz,
-    Mechanics, § 35, problem 1.
+    The energy is `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ`, with the moment of
+    inertia I₁ across the axis, the mass m, gravity g, and the distance l of the centre of mass from
+    the pivot. Two angular momenta are taken from the initial state: p_φ about the vertical, and p_ψ
+    about the axis of the top. The cross marks steady precession, where the energy is least. Source:
+    Landau and Lifshitz, Mechanics, § 35, problem 1.
 
     **Arguments:** `inertia` about the pivot; `top` the weight and the centre of mass, which is on
     the axis of symmetry; `states` of one body with a leading time axis; `levels` the number of thin
@@ -100,8 +100,8 @@ def _symmetric_top_constants(
 ) -> tuple[float, float, np.ndarray, float, np.ndarray]:
     """Return five constants of a heavy symmetric top: the moments of inertia I₁ across and I₃ about
     the axis of symmetry, kg m²; the axis (3,), body frame, from the pivot to the centre of mass;
-    the torque m g l, N m, of the weight m g at the distance l from the pivot; and the upward unit
-    vector (3,), world frame.
+    the product of the weight and the distance of the centre of mass from the pivot, N m; and the
+    upward unit vector (3,), world frame.
 
     Raise an error for a body without this symmetry or without weight.
 

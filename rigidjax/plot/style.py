@@ -174,7 +174,12 @@ def points_on_unit_sphere(longitude: np.ndarray, colatitude: np.ndarray) -> np.n
 def draw_curve_on_sphere(
     ax: Any, path: np.ndarray, *, hidden_style: dict[str, Any] | None = None, **style: Any
 ) -> None:
-    """Draw a line `path` (T, 3) on the unit sphere, in `hidden_style` where the sphere hides it."""
+    """Draw a line `path` (T, 3) on the unit sphere; the part that the sphere hides has the
+    `hidden_style`.
+
+    `hidden_style` and `style` are arguments of `ax.plot`; if `hidden_style` is not given, the
+    hidden part is faint.
+    """
     up, around = np.radians(ax.elev), np.radians(ax.azim)
     eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
     front, label = path @ eye > 0, style.pop("label", None)

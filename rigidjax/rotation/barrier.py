@@ -34,8 +34,8 @@ def platform() -> str:
 
 
 def barrier(tree: Tree) -> Tree:
-    """Return the arrays of `tree` unchanged, such that XLA on CPU computes each once for all its
-    uses, instead of repeating its operations at each use.
+    """Return the arrays of `tree` unchanged, such that XLA on CPU computes each array once for all
+    its uses, and does not repeat the computation at each use.
 
     This is done by `lax.optimization_barrier`, or, where XLA drops such barriers, by a division by
     one (`prevent_recomputation`).

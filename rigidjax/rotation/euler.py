@@ -121,7 +121,8 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
 
 
 def is_singular(angles: Vec3Like, sequence: str = "ZXZ") -> Bool[Array, ""]:
-    """Return whether the outer turns of these angles have the same axis, to 4 units of round-off.
+    """Return whether the first and the last turn of Euler angles are about one axis, to 4 units of
+    round-off.
 
     **Arguments:** `angles` (3,), rad, in the order of `sequence`. For a matrix:
     `is_singular(from_matrix(matrix, sequence), sequence)`.
@@ -259,8 +260,8 @@ def _rotation_about(axis: int, angle: Scalar) -> Quat:
 
 
 def _wrap_to_half_turn(angle: Scalar) -> Scalar:
-    """Return `angle`, rad, which is between −2π and 2π, shifted by a full turn into the interval
-    (−π, π] if it lies outside this interval.
+    """Return `angle`, rad, shifted by a full turn into the interval (−π, π] if it is outside this
+    interval. The angle must be between −2π and 2π.
     """
     angle = jnp.where(angle > np.pi, angle - 2 * np.pi, angle)
     return jnp.where(angle <= -np.pi, angle + 2 * np.pi, angle)

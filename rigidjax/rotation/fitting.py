@@ -48,7 +48,8 @@ def project(matrix: Mat3Like) -> Mat3:
 
     **Arguments:** `matrix` (3, 3), det > 0. **Returns:** (3, 3) with RᵀR = 1 to round-off.
     **Raises:** `ValueError` if a known matrix is left-handed (no rotation is nearest to a mirror
-    image), singular, or not finite. Under `jit` call `so3.check` first, or a test of your own.
+    image), singular, or not finite. Traced values are not checked: under `jit`, test det > 0 in
+    your own program.
 
     >>> project(2.0 * jnp.eye(3)).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -79,9 +80,9 @@ def wahba(
     float32). The method solves the quartic of Markley 1993 (FOAM, J. Astronaut. Sci. 41, 261), then
     takes Newton steps on the group.
 
-    **Raises:** an error, also under `jit`, if the directions do not determine the rotation: fewer
-    than two, or all parallel (to 5e-4 rad in float64, 4° in float32, where half the digits would be
-    lost); `ValueError` for known NaN, and for all zeros.
+    **Raises:** an error, also under `jit`, if the directions do not determine the rotation: if
+    there are fewer than two, or if all are parallel to within 5e-4 rad (float32: 4°), where half
+    the digits would be lost; `ValueError` for known NaN, and for directions that are all zero.
 
     >>> wahba(jnp.eye(3)[:2], jnp.eye(3)[:2]).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]

@@ -88,10 +88,12 @@ def _log_of_quaternion(q: Quat) -> Vec3:
 
 @_log_of_quaternion.defjvp
 def _log_of_quaternion_jvp(primals: tuple[Quat], tangents: tuple[Quat]) -> tuple[Vec3, Vec3]:
-    """Return the rotation vector (3,), rad, of a quaternion q of any length, and its change for a
-    change dq of q, by the inverse of the right Jacobian (the matrix from a change of the rotation
-    vector to the small turn in the body frame). By this rule JAX differentiates
+    """Return two things for a quaternion q of any length: its rotation vector (3,), rad; and the
+    change of the rotation vector for a change dq of q. By this rule JAX differentiates
     `_log_of_quaternion`.
+
+    The right Jacobian is the matrix that gives the small turn in the body frame for a change of the
+    rotation vector; its inverse gives the change for a turn.
 
     - `primals`: a tuple of one item, q (4,)
     - `tangents`: a tuple of one item, dq (4,)

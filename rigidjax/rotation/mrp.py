@@ -78,8 +78,9 @@ def shadow(sigma: Vec3Like) -> Vec3:
 
 
 def switch(sigma: Vec3Like) -> Vec3:
-    """Return `sigma` (3,) if |σ| ≤ 1, else its shadow, which is the shorter turn. Call this
-    function only between two steps of a solver, because the parameters jump.
+    """Return `sigma` (3,) if |σ| ≤ 1, else its shadow −σ/|σ|², which describes the same rotation by
+    the shorter turn. Call this function only between two steps of a solver: within a step a solver
+    needs parameters that do not jump.
 
     >>> switch(jnp.array([0.0, 2.0, 0.0])).tolist()
     [-0.0, -0.5, -0.0]
@@ -100,10 +101,10 @@ def _shadow_unchecked(sigma: Vec3) -> Vec3:
 
 def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
     """Return the rates of the parameters σ at the angular velocity Ω, dσ/dt = ¼ [(1 − s) Ω + 2 σ ×
-    Ω + 2 σ (σ·Ω)], 1/s, with s = |σ|²; the rates are finite for every finite σ (Schaub & Junkins,
-    eq 3.160).
+    Ω + 2 σ (σ·Ω)], per second, with s = |σ|²; the rates are finite for every finite σ (Schaub &
+    Junkins, eq 3.160).
 
-    **Arguments:** `sigma` (3,) dimensionless; `omega` (3,) rad/s, body frame.
+    **Arguments:** `sigma` (3,) dimensionless; `omega` (3,) Ω, in radians per second, body frame.
 
     >>> omega_to_rates(jnp.zeros(3), jnp.array([0.0, 0.0, 4.0])).tolist()
     [0.0, 0.0, 1.0]
@@ -118,7 +119,8 @@ def rates_to_omega(sigma: Vec3Like, rates: Vec3Like) -> Vec3:
     """Return the angular velocity, body frame, of the parameters σ and their rates σ̇ = dσ/dt: Ω =
     4/(1 + s)² [(1 − s) σ̇ − 2 σ × σ̇ + 2 σ (σ·σ̇)], with s = |σ|² (Schaub & Junkins, eq 3.164).
 
-    **Arguments:** `sigma` (3,) dimensionless; `rates` (3,) 1/s. **Returns:** (3,) rad/s.
+    **Arguments:** `sigma` (3,) dimensionless; `rates` (3,) σ̇, per second. **Returns:** (3,) in
+    radians per second.
 
     >>> rates_to_omega(jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 4.0]

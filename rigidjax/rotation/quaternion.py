@@ -7,10 +7,11 @@ cost little in a vector field; `check` is for data from outside. The functions c
 values, not traced values.
 
 Range: functions of a quaternion or axis of any length (`normalise`, `log`, `angle`, `about_axis`)
-take lengths from 1e-307 to 1e308 (float32: 1e-37 to 1e38). An angle beyond 1/ε, 4.5e15 rad
-(float32: 8.4e6), has no correct digit: `exp` and the functions that use `exp` refuse such an angle.
-A traced angle beyond 1/ε gives an arbitrary rotation, and NaN beyond 1e150 (1e18). Vectors and
-rates beside a unit quaternion may have components up to 1e307 (1e37).
+take lengths from 1e-307 to 1e308 (float32: 1e-37 to 1e38). An angle beyond 1/ε, where ε is the unit
+of round-off, has no correct digit: `exp` and the functions that use `exp` refuse an angle above
+4.5e15 rad (float32: 8.4e6 rad). A traced angle beyond 1/ε gives an arbitrary rotation, and NaN
+beyond 1e150 rad (float32: 1e18 rad). Vectors and rates that a function takes besides a unit
+quaternion may have components up to 1e307 (float32: 1e37).
 """
 
 from collections.abc import Sequence
@@ -80,9 +81,10 @@ def log(q: QuatLike) -> Vec3:
     """Return the shortest rotation vector of a quaternion, rad, |v| ≤ π.
 
     **Arguments:** `q` (4,) of any length. **Returns:** v = 2 atan2(|q_v|, q_w) q_v/|q_v| (3,), with
-    the scalar part q_w and the vector part q_v of `canonical(q)`. The derivative is that of q/|q|,
-    by the inverse right Jacobian, and correct from 0 to π (Solà 2018, arXiv:1711.02508; the angle
-    is halved twice to avoid cancellation and branches). **Raises:** `ValueError` for zero or NaN.
+    the scalar part q_w and the vector part q_v of `canonical(q)`. The derivative is that of the
+    rotation vector of q/|q|, by the inverse of the right Jacobian, and is correct for angles from 0
+    to π (Solà 2018, arXiv:1711.02508; the angle is halved twice to avoid cancellation and
+    branches). **Raises:** `ValueError` for zero or NaN.
 
     >>> abs(log(jnp.array([0.0, 0.0, 0.0, -1.0]))).round(6).tolist()
     [0.0, 0.0, 3.141593]
@@ -146,8 +148,8 @@ def check(
 
     **Arguments:** `q` (..., 4), scalar first, or a `Rotation` of SciPy; `name` the name of the
     argument in messages. **Returns:** the quaternion, with length 1 to round-off. **Raises:**
-    `ValueError` (under `jit` `equinox.error_if`) for NaN, zero, and a length off by more than 1e-6
-    (float32: 1e-3).
+    `ValueError` (under `jit` `equinox.error_if`) for NaN, zero, and a length that differs from 1 by
+    more than 1e-6 (float32: 1e-3).
 
     >>> check(jnp.array([1.0, 0.0, 0.0, 1e-9])).tolist()[0]
     1.0

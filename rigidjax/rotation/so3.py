@@ -41,9 +41,9 @@ from rigidjax.rotation.validation import require_rotation_matrix, require_turn_n
 def exp(v: Vec3Like) -> Mat3:
     """Return the rotation by |v| about v: 1 + A hat v + B (hat v)² (notes, eqs 15, 17, 18).
 
-    **Arguments:** `v` (3,) rotation vector, rad. A = sin θ/θ and B = (1 − cos θ)/θ² (Rodrigues
-    1840) are both computed from θ/2. The angle θ = |v| has an error of ε|v|, where ε is the unit of
-    round-off. **Raises:** as `quaternion.exp`.
+    **Arguments:** `v` (3,) rotation vector, rad; hat v is the matrix of the cross product with v. A
+    = sin θ/θ and B = (1 − cos θ)/θ² (Rodrigues 1840) are both computed from θ/2. The angle θ = |v|
+    has an error of ε|v|, where ε is the unit of round-off. **Raises:** as `quaternion.exp`.
 
     >>> exp(jnp.array([0.0, 0.0, jnp.pi / 2])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
@@ -68,9 +68,9 @@ def left_jacobian(v: Vec3Like) -> Mat3:
     """Return the left Jacobian J_l, with exp(v + dv) = exp(J_l dv) exp(v) to first order: J_l dv is
     the small turn in the world frame.
 
-    **Arguments:** `v` (3,) rotation vector, rad. J_l = 1 + B hat v + C (hat v)², with θ = |v|, B =
-    (1 − cos θ)/θ², C = (θ − sin θ)/θ³ (Chirikjian 2012, doi:10.1007/978-0-8176-4944-9; Solà 2018,
-    eq 145). **Raises:** as `exp`.
+    **Arguments:** `v` (3,) rotation vector, rad. J_l = 1 + B hat v + C (hat v)², with the matrix
+    hat v of the cross product with v, θ = |v|, B = (1 − cos θ)/θ², C = (θ − sin θ)/θ³ (Chirikjian
+    2012, doi:10.1007/978-0-8176-4944-9; Solà 2018, eq 145). **Raises:** as `exp`.
 
     >>> left_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -82,7 +82,7 @@ def left_jacobian(v: Vec3Like) -> Mat3:
 
 def right_jacobian(v: Vec3Like) -> Mat3:
     """Return the right Jacobian J_r of `v` (3,), rad, with exp(v + dv) = exp(v) exp(J_r dv) to
-    first order; J_r = J_l(v)ᵀ (Solà 2018, eq 143).
+    first order; it is the transpose of the left Jacobian of v (Solà 2018, eq 143).
 
     >>> right_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -94,7 +94,8 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
     """Return the inverse of the left Jacobian: 1 − ½ hat v + g (hat v)², with θ = |v| and g = (1 −
     (θ/2) cot(θ/2))/θ².
 
-    **Arguments:** `v` (3,) rotation vector, rad, |v| < 2π (Solà 2018, eq 146).
+    **Arguments:** `v` (3,) rotation vector, rad, |v| < 2π; hat v is the matrix of the cross product
+    with v (Solà 2018, eq 146).
 
     >>> left_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -144,10 +145,11 @@ def _relative_rotation(a: Mat3, b: Mat3) -> Mat3:
 
 
 def about_axis(axis: Vec3Like, angle: ScalarLike) -> Mat3:
-    """Return the rotation exp(γ J_y) by an angle γ about an axis y (notes, eqs 17, 18).
+    """Return the rotation exp(γ J_y) by an angle γ about a unit axis y, where J_y is the matrix of
+    the cross product with y (notes, eqs 17, 18).
 
-    **Arguments:** `axis` (3,) of any length; `angle` rad, right-handed about `axis`. **Raises:** as
-    `quaternion.about_axis`.
+    **Arguments:** `axis` (3,) along y, of any length; `angle` γ, rad, right-handed about `axis`.
+    **Raises:** as `quaternion.about_axis`.
 
     >>> about_axis(jnp.array([0.0, 0.0, 2.0]), jnp.pi / 2).round(12)[0].tolist()
     [0.0, -1.0, 0.0]

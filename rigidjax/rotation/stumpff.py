@@ -3,8 +3,8 @@
 Rotations need sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³, … as functions of t = θ². These are the
 Stumpff functions c_k(t) = Σ (−t)ⁿ/(k + 2n)!  (Stumpff 1959; Battin 1999, sec. 4.5). Their
 derivatives are Stumpff functions too, c_k' = ½ (k c_{k+2} − c_{k+1}), so that no derivative needs a
-cancelling quotient. Polynomials on a reduced range replace libm's sine and cosine, which take
-one number at a time on CPU, while polynomials take a whole vector.
+cancelling quotient. Sine and cosine are computed by polynomials on a reduced range: on CPU the
+functions of libm take one number at a time, and a polynomial takes a whole vector.
 """
 
 import math
@@ -27,8 +27,8 @@ _PI_PARTS = {
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)! of the order k = 0, 1, 2, …, for t =
-    θ² ≥ 0, any shape (Battin 1999, eq 4.80).
+    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, a sum over n = 0, 1, 2, …, of the
+    order k = 0, 1, 2, …, for t = θ² ≥ 0, any shape (Battin 1999, eq 4.80).
 
     c_0 is cos θ, c_1 sin θ/θ, c_2 (1 − cos θ)/θ², c_3 (θ − sin θ)/θ³. Values and derivatives of
     every order are right to a few units of round-off of 1/k!.
