@@ -10,7 +10,7 @@ from jax.core import Tracer
 
 from rigidjax import _checks
 
-# An array with more numbers than this is printed as its shape.
+# An array with more numbers than this is printed as its dtype and shape.
 MOST = 16
 # For each unit in which reports show angular rates: the factor that converts rad/s to this unit.
 _RATE_UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}

@@ -62,8 +62,9 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     return bodies
 
 
-# For each attribute of `<compiler>` in a MuJoCo file: the values with which MuJoCo takes the masses
-# as they are written (`_UNCHANGED`), and what it does with any other value (`_CHANGES`).
+# The keys are attributes of the element `<compiler>` in a MuJoCo file. `_UNCHANGED` has the values
+# with which MuJoCo takes masses and inertias as they are written; `_CHANGES` says what MuJoCo does
+# with any other value.
 _UNCHANGED = {
     "inertiafromgeom": ("false", "auto"), "settotalmass": ("-1", "0"), "balanceinertia": ("false",),
     "boundmass": ("0",), "boundinertia": ("0",), "coordinate": ("local",),

@@ -79,8 +79,8 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
 
 
 def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
-    """Return the second moment (3, 3), kg m², of a `vector` (6,) as `pack_second_moment` returns
-    it.
+    """Return the second moment (3, 3), kg m², that a `vector` (6,) of `pack_second_moment`
+    describes; any six numbers describe a second moment.
 
     >>> unpack_second_moment(jnp.zeros(6))[0]
     Array([1., 0., 0.], dtype=float64)
@@ -107,8 +107,8 @@ def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
 
 
 def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
-    """Return the second moment (3, 3) with trace 1 (so `Tr I = 2`) of a `vector` (5,) as
-    `pack_shape` returns it.
+    """Return the second moment (3, 3) that a `vector` (5,) of `pack_shape` describes, scaled to
+    trace 1; the trace of the inertia tensor is then 2.
 
     >>> float(jnp.trace(unpack_shape(jnp.ones(5))))
     1.0
@@ -136,8 +136,8 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
 
 
 def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
-    """Return the principal moments (3,), kg m², of a real body, from a `vector` (3,) as
-    `pack_moments` returns it.
+    """Return the principal moments (3,), kg m², that a `vector` (3,) of `pack_moments` describes;
+    any three numbers describe the moments of a real body.
 
     >>> unpack_moments([0.0, 0.0, 0.0])
     Array([2., 2., 2.], dtype=float64)
@@ -199,8 +199,8 @@ def flat_bend(
 
 
 def _second_moment_from_shape(shape: Float[Array, "5"]) -> Mat3:
-    """Return the second moment (3, 3) of a body, scaled to trace 1, that five unconstrained numbers
-    describe: (1 + V)²/Tr (1 + V)², where V is a symmetric matrix of trace zero, and 1 the unit
+    """Return the second moment (3, 3) of a body, scaled to trace 1, from five unconstrained
+    numbers: (1 + V)²/Tr((1 + V)²). Here V is a symmetric matrix of trace zero, and 1 the unit
     matrix.
 
     - `shape`: (5,), the entries V₁₁, V₂₂, V₁₂, V₂₃, V₁₃
@@ -214,8 +214,8 @@ def _second_moment_from_shape(shape: Float[Array, "5"]) -> Mat3:
 
 
 def _second_moment_root_from_shape(shape: Float[Array, "5"]) -> Mat3:
-    """Return the symmetric matrix 1 + V (3, 3), where 1 is the unit matrix: the square root of the
-    second moment of a body, scaled to trace 3.
+    """Return the square root of the second moment of a body, scaled to trace 3: the symmetric
+    matrix 1 + V (3, 3), where 1 is the unit matrix.
 
     - `shape`: (5,), the entries V₁₁, V₂₂, V₁₂, V₂₃, V₁₃ of the symmetric matrix V, whose trace is
       zero
@@ -225,10 +225,10 @@ def _second_moment_root_from_shape(shape: Float[Array, "5"]) -> Mat3:
 
 
 def _unconstrained_from_second_moment(s: Mat3) -> Float[Array, "6"]:
-    """Return six numbers, each of which may have any value, that describe a second moment s: (ρ,
-    V₁₁, V₂₂, V₁₂, V₂₃, V₁₃) with s = 3 e^{2ρ} (1 + V)²/Tr (1 + V)², where V is a symmetric matrix
-    of trace zero, and 1 the unit matrix. **Raises:** `ValueError` for a matrix that is zero, or
-    that is not symmetric and positive semi-definite.
+    """Return six unconstrained numbers that describe a second moment s: (ρ, V₁₁, V₂₂, V₁₂, V₂₃,
+    V₁₃) with s = 3 e^{2ρ} (1 + V)²/Tr((1 + V)²). Here V is a symmetric matrix of trace zero, and 1
+    the unit matrix. **Raises:** `ValueError` for a matrix that is zero, or that is not symmetric
+    and positive semi-definite.
 
     - `s`: (3, 3), kg m² or any other unit, the second moment ∫ r rᵀ dm of a body
     """

@@ -30,8 +30,9 @@ _CLOSE = 1.0 / 32.0
 # The nodes and weights of Gauss–Legendre quadrature with eight points on [0, 1].
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
-# Divided differences do not depend on the order of their arguments: they are computed for the
-# sorted pairs (i, j) and triples (i, k, j) of eigenvalues, and read from these by index.
+# Divided differences do not depend on the order of their arguments: they are computed only for
+# sorted pairs (i, j) and sorted triples (i, k, j) of eigenvalues. `_PAIR` and `_TRIPLE` give the
+# place of any pair or triple in these lists.
 _PAIRS = list(itertools.combinations_with_replacement(range(3), 2))
 _TRIPLES = list(itertools.combinations_with_replacement(range(3), 3))
 _PAIR = np.array([_PAIRS.index(tuple(sorted(t))) for t in np.ndindex(3, 3)]).reshape(3, 3)

@@ -20,8 +20,8 @@ from rigidjax._types import Quat, Quaternion
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.validation import require_near_unit, rotation_tolerance
 
-# The tolerance of the checks, in units of round-off of the largest entry of a matrix. The error of
-# a turned tensor R I Rᵀ, about ten such units, must pass.
+# The tolerance of the checks, in units of round-off of the largest entry of a matrix. A tensor R I
+# Rᵀ that a rotation R has turned has an error of about ten such units, and must pass.
 _FORGIVEN = 64.0
 
 

@@ -149,8 +149,8 @@ def tumble(
     figure = Figure(figsize=(3.6, 3.6), dpi=size / 3.6)
     canvas = FigureCanvasAgg(figure)
     ax: Any = figure.add_axes((0.0, 0.08, 0.86, 0.84), projection="3d")
-    # The path goes through every given state: with the states of the pictures alone it would be a
-    # zigzag.
+    # The path goes through every given state: through the states of the few pictures alone it would
+    # be a zigzag.
     when, tips = np.asarray(ts, dtype=float), rotation_matrices(attitudes_on_host(states)) @ tip
     unit = ", m" if isinstance(body, MassProperties) else ""
     set_equal_scales(ax, reach, (f"x{unit}", f"y{unit}", f"z{unit}"))
@@ -184,8 +184,8 @@ def _duration_and_picture_count(
     """Return two numbers: the duration of a film, s; and the number of its pictures, at least 2.
 
     - `ts`: (T,) the times of the motion, s.
-    - `seconds`: the wanted duration, s; `None` takes the duration of the motion, or 20 s for a
-      longer motion.
+    - `seconds`: the wanted duration, s; with `None` it is the duration of the motion, but at most
+      20 s.
     - `fps`: the number of pictures a second.
     """
     if seconds is None:
@@ -304,8 +304,8 @@ def _box_corners_axis_end_and_half_diagonal(
     """Return three things, for the uniform box that moves as the body does: its corners (8, 3); the
     end (3,) of its longest half-axis; and half of its diagonal.
 
-    Corners and end are in body axes. Lengths are in m for `MassProperties`, and relative to the
-    longest half-axis for an `Inertia`.
+    The corners and the end are given in body axes. Lengths are in metres for `MassProperties`; for
+    an `Inertia` the longest half-axis has the length 1.
     """
     half, turn = box_half_lengths_and_axes(body)
     longest = np.argmax(half)

@@ -121,7 +121,8 @@ def _draw_readings_and_residuals(
     scale, unit, line_t = 1.0, sensor.unit, t
     if sensor.reading_shape == (4,):
         read, scale = _body_z_in_world(values), 180 / np.pi
-        # The prediction is the reading, turned back by the residual.
+        # The predicted attitude is the attitude read, turned back by the residual, which is a
+        # rotation vector in body axes.
         back = jax.vmap(lambda q, e: quaternion.multiply(q, quaternion.exp(-e)))
         line = _body_z_in_world(back(jnp.asarray(values), jnp.asarray(errors)))
         names = tuple(f"{axis} of body z" for axis in "xyz")

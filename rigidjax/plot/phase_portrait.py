@@ -103,7 +103,8 @@ def _symmetric_top_constants(
     the product of the weight and the distance of the centre of mass from the pivot, N m; and the
     upward unit vector (3,), world frame.
 
-    Raise an error for a body without this symmetry or without weight.
+    **Raises:** `ValueError` for a body that is not symmetric about this axis, and for a weight of
+    zero or a centre of mass at the pivot.
 
     - `inertia`: the inertia about the pivot.
     - `top`: the torque of the weight, with mass, centre of mass and gravity.

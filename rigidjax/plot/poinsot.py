@@ -130,8 +130,8 @@ def _draw_curves_of_equal_energy(ax: Any, moments: np.ndarray, curve_count: int)
     import contourpy
 
     def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
-        # The pole of the coordinates is along the axis of the middle moment. No closed curve goes
-        # round this axis, so that no curve is cut where the longitude jumps by 2π.
+        # The pole of the longitude and colatitude is on the axis of the middle moment. No closed
+        # curve goes round this axis, so that no curve is cut where the longitude jumps by 2π.
         return style.points_on_unit_sphere(around, down)[[1, 2, 0]]
 
     inverse = 1 / moments

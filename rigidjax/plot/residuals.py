@@ -64,7 +64,7 @@ def _draw_sensor_residuals(
     - `t`: (T,) the T times of the readings, in the unit of the picture.
     - `standardised_residuals`: (T, k) the residuals divided by their standard deviation, for the k
       axes of the sensor.
-    - `mask`: (T,) true at times with a reading; other residuals are not drawn.
+    - `mask`: (T,) true at times with a reading; the residuals at other times are not drawn.
     """
     over_time, spread, memory, spectrum = four_panels
     colours, names = (

@@ -50,7 +50,8 @@ def recording_residuals_and_standard_deviations(
     """Return three things: a recording of a fit; its residuals, an array for each sensor; and the
     standard deviations of the residuals, an array for each sensor.
 
-    Raise an error if `fit_result` is not one fit, or has no recording with this `index`.
+    **Raises:** `TypeError` if `fit_result` is no `Fit`; `ValueError` if it is a batch of fits, or
+    if it has no recording with this `index`.
     """
     if np.shape(getattr(fit_result, "chi2", 0.0)) != ():
         raise ValueError(

@@ -1,5 +1,5 @@
-"""Give hints to XLA: which numbers to compute once for all their uses, and what to compile as one
-kernel.
+"""Give hints to XLA: which numbers it computes once for all their uses, and which functions it
+compiles as one kernel.
 """
 
 import functools
@@ -114,9 +114,10 @@ def match_batch_axes(tree: PyTree, reference: PyTree) -> PyTree:
     """Return the arrays of `tree` unchanged; under `jax.vmap` every one of them has a batch axis if
     any array of the tree `reference` has one.
 
-    The batching rule of `compiled_as_one_kernel` does the same. Under `jit`, JAX takes the batch
-    axes from the function, and the values from the rule for the derivative. If the function and the
-    rule batch differently, arrays have wrong shapes, and no error is raised.
+    A function from `compiled_as_one_kernel` gives all of its results a batch axis if any argument
+    has one; the rule for its derivative calls `match_batch_axes` to do the same. Under `jit`, JAX
+    takes the batch axes from the function, and the values from the rule for the derivative. If the
+    function and the rule batch differently, arrays have wrong shapes, and no error is raised.
     """
     return _unchanged_with_batch_axes(tree, reference)
 

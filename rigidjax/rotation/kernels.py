@@ -1,5 +1,5 @@
-"""Compute the costly maps of `quaternion` and `so3`, without checks, compiled also outside of
-`jit`.
+"""Compute the costly functions of `quaternion` and `so3`, without checks of the arguments. They are
+compiled also if they are called outside of `jit`.
 """
 
 from collections.abc import Iterable, Sequence

@@ -87,7 +87,8 @@ def _cosine_or_sinc_of_square(k: int, t: Float[Array, "..."]) -> Float[Array, ".
     """Return cos θ (for k = 0) or sin θ/θ (for k = 1) of an angle θ, rad, that is given by its
     square.
 
-    If θ is above π/2, it is first reduced by half turns; else a polynomial in θ² is used.
+    The value is that of a polynomial. An angle θ above π/2 is first reduced by half turns to a
+    remainder between −π/2 and π/2.
 
     - `k`: 0 or 1
     - `t`: θ² ≥ 0, any shape
