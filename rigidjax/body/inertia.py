@@ -44,8 +44,8 @@ class Inertia(eqx.Module):
     **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor checks shape and dtype only;
     `from_tensor`, `from_principal`, `from_second_moment`, and every function that takes a body,
     check that some mass has this inertia. `scale` is `None`, or "arbitrary" if only the ratios of
-    the components are known, as after a fit of free motion: `simulate` then warns if a torque acts,
-    and `shift` raises `ValueError`.
+    the components are known, as after a fit of free motion: `simulate` then warns of a torque in N
+    m, and `shift` raises `ValueError`.
 
     The object stores I, not 𝔖: `from_tensor` changes no digit, and the small moment of a rod keeps
     all its digits. Source: notes, eqs 76–78.
