@@ -24,8 +24,8 @@ from rigidjax.cli.logs.layouts import imu_columns_of
 from rigidjax.cli.logs.units import TIME_UNITS, unit_in_column_name
 from rigidjax.workprecision import command as workprecision
 
-# The demo takes only these options; all other options describe how to read logs, and the demo reads
-# no log.
+# The demo takes only these options. All other options describe how to read logs or what to fit to
+# them, and the demo reads no log.
 _OF_DEMO = ("starts", "checkpoint", "figure", "report", "json", "no_cache")
 # Each of these options names a file to write. Two options must not name the same file, and none may
 # name a log that is read.
@@ -38,9 +38,9 @@ def main(arguments: list[str] | None = None) -> int:
     The code is 0 for success, 1 for a fit that cannot be trusted, 2 for bad input or a file that
     could not be written, and 130 for an interrupt.
 
-    **Arguments:** `arguments` of the command line; `None` takes the arguments of this process. With
-    `None` the process belongs to this command, so that compiled programs are kept for the next run,
-    unless `--no-cache` is given.
+    **Arguments:** `arguments` the words of the command line, or `None` for those that this process
+    was started with. With `None` the process belongs to this command alone, so that settings of JAX
+    may be changed: compiled programs are then kept for the next run, unless `--no-cache` is given.
     """
     parser = _make_parser()
     options = parser.parse_args(arguments)
@@ -67,15 +67,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _raise_interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
-    """Raise a Ctrl-C (`KeyboardInterrupt`) again if Python dropped it, as it does within the
-    function that JAX lets the garbage collector call.
+    """Raise a Ctrl-C (`KeyboardInterrupt`) again if Python dropped it. Python does so if the
+    interrupt comes while the garbage collector calls a function of JAX.
 
-    `dropped` holds an exception that Python could not raise, as `sys.unraisablehook` gets it; other
-    exceptions are reported as usual.
+    `dropped` holds the exception that Python could not raise; this function is set as
+    `sys.unraisablehook`. An exception other than Ctrl-C is reported as usual.
     """
     if dropped.exc_type is KeyboardInterrupt:
-        # Another thread raises the interrupt a moment later: within this hook it would be dropped
-        # again.
+        # Another thread raises the interrupt a moment later: an interrupt that is raised within
+        # this hook would be dropped again.
         threading.Timer(0.05, _thread.interrupt_main).start()
     else:
         sys.__unraisablehook__(dropped)
@@ -108,10 +108,10 @@ def _dispatch_command(
 
 
 def _check_output_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Check the output files that the `options` name, and end the program with a message of the
-    `parser` if a file could not be written after the fit.
+    """Check before the fit that each output file that the `options` name can be written, and end
+    the program with a message of the `parser` if this is not so.
 
-    If the figure's file name has no ending, the ending `.png` is added to it in `options`.
+    If the file name of the figure has no ending, the ending `.png` is added to it in `options`.
     """
     figure = options.figure
     if figure is not None and figure.name and not figure.suffix.strip("."):
@@ -141,14 +141,14 @@ def _check_output_files(options: argparse.Namespace, parser: argparse.ArgumentPa
 
 def _keep_compiled_programs() -> None:
     """Set JAX to store compiled programs in the user's cache folder, so that the next start takes
-    seconds.
+    only seconds.
 
-    Programs of the command `workprecision` are not stored, since it measures how long they take to
-    compile.
+    The command `workprecision` does not call this function, since it measures how long programs
+    take to compile.
     """
     if jax.__version_info__ < (0, 12):
-        # Messages of XLA are hidden: for each program that it loads, XLA reports two of its own
-        # flags as errors, in a line of 2.6 kB.
+        # Messages of XLA are hidden: for each stored program that XLA loads, it reports two of its
+        # own flags as errors, in a line of 2.6 kB.
         jax.config.update("jax_logging_level", "CRITICAL")
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
@@ -174,7 +174,9 @@ def _keep_compiled_programs() -> None:
 
 
 def _cache_folder() -> Path:
-    """Return the cache folder of the user on this platform: XDG, macOS or Windows."""
+    """Return the folder for the stored programs of rigidjax: inside the user's cache folder, where
+    Linux (XDG), macOS or Windows has it.
+    """
     xdg_folder = os.environ.get("XDG_CACHE_HOME")
     if xdg_folder:
         return Path(xdg_folder) / "rigidjax"
@@ -204,7 +206,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         nargs=4, metavar=("T", "WX", "WY", "WZ"), help="names of the time column and of the three "
         "body rates (default: t wx wy wz; those of phyphox and of binary logs are known)"),
     "--time": dict(
-        metavar="COLUMN", help="name of the time column alone, beside --sensor (default: t)"),
+        metavar="COLUMN", help="name of the time column, if --columns is not given (default: t)"),
     "--unit": dict(
         choices=("rad/s", "deg/s"),
         help="of the rates (default: as the names of the columns say, such as 'x (deg/s)', else "
@@ -213,11 +215,12 @@ OPTIONS: dict[str, dict[str, Any]] = {
         nargs="+", type=float, help="standard deviation of a rate, in the unit of the rates, one "
         "number or one for each axis (default: estimated)"),
     "--limit": dict(
-        type=float, help="full scale of the rates, in their unit: a reading at it counts as at "
-        "least that much (default: found where the log shows a plateau)"),
+        type=float, help="full scale of the rates, in the unit of the rates: a reading at full "
+        "scale means a rate of at least this size (default: found where the log shows a plateau)"),
     "--loss": dict(
         choices=tuple(spec.LOSSES), default="soft-l1",
-        help="how an outlier counts: linearly, or squared (none; default: soft-l1)"),
+        help="how a large residual counts: linearly (soft-l1, huber) or squared (none); default: "
+        "soft-l1"),
     "--sensor": dict(
         action="append", metavar="KIND=COLUMNS[:UNIT[:NOISE]]",
         help="instead of --columns: gyro=wx,wy,wz:deg/s:0.1, accelerometer=ax,ay,az:m/s2, "
@@ -239,20 +242,26 @@ OPTIONS: dict[str, dict[str, Any]] = {
         help="a wheel whose speed was logged: its inertia in kg m², axis x, y or z, rad/s or rpm"),
     "--model": dict(
         choices=tuple(spec.MODELS), default="ratios",
-        help="what of the body is free (default: ratios, all that free motion shows)"),
+        help="which numbers of the body the fit may change (default: ratios of the inertia, all "
+        "that free motion shows)"),
     "--typical": dict(
-        type=float, default=1.0, metavar="KG_M2", help="about how large a moment is"),
+        type=float, default=1.0, metavar="KG_M2",
+        help="about how large a moment of inertia of the body is, kg m² (default: 1)"),
     "--free": dict(
         nargs="+", default=[], choices=("bias", "drag", "delay"),
-        help="what else is free: sensor bias and wheel delay of each log, linear drag of all"),
-    "--starts": dict(type=int, help="how many starting points to try"),
-    "--checkpoint": dict(type=Path, help="keep and resume a long fit in this file"),
+        help="what else the fit may change: the bias of the sensors and the delay of the wheels, "
+        "for each log; one linear drag for all logs"),
+    "--starts": dict(type=int, help="how many starting points of the fit to try"),
+    "--checkpoint": dict(
+        type=Path, help="store the state of a long fit in this file, and resume the fit from it"),
     "--figure": dict(
-        type=Path, metavar="FILE", help="where the figure goes (.png, .pdf, .svg)"),
-    "--report": dict(type=Path, metavar="OUT.html", help="a page with all of it"),
+        type=Path, metavar="FILE", help="write a figure to this file (.png, .pdf, .svg)"),
+    "--report": dict(
+        type=Path, metavar="OUT.html", help="write a page with all results to this file"),
     "--no-cache": _FLAG | dict(
         help="compile anew, and keep no compiled programs in the user's cache folder"),
-    "--json": dict(type=Path, metavar="OUT.json", help="the same as numbers"),
+    "--json": dict(
+        type=Path, metavar="OUT.json", help="write all results as numbers to this file"),
 }  # fmt: skip
 
 
@@ -307,13 +316,15 @@ def _run_demo(options: argparse.Namespace) -> int:
 def _channels_of_options(
     options: argparse.Namespace, rate_columns: Sequence[str]
 ) -> list[spec.Channel]:
-    """Return the sensors of a log that the command line describes, each as a `Channel` (kind,
+    """Return the sensors of a log, as the command line describes them, each as a `Channel` (kind,
     columns, unit, noise and limit).
 
-    - `options`: the options of the command line: `--sensor`, or else `--unit`, `--noise` and
-      `--limit` of one gyro.
-    - `rate_columns`: the names of the three columns of the body rates; they are used for this gyro
-      only.
+    The sensors are those of the option `--sensor`. Without this option the log has one gyro, which
+    the options `--unit`, `--noise` and `--limit` describe.
+
+    - `options`: the options of the command line.
+    - `rate_columns`: the names of the three columns of the body rates, for the one gyro without
+      `--sensor`.
     """
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
@@ -332,9 +343,10 @@ def _channels_of_options(
 def _read_logs(
     options: argparse.Namespace,
 ) -> tuple[list[spec.Channel], list[rj.identify.Recording], rj.identify.Model]:
-    """Read the logs that the `options` of the command line name. Return three things: the sensors
-    of the first log; the recordings of all logs (times, readings and sensors); and the model (body,
-    torque and free numbers) that the options describe.
+    """Read the logs that the `options` of the command line name, and return three things.
+
+    They are the sensors of the first log; the recordings of all logs (times, readings and sensors);
+    and the model (body, torque and free numbers) that the options describe.
     """
     if options.columns and options.time:
         raise LogError("--time: not together with --columns, whose first name is the time column")
@@ -384,9 +396,9 @@ def _print_units_from_column_names(
 
 @contextlib.contextmanager
 def _print_or_raise_log_warnings(strict: bool) -> Iterator[None]:
-    """Print each warning about a log in one line, for warnings within a `with` block.
+    """Print each warning about a log (`LogWarning`) that arises within a `with` block, in one line.
 
-    If `strict` is true, raise the first of these warnings as an error in place of printing it.
+    If `strict` is true, the first such warning is raised as an error and not printed.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("error" if strict else "always", LogWarning)
@@ -468,7 +480,7 @@ def _write_outputs(
     units: dict[str, str],
     more_rows: Sequence[tuple[str, float, float, float, str]] = (),
 ) -> int:
-    """Write the figure, the report and the numbers of a fit that the options ask for, and return
+    """Write those outputs of a fit (figure, report, numbers) that the options ask for, and return
     the exit code.
 
     If an output fails, a message is printed, and all other outputs are still written. The exit code
@@ -478,12 +490,12 @@ def _write_outputs(
     - `fit`: the result of the fit.
     - `options`: the options of the command line.
     - `title`: the title of the report.
-    - `files_read`: the names of the files that were read.
-    - `names`: the names of the recordings that were fitted.
-    - `units`: the units of rates and times, by the names of the arguments `rate_unit` and
-      `time_unit`.
-    - `more_rows`: rows of further quantities: name, value, low and high end of the interval, and
-      unit.
+    - `files_read`: the names of the files that were read, for the report.
+    - `names`: the names of the recordings that were fitted, for the titles of the figures.
+    - `units`: the unit of rates under the key `rate_unit`, and the unit of times under the key
+      `time_unit`, which is missing if the unit is s.
+    - `more_rows`: rows of further quantities for report and numbers: name, value, low and high end
+      of the interval, and unit.
     """
     report, figure = rj.identify.report, options.figure
     if options.demo and figure is None and _prepare_matplotlib_if_installed():
@@ -533,9 +545,9 @@ def _draw_report_figures_skipping_failed(
     """Return the figures of a report, without the figures whose drawing raises an error.
 
     - `fit`: the result of the fit.
-    - `names`: the names of the recordings; each of the first twelve has a figure.
-    - `units`: the units of rates and times, by the names of the arguments `rate_unit` and
-      `time_unit`.
+    - `names`: the names of the recordings; only the first twelve recordings have a figure each.
+    - `units`: the unit of rates under the key `rate_unit`, and the unit of times under the key
+      `time_unit`, which is missing if the unit is s.
     """
     figures, plot = [], functools.partial(rj.plot.fit, fit, **units)
     logs = [functools.partial(plot, index=i, title=name) for i, name in enumerate(names[:12])]
@@ -551,9 +563,8 @@ def _draw_report_figures_skipping_failed(
 
 
 def _prepare_matplotlib_if_installed() -> bool:
-    """Set matplotlib to draw without windows, and return whether it is installed.
-
-    If it is not installed, print a line that says so.
+    """Return whether matplotlib is installed; if it is, set it to draw without windows, else print
+    a line that says that it is missing.
     """
     try:
         import matplotlib

@@ -55,10 +55,11 @@ class Channel(eqx.Module):
 
     - `kind`: the kind of the sensor.
     - `columns`: the names of its columns in the log.
-    - `unit`: the unit of the readings; `None` takes the unit in the names of the columns or,
-      without one, the usual unit.
-    - `noise`: the standard deviation of each axis, in this unit, or `None`.
-    - `limit`: the full scale, in this unit, or `None`.
+    - `unit`: the unit of the readings; `None` means the unit in the names of the columns or, if
+      they contain no unit, the usual unit of such a log.
+    - `noise`: the standard deviation of the readings of each axis, in the unit of the readings;
+      `None` if it is not known.
+    - `limit`: the full scale of the sensor, in the unit of the readings; `None` if it is not known.
     """
 
     kind: str
@@ -71,8 +72,9 @@ class Channel(eqx.Module):
 class WheelColumn(eqx.Module):
     """Hold the description of a wheel whose speed was logged.
 
-    **Fields:** `column` the name of the column of the speed; `unit` the unit of the speed, as in
-    `Channel`; `inertia` the moment of inertia about the axis, kg m²; `axis` (3,) the axis in the
+    **Fields:** `column` the name of the column of the speed; `unit` the unit of the speed, or
+    `None` for the unit in the name of the column or, if it contains no unit, rad/s; `inertia` the
+    moment of inertia about the axis of the wheel, kg m²; `axis` (3,) a unit vector along this axis,
     body frame.
     """
 
@@ -166,26 +168,28 @@ def read_log(
 ) -> Recording:
     """Return the recording in a file, with the sensors that `channels` describe.
 
-    Times of the recording are since the first time stamp of the log. A row with an empty cell of a
-    sensor has no reading of this sensor.
+    The times of the recording count from the first time stamp of the log. A sensor has no reading
+    in a row in which one of its cells is empty.
 
     **Arguments:**
 
     - `path`: the path of the file.
     - `channels`: the sensors.
     - `time`: the name of the time column.
-    - `time_unit`: the unit of the time column; `None` takes the unit in the name of the column or,
-      without one, the usual unit of such a log (s for text).
-    - `window`: (from, to), s from the first time stamp, or `None` for all.
-    - `wheels`: the wheels; their speeds become inputs of the recording, by the names of
-      `names_of_wheel_speeds`.
-    - `free`: some of `bias`, `drag`, `delay`; for `bias` the sensors get a bias, which a fit can
-      estimate.
-    - `flight`: as in `read_table`.
+    - `time_unit`: the unit of the time column; `None` means the unit in the name of the column or,
+      if it contains no unit, the usual unit of such a log (s for text).
+    - `window`: (from, to), s from the first time stamp, or `None` for all rows.
+    - `wheels`: the wheels; their speeds become inputs of the recording, with the name `wheel`, or
+      `wheel 1`, `wheel 2`, … if there are several.
+    - `free`: some of the words `bias`, `drag`, `delay`. If it contains `bias`, the sensors get a
+      bias, which a fit can estimate; the other words have no effect here.
+    - `flight`: the number of the flight in a Blackbox log, from 1; `None` if the log has only one
+      flight.
 
-    It **warns** as `read_table` does, and also of rows that are left out because their times do not
-    increase, and of times that are plainly in another unit. **Raises** `LogError` as `read_table`,
-    and for rates that are all zero.
+    It **warns** as `read_table` does, of rows that are left out because their times do not
+    increase, of a long gap, of times that are plainly in another unit, and of an unknown unit in
+    the name of a column. **Raises** `LogError` as `read_table` does, and for rates that are all
+    zero.
     """
     unit = unit_of_time(path, time, time_unit)
     # Each column is read once, since two wheels may have their speeds in the same column.
@@ -220,8 +224,8 @@ def read_log(
 
 
 def _first_finite_time(t: np.ndarray) -> float:
-    """Return the first of the times `t` (T,) that is not missing (NaN), or zero if all are
-    missing.
+    """Return the first of the times `t` (n,) that is a finite number, not missing (NaN); return
+    zero if there is none.
     """
     finite = np.isfinite(t)
     return float(t[np.argmax(finite)]) if finite.any() else 0.0
@@ -294,17 +298,19 @@ def _sensor_and_readings(
 
 
 def names_of_wheel_speeds(wheels: Sequence[WheelColumn]) -> list[str]:
-    """Return the name of the input that holds the speed of each wheel."""
+    """Return the names of the inputs that hold the speeds of the wheels: `wheel` for one wheel,
+    `wheel 1`, `wheel 2`, … for several.
+    """
     return [f"wheel {i + 1}" if len(wheels) > 1 else "wheel" for i in range(len(wheels))]
 
 
 def _fill_missing_rows(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays, the times and the values of a series with even spacing: where a time of
-    this spacing is missing, its value is interpolated.
+    """Fill the gaps of a series whose times are evenly spaced but for missing rows: return two
+    arrays, the times without gaps, and the values, of which the missing ones are interpolated.
 
     Both arrays are returned unchanged if a time differs from an even spacing by more than a
     thousandth of a step, if there are fewer than two times, or if the filled series would be more
-    than about ten times as long.
+    than about ten times as long as the series.
 
     - `t`: (T,) increasing times, s.
     - `values`: (T,) the values at these times.
@@ -386,8 +392,9 @@ def model_of(
     - `body_chart`: a key of `MODELS`, which is the word of the option `--model`. It names the chart
       of the body, a map from free numbers to a possible body.
     - `typical_moment`: the typical size of a moment of inertia, kg m².
-    - `wheels`, `free`: as for `read_log`.
-    - `loss`: a key of `LOSSES`.
+    - `wheels`: the wheels whose speeds were logged.
+    - `free`: some of the words `bias`, `drag`, `delay`, for the numbers that a fit may move.
+    - `loss`: a key of `LOSSES`, which is the word of the option `--loss`.
 
     **Raises** `LogError` for another word as `body_chart` or `loss`.
     """
@@ -413,14 +420,15 @@ def _free_numbers_of_options(
     typical_moment: float,
     free: Sequence[str],
 ) -> list[Free]:
-    """Return a list of `Free`, each of them numbers that a fit may move in addition to the body and
-    its motion: biases of sensors, places of accelerometers, the drag, and the delays of wheels.
+    """Return the numbers that a fit may move in addition to the body and its motion, as a list of
+    `Free`: biases of sensors, places of accelerometers, the drag, and the delays of wheels.
 
     - `sensors`: the sensors of one recording; a bias is free if the sensor has one.
     - `wheels`: the names of the wheels, for the names of their delays.
     - `typical_moment`: the typical size of a moment of inertia, kg m², from which the scale of the
       drag follows.
-    - `free`: some of `bias`, `drag`, `delay`; drag and delays are free if they are named here.
+    - `free`: some of the words `bias`, `drag`, `delay`. The drag and the delays are free if this
+      list contains their words; for biases the sensors decide, as said above.
     """
 
     def of_sensor(index: int, name: str) -> Callable[[Scene], Any]:

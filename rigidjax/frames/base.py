@@ -15,15 +15,17 @@ from rigidjax.frames.point import Point
 
 
 class AbstractScene(eqx.Module):
-    """Define the equations of motion of a particle: subclass this with `acceleration` and
+    """Define the equations of motion of a particle: a subclass has the methods `acceleration` and
     `conserved`.
 
     `rigidjax.simulate(None, Point(x, v), ts, scene)` solves a scene; `diffrax.ODETerm(scene.field)`
-    is the term of the scene in plain diffrax. A scene that ends a run, for example at a collision,
-    has two more methods: `ends(t, state)`, true at the end, and `end_words(t, state)`, the reason.
-    Under `jit` the state is traced, so that the reason cannot contain its numbers. `stats` of the
-    solution then has `ended`, `end_time` and `end_state`. Only scenes of a particle can end a run
-    in this way.
+    is the term of the scene in plain diffrax.
+
+    A scene that ends a run early, for example at a collision, has two more methods: `ends(t,
+    state)`, which is true where the run must end, and `end_words(t, state)`, a text with the
+    reason. Under `jit` JAX traces the state, so that the text cannot contain numbers of the state.
+    The `stats` of the solution then have the entries `ended`, `end_time` and `end_state`. Only
+    scenes of a particle can end a run in this way.
 
     >>> class Spring(AbstractScene):
     ...     def acceleration(self, t, state):
@@ -65,10 +67,11 @@ class AbstractScene(eqx.Module):
 
 
 class Force(AbstractScene):
-    """Make a scene of your own force per mass, in an inertial frame (notes, eq 84).
+    """Define the scene of a particle in an inertial frame under a force per mass that you give
+    (notes, eq 84).
 
-    **Arguments:** `force` a callable Module `(t, state, body) → (3,)`, m/s²; `body` is `None`. For
-    a free particle `force` is `None`.
+    **Arguments:** `force` a callable Module `(t, state, body) → (3,)`, m/s², which gets `None` as
+    its `body`; or `None` for a free particle.
 
     >>> fall = Force(lambda t, state, body: jnp.array([0.0, 0.0, -9.8]))
     >>> fall.field(0.0, Point([0.0, 0, 0], [1.0, 0, 0])).v.tolist()
@@ -105,10 +108,10 @@ def checked_force_per_mass(value: NumbersLike, force: object) -> Vec3:
 
 def jump_times_within(*laws: object) -> Float[Array, " n"]:
     """Return the times (n,), s, at which any of the `laws` (forces, torques, functions of time)
-    jumps or has a kink, as their attributes `jump_times` say, in no particular order.
+    jumps or has a kink, in no particular order; they are in the attribute `jump_times` of each law.
 
-    A scene or torque that contains other laws must have the jump times of all of them, because the
-    solver reads the `jump_times` of the outermost scene or torque only.
+    A scene or torque that contains other laws must have the jump times of all these laws, because
+    the solver reads the `jump_times` of the outermost scene or torque only.
     """
     jumps = (getattr(law, "jump_times", None) for law in laws)
     times = [jnp.asarray(times, float) for times in jumps if times is not None]

@@ -17,9 +17,10 @@ GRAVITY = 9.80665
 class Earth(AbstractScene):
     """Describe free fall and throws near one place of the turning Earth; `scenes.earth` makes it.
 
-    The axes are east, north, up; up is the plumb line. Gravity is uniform and contains the
-    centrifugal acceleration at the origin; the difference of the centrifugal acceleration between
-    x' and the origin is added. **Fields:** `latitude` rad, `gravity` m/s², `rate` rad/s.
+    The axes are east, north, up; up is along the plumb line. Gravity is uniform and contains the
+    centrifugal acceleration at the origin. The centrifugal acceleration at another place differs
+    from that at the origin, and this difference is added. **Fields:** `latitude` rad; `gravity`
+    m/s²; `rate` the angular rate of the Earth, rad/s.
 
     >>> scene = earth(0.5)
     >>> float(scene.latitude), float(scene.gravity)
@@ -70,10 +71,10 @@ class Earth(AbstractScene):
         return 0.5 * (speed - moved) + self.gravity.astype(dtype) * x[2]
 
     def eastward_deflection(self, height: ScalarLike) -> Scalar:
-        """Return the eastward deflection, m, of a body dropped from `height` h, m.
+        """Return the eastward deflection, m, of a body dropped from the height h = `height`, m.
 
-        It is ⅓ Ω g cos λ (2h/g)^{3/2}, correct to first order in Ω; λ is the latitude (Landau and
-        Lifshitz, Mechanics, sec. 39, problem 1).
+        It is ⅓ Ω g cos λ (2h/g)^{3/2}, correct to first order in the angular rate Ω of the Earth; g
+        is gravity and λ the latitude (Landau and Lifshitz, Mechanics, sec. 39, problem 1).
 
         >>> round(float(earth(0.0).eastward_deflection(100.0)), 5)
         0.02195
@@ -91,8 +92,9 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
 
     **Arguments:** `latitude` λ, rad, geodetic, north positive; `gravity` along the plumb line,
     m/s²; `rate` Ω of the Earth, rad/s (WGS84: 7.292115e-5, one turn in 86164.1 s). States are
-    `Point(x, v)`: position and velocity in the axes east, north, up, from that place. **Raises:**
-    `ValueError` for a latitude beyond a right angle (degrees?) or gravity that is not positive.
+    `Point(x, v)`: position and velocity relative to the place, in the axes east, north, up.
+    **Raises:** `ValueError` for a latitude beyond ±π/2, which is probably in degrees, or for
+    gravity that is not positive.
 
     >>> earth(0.5).acceleration(0.0, Point([0.0, 0, 0], [0.0, 0, 0])).tolist()
     [0.0, 0.0, -9.80665]
@@ -110,8 +112,9 @@ class Foucault(AbstractScene):
     """Describe a pendulum on the turning Earth; `scenes.foucault` makes it.
 
     The bob keeps the distance `length` from the pivot at the origin; the axes are east, north, up.
-    The string's force is eliminated: the length is constant to the solver's tolerance, not exactly,
-    and `drift` reports the error. **Fields:** `place` the `Earth` scene; `length` m.
+    The force of the string is eliminated from the equations of motion. The distance is therefore
+    constant to the tolerance of the solver, not exactly, and `drift` reports its error. **Fields:**
+    `place` the `Earth` scene at the pivot; `length` m.
 
     >>> pendulum = foucault(0.85, 67.0)
     >>> float(pendulum.length), float(pendulum.place.latitude)
@@ -150,9 +153,9 @@ class Foucault(AbstractScene):
     ) -> Point:
         """Return the state of the bob below the pivot from its horizontal position and velocity.
 
-        **Arguments:** `east`, `north` the distances from the pivot, m, less than `length` together;
-        `east_speed`, `north_speed` the horizontal velocity, m/s. The height and the vertical
-        velocity follow from the constant length.
+        **Arguments:** `east`, `north` the horizontal distances from the pivot, m, with √(east² +
+        north²) less than the length of the string; `east_speed`, `north_speed` the horizontal
+        velocity, m/s. The height and the vertical velocity follow from the constant length.
 
         >>> foucault(0.5, 10.0).state(6.0, 0.0, 4.0, 0.0).v.tolist()
         [4.0, 0.0, 3.0]
@@ -168,13 +171,15 @@ class Foucault(AbstractScene):
     def small_swing(self, state: Point, t: ScalarLike) -> Point:
         """Return the state of the bob at time `t`, s, in closed form, for small swings.
 
-        The complex number s = east + i north obeys s'' + 2iΩ_z s' + ω₀² s = 0, with Ω_z = Ω sin λ
-        and ω₀² = g/L for a string of length L. The solution is s = e^{−iΩ_z t} (A cos ωt + B sin
-        ωt) with ω² = ω₀² + Ω_z²; the initial state gives A and B (Landau and Lifshitz, Mechanics,
-        sec. 39, problem 3). Its error is of the order of (amplitude/length)².
+        The complex number z = east + i north, with the position of the bob, obeys z'' + 2iΩ_z z' +
+        ω₀² z = 0. Here Ω_z = Ω sin λ, with the rate Ω of the Earth and the latitude λ; and ω₀² =
+        g/L, with gravity g and the length L of the string. The solution is z = e^{−iΩ_z t} (A cos
+        ωt + B sin ωt) with ω² = ω₀² + Ω_z², where A and B follow from the initial state (Landau and
+        Lifshitz, Mechanics, sec. 39, problem 3). The relative error of the solution is of the order
+        of (amplitude/length)².
 
-        **Arguments:** `state` the state at t = 0. **Returns** a `Point` at the height of the lowest
-        place.
+        **Arguments:** `state` the state at t = 0. **Returns** a `Point` at the height at which the
+        bob hangs at rest.
 
         >>> pendulum = foucault(0.5, 10.0)
         >>> pendulum.small_swing(pendulum.start(0.1, 0.0), 0.0).x[0]
@@ -200,7 +205,8 @@ class Foucault(AbstractScene):
         return Point(jnp.stack([ex, ey, -self.length.astype(t.dtype)]), jnp.stack([wx, wy, zero]))
 
     def precession_rate(self) -> Scalar:
-        """Return the rate at which the plane of small swings turns, rad/s: −Ω sin λ.
+        """Return the rate at which the plane of small swings turns, rad/s: −Ω sin λ, with the rate
+        Ω of the Earth and the latitude λ.
 
         Seen from above, the plane turns clockwise in the northern hemisphere, where λ > 0.
 
@@ -218,8 +224,8 @@ def foucault(
     **Arguments:** `latitude` λ, rad, north positive; `length` of the string, m; `gravity` m/s²,
     along the plumb line; `rate` of the Earth, rad/s (WGS84 by default). All arguments may be
     traced: `latitude` and `rate`, for example, can be fitted to measurements. **Raises:**
-    `ValueError` for a length or gravity that is not positive, or for a latitude beyond a right
-    angle (degrees?).
+    `ValueError` for a length or gravity that is not positive, or for a latitude beyond ±π/2, which
+    is probably in degrees.
 
     >>> pendulum = foucault(0.85, 67.0)
     >>> pendulum.start(3.0, 0.0).v.tolist()

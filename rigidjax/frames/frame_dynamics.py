@@ -27,9 +27,11 @@ class InFrame(AbstractScene):
       Point in S') → (3,)`, in the axes of S'.
     - `outside`: a force per mass, m/s², that is a function of the time and the state in the
       inertial frame S, `(t, Point in S) → (3,)`, in the axes of S.
-    - `potential`: V(x') per mass, `(3,) → ()`, m²/s²; the force −∇V comes from automatic
-      differentiation. In a uniformly turning frame without other forces `conserved` has the Jacobi
-      integral.
+    - `potential`: a function of the position x' in S', `(3,) → ()`, that returns the potential V
+      per mass, m²/s²; the force per mass −∇V is computed by automatic differentiation.
+
+    If the rotation of the frame is a `frames.Uniform`, and its `origin`, `inside` and `outside` are
+    `None`, `conserved` returns the Jacobi integral.
 
     >>> scene = InFrame(MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0])))
     >>> scene.acceleration(0.0, rj.frames.Point([2.0, 0, 0], [0.0, 0, 0])).tolist()
@@ -114,19 +116,25 @@ class BodyInFrame(eqx.Module):
     frame S'.
 
     Pass this to `simulate` as the torque of an `Attitude` or `Rigid` state in S'. Such a state has
-    q', body → S', with the matrix Q'; Ω', the rate relative to S', in body axes; a `Rigid` state
-    also has x' and v', the position and velocity of the centre of mass in S'. The absolute rate is
-    Ω_abs = Ω' + W, where W = Q'ᵀ Ω is the rate Ω of the frame in body axes. It obeys I dΩ_abs/dt =
-    IΩ_abs × Ω_abs + τ, with the inertia I and the real torque τ. Hence the equation of Ω' is
+    the quaternion q', body → S', whose matrix is Q', and the rate Ω' relative to S', in body axes;
+    a `Rigid` state also has the position x' and velocity v' of the centre of mass in S'.
+    **Arguments:**
+
+    - `frame`: the `MovingFrame` S', whose rate is Ω, axes of S'.
+    - `torque`: the real torque τ, `(t, state in S', body) → (3,)`, N m, body axes; or a model that
+      returns a `Wrench`, whose force is in the axes of S'; or `None`. `simulate` refuses torques
+      that need the absolute rate (wheels, `ChangingInertia`), both as this `torque` and in a sum
+      with a `BodyInFrame`.
+
+    The absolute rate of the body is Ω_abs = Ω' + W, where W = Q'ᵀ Ω is the rate of the frame in
+    body axes. Ω_abs obeys I dΩ_abs/dt = IΩ_abs × Ω_abs + τ, with the inertia I. Hence the equation
+    of Ω' is
 
     I dΩ'/dt = IΩ' × Ω' + [τ + IΩ_abs × Ω_abs − IΩ' × Ω' − I(Q'ᵀ dΩ/dt − Ω' × W)],
 
-    and the centre of mass moves as a `Point` does (eq 91). **Arguments:** `frame` the `MovingFrame`
-    S'; `torque` the real torque τ, `(t, state in S', body) → (3,)`, N m, body axes; or a model that
-    returns a `Wrench`, whose force is in the axes of S'; or `None`. `simulate` refuses torques that
-    need the absolute rate (wheels, `ChangingInertia`), both as this `torque` and in a sum with a
-    `BodyInFrame`. Source: notes, eqs 50, 91, for a body instead of a point. **Raises:** `TypeError`
-    for a force on a state that has no position.
+    in which the bracket is the torque that this object returns. The centre of mass moves as a
+    `Point` does (eq 91). Source: notes, eqs 50, 91, for a body instead of a point. **Raises:**
+    `TypeError` for a force on a state that has no position.
 
     >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
     >>> still = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, -1.0])

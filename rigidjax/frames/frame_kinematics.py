@@ -11,12 +11,15 @@ from rigidjax.rotation import linalg3, quaternion
 class Instant(eqx.Module):
     """Hold the position, rotation and motion of a moving frame S' at one time.
 
-    `MovingFrame.at(t)` makes it; S is the inertial frame.
+    `MovingFrame.at(t)` makes an `Instant`. **Fields**, where S is the inertial frame:
 
-    **Fields:** `rotation` M (3, 3), S' → S; `rate` Ω (3,), rad/s, and `rate_change` dΩ/dt (3,),
-    rad/s², both in the axes of S'; `origin` X (3,), `origin_velocity` dX/dt (3,) and
-    `origin_acceleration` d²X/dt² (3,), in the axes of S. The arguments `x` and `v` of the methods
-    are a position x' and a velocity v' in S'.
+    - `rotation`: the rotation matrix M (3, 3), S' → S.
+    - `rate`, `rate_change`: the angular velocity Ω (3,), rad/s, and its derivative dΩ/dt (3,),
+      rad/s², in the axes of S'.
+    - `origin`, `origin_velocity`, `origin_acceleration`: the position X (3,) of the origin of S',
+      m, its velocity dX/dt (3,), m/s, and its acceleration d²X/dt² (3,), m/s², in the axes of S.
+
+    The arguments `x` and `v` of the methods are a position x' and a velocity v' in S'.
 
     >>> now = rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0)
     >>> now.rate.tolist(), now.coriolis([1.0, 0.0, 0.0]).tolist()
@@ -31,7 +34,9 @@ class Instant(eqx.Module):
     origin_acceleration: Vec3
 
     def to_inertial(self, state: PyTree) -> PyTree:
-        """Return `state`, which is given in S', transformed to S (notes, eqs 85, 88)."""
+        """Return `state`, which is given in the moving frame S', transformed to the inertial frame
+        S (notes, eqs 85, 88).
+        """
         _require_transformable(state)
         turned: dict[str, Array] = {}
         if hasattr(state, "x"):
@@ -47,7 +52,9 @@ class Instant(eqx.Module):
         return _replace_fields(state, turned)
 
     def from_inertial(self, state: PyTree) -> PyTree:
-        """Return `state`, which is given in S, transformed to S' (notes, eqs 86, 88)."""
+        """Return `state`, which is given in the inertial frame S, transformed to the moving frame
+        S' (notes, eqs 86, 88).
+        """
         _require_transformable(state)
         turned: dict[str, Array] = {}
         if hasattr(state, "x"):
@@ -63,44 +70,52 @@ class Instant(eqx.Module):
         return _replace_fields(state, turned)
 
     def to_inertial_axes(self, y: Vector) -> Vec3:
-        """Return the components in S, M y, of a vector `y` (3,) given in the axes of S' (notes, eq
-        85).
+        """Return the components M y (3,) in the inertial frame S of a vector `y` (3,), which is
+        given in the axes of the moving frame S' (notes, eq 85).
         """
         y = _checks.array_of_shape(y, (3,), "y")
         return linalg3.apply(self.rotation.astype(y.dtype), y)
 
     def from_inertial_axes(self, y: Vector) -> Vec3:
-        """Return the components in S', Mᵀ y, of a vector `y` (3,) given in the axes of S (notes, eq
-        86).
+        """Return the components Mᵀ y (3,) in the moving frame S' of a vector `y` (3,), which is
+        given in the axes of the inertial frame S (notes, eq 86).
         """
         y = _checks.array_of_shape(y, (3,), "y")
         return linalg3.apply(self.rotation.T.astype(y.dtype), y)
 
     def centrifugal(self, x: Vector) -> Vec3:
-        """Return the centrifugal acceleration −Ω × (Ω × x') (3,) at `x` = x', in the axes of S'."""
+        """Return the centrifugal acceleration −Ω × (Ω × x') (3,), m/s², at the position x' = `x` in
+        the moving frame S', in the axes of S'; Ω is the angular velocity of S'.
+        """
         x = _checks.array_of_shape(x, (3,), "x")
         rate = self.rate.astype(x.dtype)
         return linalg3.cross(linalg3.cross(rate, x), rate)
 
     def coriolis(self, v: Vector) -> Vec3:
-        """Return the Coriolis acceleration −2 Ω × v' (3,) at `v` = v', in the axes of S'."""
+        """Return the Coriolis acceleration −2 Ω × v' (3,), m/s², of a particle with the velocity v'
+        = `v` in the moving frame S', in the axes of S'; Ω is the angular velocity of S'.
+        """
         v = _checks.array_of_shape(v, (3,), "v")
         return 2 * linalg3.cross(v, self.rate.astype(v.dtype))
 
     def euler_acceleration(self, x: Vector) -> Vec3:
-        """Return the Euler acceleration −dΩ/dt × x' (3,) at `x` = x', in the axes of S'."""
+        """Return the Euler acceleration −dΩ/dt × x' (3,), m/s², at the position x' = `x` in the
+        moving frame S', in the axes of S'; Ω is the angular velocity of S'.
+        """
         x = _checks.array_of_shape(x, (3,), "x")
         return linalg3.cross(x, self.rate_change.astype(x.dtype))
 
     def translational_acceleration(self) -> Vec3:
-        """Return −Mᵀ d²X/dt² (3,), in the axes of S': the fictitious acceleration due to the
-        acceleration of the origin.
+        """Return the fictitious acceleration −Mᵀ d²X/dt² (3,), m/s², due to the acceleration of the
+        origin X of the moving frame S', in the axes of S'; M is the rotation matrix of S'.
         """
         return -self.from_inertial_axes(self.origin_acceleration)
 
     def fictitious(self, x: Vector, v: Vector) -> Vec3:
-        """Return the sum of the four fictitious accelerations (3,) at `x` = x' and `v` = v', in the
-        axes of S' (notes, eq 91): centrifugal, Coriolis, Euler, and translational.
+        """Return the sum of the four fictitious accelerations (3,), m/s², in the axes of the moving
+        frame S' (notes, eq 91): centrifugal, Coriolis, Euler, and translational.
+
+        - `x`, `v`: the position (3,), m, and the velocity (3,), m/s, of a particle in S'
         """
         x, v = _checks.array_of_shape(x, (3,), "x"), _checks.array_of_shape(v, (3,), "v")
         turning = self.centrifugal(x) + self.coriolis(v) + self.euler_acceleration(x)

@@ -32,10 +32,10 @@ class Hoop(AbstractScene):
     gravity: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """Return d²x'/dt² (3,), m/s², of the bead at x', in the axes of the hoop.
+        """Return the acceleration d²x'/dt² (3,), m/s², of the bead at x', in the axes of the hoop.
 
-        It is the sum of gravity, of the centrifugal acceleration, and of the pull of the hoop in
-        its plane, which keeps the bead at the distance `radius` from the centre.
+        It is the sum of gravity, the centrifugal acceleration, and the force per mass of the hoop
+        within its plane, which keeps the bead at the distance `radius` from the centre.
         """
         x, _, z = components(state.x)
         vx, _, vz = components(state.v)
@@ -52,7 +52,7 @@ class Hoop(AbstractScene):
 
     def side_push(self, state: Point) -> Scalar:
         """Return the force per mass, m/s², with which the hoop pushes the bead along y, across its
-        plane: 2Ω v_x, which balances the Coriolis acceleration.
+        plane: 2Ω v_x, which balances the Coriolis acceleration; Ω is the rate of the hoop.
 
         >>> float(hoop(1.0, 3.0).side_push(Point([0.0, 0, -1], [2.0, 0, 0])))
         12.0
@@ -79,7 +79,7 @@ class Hoop(AbstractScene):
     def equilibrium_angle(self) -> Scalar:
         """Return the angle of the bead's stable equilibrium from the lowest place, rad.
 
-        It is arccos(g/(Ω²R)), with the hoop's rate Ω and radius R, or 0 if g ≥ Ω²R.
+        It is arccos(g/(Ω²R)), with gravity g and the hoop's rate Ω and radius R, or 0 if g ≥ Ω²R.
 
         >>> float(hoop(1.0, 1.0).equilibrium_angle())
         0.0
@@ -93,9 +93,9 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
     """Return the scene of a bead that slides without friction on a hoop with a vertical rotation
     axis.
 
-    **Arguments:** `radius` R, m; `rate` Ω, rad/s; `gravity` m/s². Source: Goldstein, Mechanics,
-    sec. 2.7 (θ'' = sin θ (Ω² cos θ − g/R) for the angle θ from the lowest place); notes, eq 91.
-    **Raises:** `ValueError` for a radius that is not positive.
+    The angle θ of the bead from the lowest place obeys θ'' = sin θ (Ω² cos θ − g/R). **Arguments:**
+    `radius` R, m; `rate` Ω of the hoop, rad/s; `gravity` g, m/s². Source: Goldstein, Mechanics,
+    sec. 2.7; notes, eq 91. **Raises:** `ValueError` for a radius that is not positive.
 
     >>> hoop(1.0, 5.0).acceleration(0.0, Point([0.0, 0, -1], [0.0, 0, 0])).tolist()
     [0.0, 0.0, 0.0]
@@ -106,7 +106,8 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
 
 
 class _QuadraticAngle(eqx.Module):
-    """Compute the angle Ωt + ½αt², rad, of a uniformly accelerated turn at time t, s.
+    """Compute the angle Ωt + ½αt², rad, by which a uniformly accelerated frame has turned at the
+    time t, s.
 
     **Fields:** `rate` Ω at t = 0, rad/s; `growth` α = dΩ/dt, rad/s².
     """

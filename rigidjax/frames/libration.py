@@ -40,9 +40,9 @@ def libration(rate: ScalarLike) -> BodyInFrame:
     the frame turns at the rate n about z. `q` takes body axes to the orbital frame; `omega` is the
     rate relative to this frame, in body axes.
 
-    **Arguments:** `rate` n of the orbit, rad/s. Small librations in the orbital plane of a body
-    with moments (a, b, c) about (x, y, z) have the rate n √(3 (b − a)/c). Source: Hughes 1986,
-    ch. 9; notes, eqs 50, 91.
+    **Arguments:** `rate` the angular rate n of the orbit, rad/s. Small oscillations (librations) in
+    the orbital plane have the angular frequency n √(3 (b − a)/c), where a, b, c are the moments of
+    inertia of the body about x, y, z. Source: Hughes 1986, ch. 9; notes, eqs 50, 91.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> at_rest = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
@@ -56,11 +56,13 @@ def libration(rate: ScalarLike) -> BodyInFrame:
 
 
 def libration_integral(state: PyTree, body: _inertia.Inertia, rate: ScalarLike) -> Scalar:
-    """Return the conserved Jacobi integral of `libration`, J: ½Ω'·IΩ' + (3/2)n² u·Iu − ½n² w·Iw.
+    """Return the Jacobi integral, in joules, that a motion under the torque `libration` conserves:
+    ½Ω'·IΩ' + (3/2)n² u·Iu − ½n² w·Iw.
 
-    **Arguments:** `state` an `Attitude` in the orbital frame; `body` an `Inertia`; `rate` n,
-    rad/s. Ω' is the rate relative to the orbital frame, I the inertia, u and w the unit vectors
-    along the frame's x and z, all in body axes (Hughes 1986, sec. 9.1).
+    Here Ω' is the body rate relative to the orbital frame, I the inertia, and u and w the unit
+    vectors along the x and z axes of this frame, all in body axes (Hughes 1986, sec. 9.1).
+    **Arguments:** `state` an `Attitude` in the orbital frame; `body` an `Inertia`; `rate` the
+    angular rate n of the orbit, rad/s.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> at_rest = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])

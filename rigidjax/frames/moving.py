@@ -23,10 +23,11 @@ class MovingFrame(eqx.Module):
     **Arguments:**
 
     - `rotation`: a function of the time, s, that returns the matrix M (3, 3), S' → S, or the unit
-      quaternion (4,) of M. It may also return a state with `q` and `omega`, as a solution of
-      `simulate` (whose `evaluate` is called) or a `FreeBody` does: the frame is then fixed in this
-      body, and derivatives through a solved motion are in forward mode only. A Module such as
-      `frames.Uniform` with other numbers is not compiled again; a new `lambda` is.
+      quaternion (4,) of M. For a frame that is fixed in a body, the function returns the state of
+      the body, with `q` and `omega`; a solution of `simulate` (its method `evaluate` is called) or
+      a `FreeBody` is such a function. Derivatives through a solution of `simulate` are in forward
+      mode only. A Module such as `frames.Uniform` may get other numbers without a new compilation;
+      a new `lambda` is compiled again.
     - `origin`: a function of the time that returns the origin X (3,) of S', m, axes of S; `None` if
       the origins of S and S' coincide.
     - `rate`: a function of the time that returns the angular velocity Ω (3,), rad/s, **axes of
@@ -96,7 +97,8 @@ class MovingFrame(eqx.Module):
         return linalg3.vee(linalg3.product(m.T, m_dot))
 
     def to_inertial(self, state: PyTree, t: ScalarLike) -> PyTree:
-        """Return `state`, which is given in S', transformed to S; its type does not change.
+        """Return `state`, which is given in the moving frame S', transformed to the inertial frame
+        S; the type of the state does not change.
 
         **Arguments:** `state` a `Point`, `Attitude` or `Rigid`, or any Module with `x` and `v`,
         with `q` and `omega`, or with all four fields; one state, not a batch. `t` the time, s. Then
@@ -114,10 +116,11 @@ class MovingFrame(eqx.Module):
         return self.at(t).to_inertial(state)
 
     def from_inertial(self, state: PyTree, t: ScalarLike) -> PyTree:
-        """Return `state`, which is given in S, transformed to S': the inverse of `to_inertial`.
+        """Return `state`, which is given in the inertial frame S, transformed to the moving frame
+        S': the inverse of `to_inertial`.
 
-        **Arguments:** as for `to_inertial`. x' = Mᵀ(x − X), v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs
-        86–88).
+        **Arguments:** as for `to_inertial`. The position and the velocity in S' are x' = Mᵀ(x − X)
+        and v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs 86–88).
 
         >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.from_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 2, 0]), 0.0).v.tolist()
@@ -148,8 +151,8 @@ class MovingFrame(eqx.Module):
         return self.at(t).euler_acceleration(x)
 
     def translational_acceleration(self, t: ScalarLike) -> Vec3:
-        """Return −Mᵀ d²X/dt² (3,), m/s², axes of S': the fictitious acceleration due to the
-        acceleration of the origin.
+        """Return the fictitious acceleration −Mᵀ d²X/dt² (3,), m/s², axes of S', due to the
+        acceleration of the origin X of S'; M is the rotation matrix of S'.
         """
         return self.at(t).translational_acceleration()
 
@@ -175,7 +178,8 @@ class MovingFrame(eqx.Module):
         return free if force is None else _checks.array_of_shape(force, (3,), "force") + free
 
     def acceleration_to_inertial(self, x: Vector, v: Vector, a: Vector, t: ScalarLike) -> Vec3:
-        """Return the acceleration in S (3,), m/s², of a particle whose motion in S' is given.
+        """Return the acceleration (3,), m/s², in the inertial frame S of a particle whose motion in
+        the moving frame S' is given.
 
         **Arguments:** `x`, `v`, `a` (3,) its position, velocity and acceleration in S', m, m/s and
         m/s²; `t` the time, s. Source: notes, eqs 89, 90.
@@ -211,9 +215,11 @@ class MovingFrame(eqx.Module):
         return 0.5 * (speed - linalg3.dot(moved, moved)) + v
 
     def compose(self, inner: "MovingFrame") -> "MovingFrame":
-        """Return the frame that moves as `inner` does **within this frame**.
+        """Return the frame that moves relative to **this frame** as `inner` does relative to an
+        inertial frame.
 
-        With the index 1 for this frame and 2 for `inner`: M = M₁M₂, X = X₁ + M₁X₂.
+        Its rotation matrix is M = M₁M₂ and its origin X = X₁ + M₁X₂, with the index 1 for this
+        frame and 2 for `inner`.
 
         >>> half = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
         >>> half.compose(half).at(0.0).rate.tolist()
@@ -223,16 +229,19 @@ class MovingFrame(eqx.Module):
         return MovingFrame(motion.rotation, motion.origin, motion.rate)
 
     def inverse(self) -> "MovingFrame":
-        """Return the frame that moves as S moves relative to S', with Mᵀ in place of M and −MᵀX in
-        place of X.
+        """Return the frame that moves as the inertial frame S does if it is seen from this frame
+        S'.
 
+        Its rotation matrix is Mᵀ and its origin −MᵀX, with the matrix M and the origin X of S'.
         `frame.compose(frame.inverse())` does not move.
         """
         motion = _InverseMotion(self)
         return MovingFrame(motion.rotation, motion.origin, motion.rate)
 
     def place(self, t: ScalarLike) -> Vec3:
-        """Return the position X(t) (3,), m, axes of S, of the origin of S'."""
+        """Return the position X(t) (3,), m, of the origin of the moving frame S', in the axes of
+        the inertial frame S.
+        """
         t = _checks.checked_time(t)
         if self.origin is None:
             return jnp.zeros(3, t.dtype)

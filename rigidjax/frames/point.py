@@ -11,8 +11,8 @@ from rigidjax._types import Vectors
 class Point(eqx.Module):
     """Hold the position and velocity of a particle, in the frame of its scene.
 
-    **Arguments:** `x` (3,) position, m; `v` (3,) velocity dx/dt **in this frame**, m/s. A scene
-    with other units, as the restricted three-body problem, says so. Source: notes, eq 84.
+    **Arguments:** `x` (3,) position, m; `v` (3,) velocity dx/dt **in this frame**, m/s. Scenes with
+    other units, such as the restricted three-body problem, state their units. Source: notes, eq 84.
 
     >>> Point([1.0, 0, 0], [0.0, 2, 0]).v.shape
     (3,)

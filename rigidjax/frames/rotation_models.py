@@ -16,10 +16,11 @@ from rigidjax.rotation.validation import require_near_unit, require_rotation_mat
 
 
 class Uniform(eqx.Module):
-    """Turn uniformly: M(t) = exp(t hat Ω), with M(0) = 1.
+    """Describe a frame S' that turns uniformly: its rotation matrix is M(t) = exp(t hat Ω), with
+    M(0) = 1, where hat Ω is the matrix of the cross product with Ω.
 
-    **Arguments:** `omega` the angular velocity Ω (3,), rad/s; its components in S and in S' are
-    equal.
+    **Arguments:** `omega` the angular velocity Ω (3,), rad/s. Its components in S' and in the
+    inertial frame S are equal.
 
     >>> Uniform([0.0, 0.0, 1.0])(jnp.pi).round(12)[0].tolist()
     [-1.0, -0.0, 0.0]
@@ -40,10 +41,10 @@ class Uniform(eqx.Module):
 
 
 class AboutAxis(eqx.Module):
-    """Turn about a fixed axis by an angle that is any function of the time.
+    """Describe a frame that turns about a fixed axis by an angle that is any function of the time.
 
-    **Arguments:** `axis` (3,), of any length but zero; `angle` a function of the time, s, that
-    returns the angle, rad.
+    **Arguments:** `axis` (3,), a vector along the axis, of any length but zero; `angle` a function
+    of the time, s, that returns the angle, rad.
 
     >>> float(AboutAxis([0.0, 0.0, 2.0], lambda t: 3.0 * t**2).rate(1.0)[2])
     6.0

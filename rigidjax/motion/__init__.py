@@ -1,5 +1,5 @@
-"""Describe states of a body. For what a motion conserves see `rj.conserved`, `rj.drift`,
-`rj.energy`.
+"""Describe states of a body. For the quantities that a motion conserves see `rj.conserved`,
+`rj.drift`, `rj.energy`.
 """
 
 from rigidjax._names import define_dir_and_getattr

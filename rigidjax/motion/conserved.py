@@ -29,9 +29,9 @@ def energy(
     + ½ Ω·IΩ + U`, with the mass m, velocity v, body rate Ω, inertia I and the sum U of potentials.
 
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for torques that depend on
-    time. Wheels add no energy, except for `ReactionWheels`. Under a torque with states of its own
-    `state` is a `Coupled`, as `batch.rollout` and `crossings` return it. Source: notes, eq 79.
-    **Raises:** `TypeError` for a torque without a potential.
+    time. Wheels add no energy, except for `ReactionWheels`. If the torque has states of its own
+    (such as the speed of a wheel), `state` is a `Coupled`, as `batch.rollout` and `crossings`
+    return it. Source: notes, eq 79. **Raises:** `TypeError` for a torque without a potential.
 
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
@@ -56,20 +56,24 @@ def conserved(
 ) -> dict[str, Float[Array, "..."]]:
     """Return the quantities that the exact motion of a body under a torque conserves, at one state.
 
-    **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s. A torque declares what it
-    conserves by optional members (see `rigidjax.torques.AbstractTorque`); without these members
-    nothing is conserved. **Returns** a dict of the conserved quantities of this state, with one set
-    of names for all times:
+    **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` the time, s. A torque declares
+    what it conserves by optional members (see `rigidjax.torques.AbstractTorque`); under a torque
+    without these members nothing is conserved. **Returns** a dict with the value of each conserved
+    quantity; which quantities it contains does not depend on the time:
 
     - `energy`, J, if every torque has a potential and no torque depends on time;
-    - `momentum` (3,), kg m²/s, world frame, `R(IΩ + h)`, and `momentum_squared`, the Casimir `|IΩ +
-      h|²`, if there is no external torque (R is the attitude, I the inertia, Ω the body rate, and h
-      the momentum of the wheels);
+    - `momentum` (3,), kg m²/s, world frame, the angular momentum `R(IΩ + h)`, if there is no
+      external torque;
+    - `momentum_squared`, kg² m⁴/s², the Casimir `|IΩ + h|²`, if there is no external torque;
     - `momentum_along_axis`, kg m²/s, if the only external torque has no component along a fixed
       axis of the world, such as the direction of gravity or of a field;
     - `linear_momentum` (3,), kg m/s, world frame, if no force acts on the body;
-    - `momentum_about_origin` (3,), kg m²/s, world frame, `m x × v + R(IΩ + h)`, if the body is
-      free, or attracted by the origin.
+    - `momentum_about_origin` (3,), kg m²/s, world frame, the angular momentum about the origin
+      `mass · x × v + R(IΩ + h)`, if the body is free, or attracted by the origin.
+
+    Here R is the attitude, I the inertia, Ω the body rate, h the momentum of the wheels, x the
+    position and v the velocity. `momentum` and `momentum_along_axis` are those of a state with an
+    attitude; the last two quantities are those of a `Rigid`.
 
     Source: Noether's theorem; Marsden and Ratiu, Introduction to Mechanics and Symmetry, §§1.3,
     1.4.
@@ -119,13 +123,18 @@ def drift(
     body: Inertia | MassProperties,
     torque: Torque | None = None,
 ) -> dict[str, Scalar]:
-    """Return the drift of each conserved quantity during a run, relative to the size of the
-    quantity.
+    """Return how far each conserved quantity drifts during a run, relative to its scale.
 
-    **Arguments:** `ts` (T,) s; `ys` states with a leading time axis, as a `Coupled` if the torque
-    has states of its own; `body`, `torque` as for `simulate`. **Returns** for each name of
-    `conserved` the largest distance of the quantity from its value at `ts[0]`, divided by the
-    largest kinetic energy, momentum, or momentum squared of the run.
+    **Arguments:** `ts` (n,) the times, s; `ys` the states at these times, with a leading time axis,
+    as a `Coupled` if the torque has states of its own (such as the speed of a wheel); `body`,
+    `torque` as for `simulate`. **Returns** for each quantity that `conserved` names the largest
+    distance from its value at `ts[0]`, divided by its scale, which is the largest value during the
+    run of
+
+    - the kinetic energy, for `energy`;
+    - the magnitude of the quantity itself, for `linear_momentum` and `momentum_about_origin`;
+    - the squared magnitude of the angular momentum, for `momentum_squared`;
+    - the magnitude of the angular momentum, for the other momenta.
 
     >>> import jax
     >>> body, ts = rj.Inertia.from_principal(1.0, 2.0, 3.0), jax.numpy.linspace(0.0, 9.0, 4)

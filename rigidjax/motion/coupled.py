@@ -19,12 +19,13 @@ from rigidjax.motion.torques.states import (
 
 
 class Coupled(eqx.Module):
-    """Hold the state of a body whose torque has states of its own, for the integrators.
+    """Hold the state of a body together with the states that its torques have of their own, such as
+    the speed of a wheel.
 
-    `simulate` makes a `Coupled` itself and returns its parts, `sol.ys` and `sol.own`;
-    `rigidjax.batch.rollout` returns it; `rigidjax.conserved` and `energy` take it. **Arguments:**
-    `motion` a `Spin`, `Attitude` or `Rigid`; `own`, a tuple with the states of each torque that has
-    states, as `Solution.own`.
+    `simulate` makes a `Coupled` itself and returns its two parts separately, as `sol.ys` and
+    `sol.own`; `rigidjax.batch.rollout` returns a `Coupled`; `rigidjax.conserved` and
+    `rigidjax.energy` take one. **Arguments:** `motion` a `Spin`, `Attitude` or `Rigid`; `own` a
+    tuple with the states of each torque that has states, in the order of these torques.
 
     >>> wheel = rj.torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0])
     >>> Coupled.start(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0, 2.0]), wheel).own
@@ -36,8 +37,11 @@ class Coupled(eqx.Module):
 
     @staticmethod
     def start(body: Body | None, state0: PyTree, torque: PyTree, t: ScalarLike = 0.0) -> "Coupled":
-        """Return the `Coupled` of `state0` and the initial states of `torque` (see
-        `rigidjax.simulate`) at `t`, s.
+        """Return the state of motion `state0` together with the initial values of the states that
+        `torque` has of its own, as a `Coupled`.
+
+        - `body`, `state0`, `torque`: as for `rigidjax.simulate`
+        - `t`: s, the time at which the motion starts
         """
         _checks.require_unbatched_instance(body, (Inertia, MassProperties), "body")
         _checks.require_unbatched_instance(
@@ -80,7 +84,7 @@ def with_own_states(body: Body | None, state0: PyTree, torque: PyTree, t: Scalar
     - `body`: an `Inertia` or `MassProperties`
     - `state0`: a `Spin`, `Attitude` or `Rigid`; a `Coupled` is returned unchanged
     - `torque`: a torque, a force or `None`
-    - `t`: s, the time of the start
+    - `t`: s, the time at which the integration starts
     """
     if isinstance(state0, Coupled) or not contains_own_states(torque):
         return state0

@@ -41,9 +41,10 @@ class Spin(eqx.Module):
 class Attitude(eqx.Module):
     """Hold the state of a body that turns: attitude and body rate.
 
-    **Arguments:** `q` (4,) unit quaternion (w, x, y, z), **scalar first**, body → world (the `M` of
-    the notes, eq 8), or a `Rotation` of SciPy; `omega` (3,) Ω in the body frame, rad/s. `simulate`
-    and `rigidjax.exact.free_body` check that `q` is a unit quaternion.
+    **Arguments:** `q` (4,) unit quaternion (w, x, y, z), **scalar first**, body → world (its
+    rotation matrix is `M` in the notes, eq 8), or a `Rotation` of SciPy; `omega` (3,) angular
+    velocity Ω in the body frame, rad/s. `simulate` and `rigidjax.exact.free_body` check that `q` is
+    a unit quaternion; this class does not.
 
     >>> Attitude([1.0, 0, 0, 0], [0.0, 0, 1]).q.shape
     (4,)
@@ -95,10 +96,11 @@ class Rigid(eqx.Module):
 class EulerEquations(eqx.Module):
     """Evaluate Euler's equations `I dΩ/dt = IΩ × Ω + τ` as a vector field `f(t, y, args)`.
 
-    `inertia` I is about the point that the body turns about; `torque` gives τ, N m, body frame, or
-    is `None`. Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`;
-    Landau and Lifshitz, Mechanics, eq 36.4. **Raises:** `ValueError` for the inertia of a rod or a
-    point, which has no inverse, unless JAX traces it.
+    Ω is the body rate, rad/s, body frame. **Arguments:** `inertia` I, kg m², about the point that
+    the body turns about; `torque` a torque, whose value is τ, N m, body frame, or `None`. Source:
+    Landau and Lifshitz, Mechanics, eq 36.4; the equations are in Lie–Poisson form, `dΠ/dt = Π ×
+    ∇H(Π) + τ` with the momentum `Π = IΩ` and the energy `H = ½ Π·I⁻¹Π`. **Raises:** `ValueError`
+    for the inertia of a rod or a point, which has no inverse, unless JAX traces the inertia.
     """
 
     inertia: Inertia
@@ -122,10 +124,11 @@ class EulerEquations(eqx.Module):
 
     def angular_acceleration(self, t: ScalarLike, state: HasSpin) -> Vec3:
         """Return dΩ/dt (3,), rad/s², body frame: the derivative of the body rate under the torque
-        of the equations.
+        that these equations hold.
 
         - `t`: s, the time
-        - `state`: any state with a body rate Ω and with what else the torque reads
+        - `state`: any state with a body rate Ω and with each other part that the torque reads, such
+          as the attitude
         """
         torque = None
         if self.torque is not None:
@@ -151,8 +154,9 @@ class AttitudeEquations(eqx.Module):
     """Evaluate the equations of motion of a body that turns, Euler's equations `I dΩ/dt = IΩ × Ω +
     τ` and `dq/dt = ½ q ⊗ (0, Ω)` (notes, eq 50), as a vector field `f(t, y, args)`.
 
-    The state y is an `Attitude`: the quaternion q, body → world, and the body rate Ω. `inertia` I
-    is about the point that the body turns about; `torque` gives τ, N m, body frame, or is `None`.
+    The state y is an `Attitude`: the quaternion q, body → world, and the body rate Ω, rad/s.
+    **Arguments:** `inertia` I, kg m², about the point that the body turns about; `torque` a torque,
+    whose value is τ, N m, body frame, or `None`.
     """
 
     euler: EulerEquations
@@ -165,10 +169,14 @@ class AttitudeEquations(eqx.Module):
 
 
 class NewtonEuler(eqx.Module):
-    """Evaluate the Newton–Euler equations about the centre of mass as a vector field (notes, eqs 1,
-    50, 56, 84).
+    """Evaluate the Newton–Euler equations of a body about its centre of mass as a vector field
+    `f(t, y, args)` (notes, eqs 1, 50, 56, 84).
 
-    `m dv/dt = F`, `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`; `torque` gives τ, or a `Wrench`.
+    The equations are `dx/dt = v`, `m dv/dt = F`, `dq/dt = ½ q ⊗ (0, Ω)` and `I dΩ/dt = IΩ × Ω + τ`.
+    The state y is a `Rigid`: the position x and velocity v of the centre of mass, world frame; the
+    quaternion q, body → world; and the body rate Ω. **Arguments:** `body` the mass m and the
+    inertia I about the centre of mass; `torque` a model that returns the torque τ, N m, body frame,
+    or a `Wrench` of τ and the force F, N, world frame; `None` for a free body.
     """
 
     euler: EulerEquations
@@ -194,8 +202,9 @@ class NewtonEuler(eqx.Module):
 
 
 def project_to_group(state: State) -> State:
-    """Return the state with its quaternion, if it has one, scaled to length 1; other numbers of the
-    state do not change. **Raises:** `ValueError` if the quaternion is zero, unless JAX traces it.
+    """Return the state with its quaternion, if the state has one, scaled to length 1; the other
+    numbers of the state do not change. **Raises:** `ValueError` if the quaternion is zero, unless
+    JAX traces the quaternion.
 
     - `state`: a `Spin`, `Attitude`, `Rigid` or any other tree of arrays, or a `Coupled`: a state of
       motion together with the states of the torques

@@ -21,16 +21,17 @@ from rigidjax.rotation.linalg3 import components
 
 
 def dimension(state: PyTree) -> int:
-    """Return the length n of the vector that describes a small change of `state` (a tree of
-    arrays): the count of its numbers, less one for each quaternion, whose change is a rotation
-    vector of three numbers.
+    """Return the length n of the vector that describes a small change of `state`, a tree of arrays.
+
+    This is the count of the numbers in `state`, less one for each quaternion: a quaternion has four
+    numbers, but its change is a rotation vector of three numbers.
     """
     return max((place.stop for place in _slices_of_leaves(state)), default=0)
 
 
 def leaf_names(state: PyTree) -> tuple[str, ...]:
-    """Return the names of the leaves (arrays) of `state`, such as "q" and "omega", in the order in
-    which their numbers stand in the vector of a change of the state.
+    """Return the names of the leaves (arrays) of `state`, such as "q" and "omega". Their order is
+    the order in which the changes of the leaves stand in the vector of a change of the state.
     """
     paths = jax.tree.leaves_with_path(state)
     return tuple(jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths)
@@ -39,8 +40,8 @@ def leaf_names(state: PyTree) -> tuple[str, ...]:
 def parts_by_name(
     state: PyTree, change: Float[Array, "*batch n"]
 ) -> dict[str, Float[Array, "*batch _"]]:
-    """Return, by the name of each leaf (array) of `state`, the numbers of a change of the state
-    that belong to this leaf; a quaternion has three numbers in a change.
+    """Split a change of a state into a dict: from the name of each leaf (array) of the state to the
+    numbers of the change that belong to this leaf, which are three numbers for a quaternion.
 
     - `state`: a tree of arrays
     - `change`: (..., n), the changes of all leaves one after another, n = `dimension(state)`
@@ -50,8 +51,8 @@ def parts_by_name(
 
 
 def rotation_slices(state: PyTree) -> tuple[slice, ...]:
-    """Return the slices of the rotation vectors (three numbers each) in the vector of a change of
-    `state` (a tree of arrays), one slice for each quaternion of the state.
+    """Return one slice for each quaternion of `state`, a tree of arrays: the place of its rotation
+    vector (three numbers) in the vector that describes a change of the state.
     """
     pairs = zip(_slices_of_leaves(state), _quaternion_flags(state), strict=True)
     return tuple(place for place, turned in pairs if turned)
@@ -88,8 +89,11 @@ def minus(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
 
 
 def minus_small(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
-    """Return the change (n,) from one state to another near it, `state ⊖ reference`, computed
-    without an arctangent: a turn by the angle θ gives 2 sin(θ/2), not θ.
+    """Return the change (n,) from `reference` to a state near it, `state ⊖ reference`, computed
+    without an arctangent.
+
+    For two quaternions that differ by a turn of the angle θ, the vector returned therefore has the
+    length 2 sin(θ/2), not θ.
 
     - `state`, `reference`: two trees of arrays with one structure
     """
@@ -103,8 +107,8 @@ def minus_small(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
 
 
 def vector_to_tangent(state: PyTree, change: Float[Array, " n"]) -> PyTree:
-    """Return the derivative of `plus(state, s change)` with respect to s at s = 0: a tree like
-    `state`, which JAX takes as a tangent.
+    """Return the derivative of `plus(state, α * change)` with respect to the number α at α = 0: a
+    tree like `state`, which JAX takes as a tangent.
 
     - `state`: a tree of arrays
     - `change`: (n,), the changes of all leaves one after another; for a quaternion, a rotation
@@ -142,8 +146,8 @@ def _quaternion_flags(state: PyTree) -> list[bool]:
 
 
 def _slices_of_leaves(state: PyTree) -> list[slice]:
-    """Return, for each leaf (array) of `state`, the slice of the vector of a change that belongs to
-    the leaf.
+    """Return one slice for each leaf (array) of `state`, a tree of arrays: the place of the change
+    of this leaf in the vector that describes a change of the state.
 
     The vector holds the changes of all leaves one after another: three numbers (a rotation vector)
     for a quaternion, and as many numbers as the leaf has for any other leaf.
@@ -187,9 +191,9 @@ def _concatenate_over_leaves(
     of_quaternions: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> Array:
-    """Return one vector (n,), computed leaf by leaf from two trees: one function is applied to each
-    quaternion of a state and the array at the same place of the other tree, another function to all
-    other pairs of arrays.
+    """Return one vector (n,), computed from pairs of arrays at the same place of two trees: one
+    function is applied to the pairs with a quaternion, and another function to all other pairs. The
+    results stand in the vector one after another.
 
     - `first`: a tree of arrays with the structure of `second`
     - `second`: a state, which determines the leaves that are quaternions

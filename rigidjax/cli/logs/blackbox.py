@@ -23,7 +23,8 @@ from rigidjax.cli.logs.errors import LogError, warn
 
 # The first three numbers are bounds of the flight controllers' own decoder: the longest frame in
 # bytes, and the largest jumps of the iteration and of the time, µs, between two frames. The
-# counters of iteration and time have 32 bits, so that they start again at _WRAP.
+# counters of iteration and time have 32 bits, so that they start again from zero where they would
+# reach _WRAP.
 _LONGEST_FRAME, _ITERATION_JUMP, _TIME_JUMP, _WRAP = 256, 5_000, 10_000_000, 2**32
 # This maps each kind of event to the number of integers of variable length that follow the kind.
 _EVENT_NUMBERS = {0: 1, 14: 2, 15: 1, 30: 2}
@@ -95,10 +96,12 @@ class _Bytes:
 
 
 class _Flight:
-    """Hold one flight: its header, and its frames in the order of the log.
+    """Hold one flight of a Blackbox log: its header, and its frames in the order of the log.
 
-    **Fields**, among others: `names` of all fields; `count` the number of I and P frames that were
-    read so far; `left_out` the number of I and P frames that were left out.
+    A frame is one record of the log; an I frame holds whole values, and a P frame holds differences
+    from the frames before it. **Fields**, among others: `names` the names of all fields of the
+    frames; `count` the number of I and P frames that were read so far; `left_out` the number of
+    these frames that were left out.
     """
 
     def __init__(self, reader: Any, data: bytes):
@@ -117,7 +120,9 @@ class _Flight:
         self.names = list(dict.fromkeys([*self.main, *self.others]))
 
     def wrap_to_32_bits(self, name: str, values: np.ndarray) -> np.ndarray:
-        """Return the values of a field as the 32-bit integers that the flight controller had."""
+        """Return the `values` of the field `name` as the 32-bit integers that the flight controller
+        had; the time and the fields of slow and GPS frames are returned unchanged.
+        """
         if name not in self.main or name == "time":
             return values
         if self.fields[self.kind.INTRA][self.main.index(name)].signed:
@@ -182,8 +187,8 @@ class _Flight:
                 yield -1 if kind == self.kind.INTRA else order.groups, others | fields
 
     def _expected_iteration_of_next_frame(self) -> int:
-        """Return the number of the iteration of the flight controller's loop that the next frame
-        must have.
+        """Return the iteration of the flight controller's loop at which the next frame must have
+        been written, if no frame is missing.
 
         A frame is one record of the log. The header says after how many iterations a frame is
         written.
@@ -191,11 +196,11 @@ class _Flight:
         return self.context.last_iter + 1 + self.context.count_skipped_frames()
 
     def _is_frame_or_end_at(self, index: int) -> bool:
-        """Return whether one of three things is at the byte `index` of the data: a frame; a P frame
-        whose first byte (its letter P) is damaged; or the end of the data.
+        """Return whether the byte `index` of the data is where one of three things begins: a frame;
+        a P frame whose first byte (its letter P) is damaged; or the end of the data.
 
-        Otherwise the frame before this byte is probably damaged, and has too few bytes or too many.
-        Erased memory counts as the end of the data.
+        If none of them begins there, the frame before this byte is probably damaged, and has too
+        few bytes or too many. Erased memory counts as the end of the data.
         """
         if index == len(self.data) or self.data[index] in self.kinds:
             return True
@@ -252,15 +257,17 @@ class _Flight:
 
 
 class _Order:
-    """Check the order of I and P frames by their iterations and times.
+    """Check the order of the frames of a Blackbox log by their iterations and times.
 
-    A group is an I frame and the P frames after it.
+    An I frame holds whole values; a P frame holds differences from the frames before it. A group is
+    an I frame and the P frames after it, up to the next I frame.
 
     **Fields**, among others:
 
-    - `groups`: the number of groups.
-    - `incomplete`: the groups with too few frames.
-    - `time`: the time of the last frame, µs, without the jumps of a counter of 32 bits.
+    - `groups`: the number of groups so far.
+    - `incomplete`: the numbers of the groups from which frames are missing.
+    - `time`: the time of the last frame, µs; it goes on where the 32-bit counter of the log starts
+      again from zero.
     - `is_valid`: whether no frame since the last I frame was damaged or missing.
     """
 
@@ -272,7 +279,9 @@ class _Order:
         self.groups, self.incomplete = 0, list[int]()
 
     def resume_after_pause(self, iteration_and_time: Sequence[int]) -> None:
-        """Set the last frame's iteration and time to those of the event that ends a pause."""
+        """Set the iteration and the time of the last frame to those of the event that ends a pause
+        of the logging.
+        """
         self.last = self.last_key = tuple(iteration_and_time)
         self.is_resumed = True
 
@@ -325,9 +334,9 @@ class _Order:
     def groups_with_missing_frames(self) -> list[int]:
         """Return the numbers of the groups from which frames are missing.
 
-        A group is an I frame and the P frames after it. If frames are missing from half of all
-        groups or more, the result is empty: the interval
-        between frames in the header is then not the interval in the log.
+        A group is an I frame and the P frames after it. The result is empty if frames seem to be
+        missing from half of all groups or more: the interval between frames that the header states
+        is then not the interval in the log.
         """
         return self.incomplete if 2 * len(self.incomplete) < self.groups else []
 
@@ -347,7 +356,8 @@ def _read_variable_length_integer(stream: _Bytes) -> int:
 
 
 def _closely_follows_frame(last_frame: Sequence[int], frame: Sequence[int]) -> bool:
-    """Return whether the iteration and the time of a frame closely follow those of the last one.
+    """Return whether a frame follows the last frame closely: its iteration and its time are not
+    before those of the last frame, and not further after them than the decoder allows.
 
     Both arguments hold an iteration of the flight controller's loop, and a time, µs.
     """

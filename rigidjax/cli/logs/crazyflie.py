@@ -15,12 +15,13 @@ FIRST_BYTE = 0xBC
 
 
 def read_crazyflie(path: Path, columns: Sequence[str]) -> Columns:
-    """Return two things: the names of all variables of a Crazyflie's µSD log, such as `gyro.x`, and
-    of their `timestamp`, µs; and a dict of the wanted variables.
+    """Return two things: the names of all variables in a Crazyflie's µSD log, such as `gyro.x`; and
+    a dict of the variables that `columns` name.
 
-    A log holds several events, each with its own variables. The event that has most of the wanted
-    names is read. Source: the description of the format in the documentation of the firmware, "µSD
-    card deck", versions 1 and 2.
+    The times are the variable `timestamp`, µs. A log holds several events, each with its own
+    variables and times. The event that has most of the wanted variables is read, and if two events
+    have equally many, the event with more data. Source: the description of the format in the
+    documentation of the firmware, "µSD card deck", versions 1 and 2.
     """
     data = path.read_bytes()
     version, count = struct.unpack_from("<HH", data, 1)

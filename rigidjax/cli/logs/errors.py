@@ -1,5 +1,5 @@
-"""Define the error for a log that cannot be read, and the warning for a log of which a part is left
-out.
+"""Define the error for a log that cannot be read, and the warning for a log that is read only in
+part or whose units are doubtful.
 """
 
 import warnings
@@ -14,8 +14,8 @@ class LogError(ValueError):
     """
 
     def __str__(self) -> str:
-        """Return the message with control characters escaped, since a name may contain commands of
-        a terminal.
+        """Return the message with control characters escaped, since the name of a file or column
+        may contain characters that are commands for a terminal.
         """
         return _checks.escape_controls(super().__str__())
 

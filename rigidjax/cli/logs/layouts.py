@@ -25,8 +25,8 @@ class ImuColumns(NamedTuple):
 USUAL = ImuColumns(("t", "wx", "wy", "wz"), "rad/s", "s")
 
 
-# Fields in binary logs, by the ending of the file, have these units, which their names do not
-# contain.
+# For each ending of the file name of a binary log: the units of fields whose names do not contain a
+# unit.
 _UNITS = {
     ".bbl": {"time": "us", "gyroADC": "deg/s", "accSmooth": "g"},
     ".ulg": {"timestamp": "us"},
@@ -42,10 +42,11 @@ def known_unit_of_column(path: str | Path, column: str) -> str | None:
 
 
 def imu_columns_of(path: str | Path) -> ImuColumns:
-    """Return the columns of time and rates of a log, or `USUAL` if they are not known.
+    """Return the columns of time and rates of a log, or the usual columns t, wx, wy, wz if they are
+    not known.
 
-    The columns of a text are found by the units in their names, which phyphox writes in the same
-    way in all languages.
+    The columns of a text log are found by the units in their names, because phyphox writes the
+    units in the same way in all languages.
     """
     path = Path(path)
     # Errors are suppressed here, since the reader of the log raises them later with better
@@ -59,10 +60,11 @@ def imu_columns_of(path: str | Path) -> ImuColumns:
 
 
 def _imu_columns_by_units_in_names(column_names: list[str]) -> ImuColumns | None:
-    """Return the columns of the time and of the three rates, about x, y and z, whose names contain
-    their units.
+    """Return the columns of a text log whose names contain the unit of a time or of a rate about x,
+    y or z.
 
-    The result is `None` unless there is exactly one time and one rate about each axis.
+    The result is `None` unless there is exactly one such column for the time and one for the rate
+    about each axis.
     """
     times = {n: unit for n in column_names if (unit := unit_in_column_name(n, ())) in TIME_UNITS}
     rates = {

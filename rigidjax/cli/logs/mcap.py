@@ -28,7 +28,7 @@ def read_mcap(path: Path, columns: Sequence[str]) -> Columns:
         reader = make_reader(file, decoder_factories=[_Json(), ros()])
         for number, (_, channel, message, content) in enumerate(reader.iter_decoded_messages()):
             if not columns and number == _ENOUGH:
-                # Only names are wanted, and every topic has had a message by now.
+                # Only names are wanted, and every topic is assumed to have had a message by now.
                 break
             first = message.log_time if first is None else first
             fields = {"log_time": 1e-9 * (message.log_time - first)} | dict(
@@ -58,8 +58,11 @@ class _Json:
 
 
 def _named_numbers_in(content: object, name: str = "") -> Iterator[tuple[str, float]]:
-    """Yield a pair for each number in a message: the name of its place, such as `.gyro.x`; and it
-    as a float.
+    """Yield a pair for each number in a message: the name of the place of the number, such as
+    `gyro.x`; and the number as a float.
+
+    - `content`: the message, or a field inside it
+    - `name`: the name of this field, empty for the message
     """
     if isinstance(content, bool | int | float | np.number):
         yield name, float(content)

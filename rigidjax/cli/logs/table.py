@@ -36,11 +36,11 @@ def read_table(
     A log is one of these:
 
     - Text with a header, which may be packed (`.gz`), in UTF-8, UTF-16 or Windows's code page 1252.
-      Cells are separated by commas, semicolons or tabs: the sign that splits the header into the
-      largest number of names. Decimals have a point or, between semicolons and tabs, a comma. Lines
-      that begin with `#` may stand above the header; the last such line may be the header itself,
-      as in files of `numpy.savetxt`. Text is read line by line; it needs memory for up to three
-      times its numbers.
+      Cells are separated by commas, semicolons or tabs; the separator is the one of these signs
+      that splits the header into the largest number of names. Decimals have a point or, between
+      semicolons and tabs, a comma. Lines that begin with `#` may stand above the header; the last
+      such line may be the header itself, as in files of `numpy.savetxt`. Text is read line by line,
+      so that reading needs up to three times the memory of the numbers that are read.
     - `.npz`, `.mat` (MATLAB up to v7), or a Crazyflie's µSD log (without ending, or `.usd`).
     - With the extra of the same name (`pip install 'rigidjax[blackbox]'`): `blackbox` (`.bbl`,
       `.bfl`), `ulog` of PX4 (`.ulg`), `mcap` (JSON and ROS 2).
@@ -53,8 +53,9 @@ def read_table(
       flight.
 
     **Returns** name → (T,) numbers in the units of the log, NaN for an empty cell. It **warns** of
-    frames (records) of a Blackbox log that are left out: all frames before the first I frame, which
-    is a frame that can be read alone, and all frames from a damaged frame to the next I frame.
+    frames (records) of a Blackbox log that are left out. An I frame is a frame that can be read
+    alone: all frames before the first I frame are left out, and all frames from a damaged frame to
+    the next I frame.
 
     **Raises:** `ValueError`, in one line that names file, line and column, for a file that is
     missing, cut or of another kind; for a column that is missing, there twice, or wanted twice; for
@@ -104,7 +105,9 @@ def lowercase_file_ending(path: Path) -> str:
 
 
 def _refuse_flight_unless_blackbox(path: Path, flight: int | None) -> None:
-    """Raise `LogError` if a `flight` is chosen and the log is not a Blackbox log."""
+    """Raise `LogError` if a `flight` is chosen. The caller has found that the log at `path` is not
+    a Blackbox log, and other logs have no flights.
+    """
     if flight is not None:
         raise LogError(f"{path}: flight {flight}: only a Blackbox log (.bbl, .bfl) has flights")
 

@@ -66,9 +66,11 @@ class Header(NamedTuple):
 
 
 def read_header(file: io.TextIOBase) -> Header:
-    """Read the header of a text from its beginning, which is the first line after comments (`#`).
+    """Read the header of a text log, open at its beginning: the first line that is neither empty
+    nor a comment (`#`).
 
-    If numbers follow the last comment, this comment is the header, as in files of `numpy.savetxt`.
+    If this line contains a number in place of a name, or is missing, the last comment before it is
+    the header, as in files of `numpy.savetxt`.
     """
     comments, first, line = "", file.readline(_LONGEST), 1
     while first.startswith("#") or (first and not first.strip()):
@@ -80,8 +82,8 @@ def read_header(file: io.TextIOBase) -> Header:
     return Header(names, separator, line, [])
 
 
-# A header is read up to this length, which is the longest cell that `csv` allows, since a file may
-# be one endless line.
+# A line of the header is read up to this length only, since a file may be one endless line. The
+# module `csv` allows no longer cell.
 _LONGEST = 131_072
 _NUMBER = re.compile(r"[-+.\d][-+.\deE]*")
 
@@ -142,7 +144,9 @@ def read_columns(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dic
 
 
 class _NumberReader:
-    """Read cells as numbers, where the first decimal decides between a point and a comma."""
+    """Read cells as numbers; the first decimal sign decides whether all decimals of the log have a
+    point or a comma.
+    """
 
     def __init__(self, separator: str):
         self.separator = separator
@@ -159,8 +163,8 @@ class _NumberReader:
             plain = self._replace_decimal_comma(cell)
         elif "." in cell:
             self.decimal = "."
-        # Python accepts more than a log may contain: 1_000, and digits of other alphabets, are
-        # refused.
+        # `float` accepts more texts than a log may contain, such as 1_000 and digits of other
+        # alphabets. These texts are refused here.
         try:
             value = float(plain if plain.isascii() and "_" not in plain else "")
         except ValueError:

@@ -55,7 +55,7 @@ def mask_of_increasing(t: np.ndarray) -> np.ndarray:
 def rows_to_use(
     path: str | Path, t: np.ndarray, time_column: str, window: tuple[float, float] | None
 ) -> np.ndarray:
-    """Return the indices of the rows to use, which are the rows in the window whose times increase.
+    """Return the indices of the rows to use: those rows in the window whose times increase.
 
     **Arguments:**
 
@@ -106,8 +106,8 @@ def rows_to_use(
 def _refuse_clock_set_back(
     path: str | Path, t: np.ndarray, time_column: str, rows: np.ndarray, is_kept: np.ndarray
 ) -> None:
-    """Raise `LogError` if the times of rows that are not kept form a second increasing series,
-    since the clock was set back in this case.
+    """Raise `LogError` if the clock was set back: successive rows that are not kept then have times
+    that form a second increasing series.
 
     - `path`, `time_column`: the path of the file and the name of the time column, for messages.
     - `t`: (T,) the times, s.

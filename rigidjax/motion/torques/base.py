@@ -28,11 +28,11 @@ from rigidjax.motion.torques.states import FrozenLaw, require_frozen_states
 
 
 class Wrench(eqx.Module):
-    """Hold a force on the centre of mass and a torque about the centre of mass: the value of a
-    force model.
+    """Hold a force on the centre of mass and a torque about the centre of mass: the value that a
+    force model returns.
 
     **Arguments:** `force` (3,) N, **world** frame; `torque` (3,) N m, **body** frame, about the
-    centre of mass; none by default.
+    centre of mass; zero by default.
 
     >>> Wrench([0.0, 0.0, -9.81]).torque
     Array([0., 0., 0.], dtype=float64)
@@ -50,17 +50,23 @@ class Wrench(eqx.Module):
 class AbstractTorque(eqx.Module):
     """Define a torque on a body: a function of time, state and body, in N m, body axes.
 
-    Subclass it, or give any callable Module. `feels` is the smallest state with the parts that the
-    torque reads: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also `.x`, `.v`); a
-    torque with `feels = HasPose` may return a `Wrench`, a force as well as a torque. `body` is the
-    argument of `simulate`: an `Inertia`, or `MassProperties` for `Rigid`.
+    Subclass it, or write any callable Module in its place. `feels` is the smallest state with the
+    parts that the torque reads: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also
+    `.x`, `.v`); a torque with `feels = HasPose` may return a `Wrench`, a force as well as a torque.
+    A torque gets the `body` that was given to `simulate`: an `Inertia`, or `MassProperties` for
+    `Rigid`.
 
-    Optional members. `rate_free`: the torque does not depend on the body rate, and
-    `rigidjax.solvers.Splitting4` and others can be used. For `rigidjax.conserved`: a method
-    `energy(t, state, body)`, J, if the torque has a potential; `steady`, true if the torque does
-    not depend on time; `axis` (3,), world frame, along which the torque has no component; a method
-    `internal_momentum(t)` (3,), N m s, body frame, the momentum inside a body on which no external
-    torque acts. `jump_times` (n,), s: the times at which the torque jumps or has a kink.
+    Optional members:
+
+    - `rate_free`: true if the torque does not depend on the body rate;
+      `rigidjax.solvers.Splitting4` and others can then be used.
+    - `jump_times` (n,), s: the times at which the torque jumps or has a kink.
+    - `energy(t, state, body)`, J, a method of a torque with a potential. This member and the next
+      three are for `rigidjax.conserved`.
+    - `steady`: true if the torque does not depend on time.
+    - `axis` (3,), world frame: a vector along which the torque has no component.
+    - `internal_momentum(t)` (3,), N m s, body frame, a method that returns the momentum of parts
+      inside the body, such as wheels. A torque with this method is not an external torque.
 
     **States of its own** (a motor's speed, a wheel, a bias that drifts): give the torque `state0`,
     a tree of arrays or a method `(t, state, body)` that returns one, and a method `rate(t, own,
@@ -210,7 +216,7 @@ def evaluate_torque(
     torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> Vec3:
     """Return the value (3,), N m, body frame, of a torque at one time. **Raises:** `TypeError` for
-    a force, which needs a `Rigid`.
+    a model that returns a force as well, since this function returns the torque alone.
 
     - `torque`: a callable (t, state, body)
     - `t`: s, the time
@@ -235,8 +241,8 @@ def force_and_torque(
 
     - `model`: a callable (t, state, body) that returns a torque (3,) or a `Wrench`
     - `t`: s, the time
-    - `state`: the state of motion, with the parts that `model` reads; its precision is that of the
-      result
+    - `state`: the state of motion, with the parts that `model` reads; the result has the precision
+      of this state
     - `body`: an `Inertia` or `MassProperties`
     """
     require_compatible(model, state, body)
@@ -254,8 +260,9 @@ def force_and_torque(
         hint = "; a subclass of AbstractTorque declares the state that it reads by feels, such as"
         hint += " feels = HasAttitude"
         raise TypeError(message + hint) from error
-    # The test is not by class: torques of moving frames do not import this module, and return
-    # forces of another class.
+    # A model that returns a force is recognised by the field `force` of its value, not by the class
+    # of the value: the modules of moving frames do not import this module, and have a class of
+    # their own for a force and a torque.
     if hasattr(result, "force"):
         return result.force.astype(dtype), result.torque.astype(dtype)
     value = _checks.array_of_shape(result, (3,), name, hint="body-frame N m")
@@ -286,7 +293,8 @@ def missing_state_part_message(caller: str, error: AttributeError) -> str | None
 
 def require_unbatched_torque(torque: Torque) -> None:
     """Raise `ValueError` if an array in a field of `torque` has the shape of many torques, such as
-    in a batch made by `jax.vmap`. A torque that a user defined is not checked.
+    in a batch made by `jax.vmap`. A torque that a user defined is not checked, because its fields
+    may have any shape.
     """
     if not type(torque).__module__.startswith(__package__ or ""):
         return
@@ -329,7 +337,7 @@ def vector_converter(name: str, *, hint: str = "") -> Callable[[Any], Array]:
     for `equinox.field(converter=…)`.
 
     - `name`: the name of the field, for messages
-    - `hint`: advice that a message ends with
+    - `hint`: advice, which is added at the end of a message
     """
     return lambda value: _checks.finite_array(value, (3,), name, hint=hint)
 
@@ -432,8 +440,9 @@ def scalar_or_one_each(value: NumbersLike, count: int, name: str) -> Array:
 
 
 def length_or_zero(v: Vec3) -> Scalar:
-    """Return the length |v| of a vector (3,), any unit, with the derivative 0 at v = 0, where the
-    true derivative does not exist; derivatives of a product such as |v| v are then right.
+    """Return the length |v| of a vector `v` (3,), in any unit. At v = 0, where the derivative of
+    the length does not exist, its derivative is set to 0: the first derivative of a product such as
+    |v| v is then right.
     """
     v = _checks.array_of_shape(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]

@@ -17,13 +17,15 @@ from rigidjax.rotation.barrier import barrier
 class Chebyshev(eqx.Module):
     """Evaluate a function of time, t → (k,): a Chebyshev series on each of many equal intervals.
 
-    **Arguments:** `start` s, the beginning of the first interval; `step` s, the length of each;
-    `coefficients` (intervals, k, terms): `Σ_n c_n T_n(x)` with x from −1 to 1 along the interval,
-    the layout of JPL's ephemerides. All may be traced.
+    **Arguments:** `start` s, the beginning of the first interval; `step` s, the length of each
+    interval; `coefficients` (intervals, k, terms), in the layout of JPL's ephemerides: the value is
+    `Σ_n c_n T_n(x)` with the coefficients c_n of the interval, the Chebyshev polynomials T_n, and x
+    from −1 to 1 along the interval. All arguments may be traced.
 
-    The function gives a position at any time for `GravityGradient` and `Tide`, with all digits of
-    the table; it is NaN outside of the intervals. **Raises:** `ValueError` for a step that is not
-    positive. The sum is by Clenshaw's recurrence (1955, Mathematical Tables 9:118).
+    `GravityGradient` and `Tide` take such a function as the `position` of a point mass; the
+    position then has all digits of the table. The value is NaN outside of the intervals.
+    **Raises:** `ValueError` for a step that is not positive. The sum is computed by Clenshaw's
+    recurrence (1955, Mathematical Tables 9:118).
 
     >>> Chebyshev(0.0, 2.0, [[[1.0, 0.0, 1.0]]])(2.0)  # 1 + T₂(1)
     Array([2.], dtype=float64)

@@ -82,25 +82,30 @@ def parts_of(torque: base.Torque | None) -> tuple[Any, ...]:
 
 
 class ChangingInertia(eqx.Module):
-    """Describe the effect of a changing inertia: `d(IΩ)/dt = IΩ × Ω + τ`, that is `I dΩ/dt = … − İΩ
-    + τ`.
+    """Describe the effect of a changing inertia I on the body rate Ω: `d(IΩ)/dt = IΩ × Ω + τ`, that
+    is `I dΩ/dt = IΩ × Ω − İΩ + τ`.
 
-    **Arguments:** `inertia` kg m², body frame, about the point that the body turns about (the
-    centre of mass of a `Rigid`): a function of time, t → (3, 3), such as `Linear(times, tensors)`,
-    or a Module with `feels` (as torques have) of `(t, state, body)`, such as `Tide`. `simulate`
-    integrates the momentum under a function of time: where the inertia jumps, as in `jnp.where(t <
-    t1, I0, I1)`, the momentum does not change. Elsewhere (`rigidjax.batch.rollout`), and of a
-    Module with `feels`, the derivative along the motion is taken, which has no jumps. A tensor that
-    no body has (not symmetric, or with moments that are not positive or break the triangle
-    inequality) becomes NaN, which ends the run. `torque` all other torques, or `None`: give all
-    other torques here, not in a `Sum` with this object, because they act on the body with the
-    inertia I.
+    **Arguments:**
 
-    A function of time replaces the inertia of the body given to `simulate`. Parts that move inside
-    must have no momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend in a straight
-    line from the centre; otherwise add the momentum of the moving parts as a `Flywheel` to
-    `torque`. Ejected fuel carries momentum away, at the rate İΩ for its part of İ: in this case add
-    İΩ to `torque`.
+    - `inertia`: I (3, 3), kg m², body frame, about the point that the body turns about (the centre
+      of mass of a `Rigid`). It is either a function of time, t → (3, 3), such as `Linear(times,
+      tensors)`, which replaces the inertia of the body given to `simulate`; or a Module that is
+      called as `(t, state, body)` and has the attribute `feels`, as torques have, such as `Tide`. A
+      tensor that no body has (not symmetric, or with moments that are not positive or break the
+      triangle inequality) becomes NaN, which ends the run.
+    - `torque`: the sum τ of all other torques, or `None`. Give all other torques here, not in a
+      `Sum` with this object, because they act on the body with the inertia I.
+
+    If `inertia` is a function of time, `simulate` integrates the momentum: where the inertia jumps,
+    as in `jnp.where(t < t1, I0, I1)`, the momentum does not change. In other integrators, such as
+    `rigidjax.batch.rollout`, and for a Module with `feels`, the derivative İ along the motion is
+    used instead, in which a jump of the inertia is lost.
+
+    Parts that move inside the body must have no angular momentum in the body frame (Σ mᵢ rᵢ × ṙᵢ =
+    0, a sum over the parts), as booms that extend in a straight line from the centre have none;
+    otherwise add the momentum of the moving parts as a `Flywheel` to `torque`. Ejected fuel carries
+    its momentum away: if İ_f is the rate at which the loss of fuel changes the inertia, add the
+    torque İ_f Ω to `torque`.
 
     Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; the momentum `R I(t) Ω` is conserved
     without τ.
@@ -127,8 +132,8 @@ class ChangingInertia(eqx.Module):
 
     @property
     def feels(self) -> base.StateType:
-        """Return the type of the smallest state that both the inertia and the torque inside can
-        read, such as `HasAttitude`.
+        """Return the type of the smallest state with all parts that the inertia and the torque of
+        this object read, such as `HasAttitude`.
         """
         needed = [getattr(part, "feels", HasSpin) for part in (self.inertia, self.torque)]
         return max(needed, key=base.STATE_TYPES_BY_SIZE.index)
@@ -155,8 +160,9 @@ class ChangingInertia(eqx.Module):
             now = tensor_or_nan(self.tensor(t, here, body).astype(omega.dtype))
             return apply(now, omega), now
 
-        # Ω̇ is not known yet, but d(IΩ)/dt is linear in Ω̇: one linearisation, evaluated along four
-        # directions (t with q, and each e_i of Ω), gives a linear system for Ω̇.
+        # Ω̇ is not known yet, but d(IΩ)/dt is linear in Ω̇. One linearisation of IΩ gives a linear
+        # system for Ω̇; it is evaluated along four directions: t and q together, and the three
+        # components of Ω one by one.
         (held, now), along = jax.linearize(momentum, t, q, omega)
         still, first = jnp.zeros((1, 3), omega.dtype), jnp.eye(4, 1, dtype=omega.dtype)
         turns = None if q is None else first * quaternion.rate(q, omega)[None]
@@ -167,8 +173,8 @@ class ChangingInertia(eqx.Module):
         if self.torque is not None:
             force, torque = base.force_and_torque(self.torque, t, state, with_tensor(body, now))
             turning = turning + torque
-        # The equations of motion use the inertia of the body, not I: return the torque with which
-        # they give this Ω̇.
+        # The equations of motion use the fixed inertia of `body`, not the changing inertia I. The
+        # torque that is returned is the torque with which these equations give the right Ω̇.
         fixed = tensor_of(body)
         slope = solve(slopes[1:].T, turning)
         torque = apply(fixed, slope) - cross(apply(fixed, omega), omega)
@@ -186,18 +192,25 @@ class Tide(eqx.Module):
     """Compute the inertia tensor of an elastic body that a point mass and the body's own spin
     deform.
 
-    `I = I₀ − κ (μ/r³)(u uᵀ − ⅓) + ⅓ κ (Ω Ωᵀ − ⅓ Ω² − n² (e_z e_zᵀ − ⅓))` with the inertia I₀ of
-    the body, the body rate Ω, and `u = Rᵀr/r` from the attitude R and the position r a time `delay`
-    ago. `ChangingInertia` takes a tide and adds İΩ: `ChangingInertia(Tide(…), torque)`.
+    `I = I₀ − κ (μ/r³)(u uᵀ − ⅓) + ⅓ κ (Ω Ωᵀ − ⅓ Ω² − n² (e_z e_zᵀ − ⅓))`, with the inertia I₀ of
+    the body given to `simulate`, the body rate Ω, and the direction `u = Rᵀr/r` of the point mass
+    in body axes. The attitude R and the position r in u are those at the earlier time t − `delay`.
+    Pass a tide to `ChangingInertia`, which computes İΩ: `ChangingInertia(Tide(…), torque)`.
 
-    **Arguments:** `response` κ = k₂R⁵/G, kg m² s², of a Love number k₂ and a radius R; `delay` s;
-    `mu` G M of the point mass, m³/s²; `position` r (3,) m, world frame, from the body to it:
-    constant, or a callable Module of time; `mean_rate` n rad/s about body z, the spin whose
-    deformation I₀ contains.
+    **Arguments:**
 
-    The attitude at t − delay is that of a turn at the present body rate. Source: Folkner, Williams,
-    Boggs, Park, Kuchynka 2014, The planetary and lunar ephemerides DE430 and DE431, IPN Progress
-    Report 42-196, section III.
+    - `response`: κ = k₂ a⁵/G, kg m² s², for a body with the Love number k₂ and the radius a; G is
+      the constant of gravitation.
+    - `delay`: s, the time by which the deformation lags behind the attraction of the point mass.
+    - `mu`: μ, m³/s², G times the mass of the point mass.
+    - `position`: r (3,), in metres, world frame, from the body to the point mass: constant, or a
+      callable Module of time.
+    - `mean_rate`: n, rad/s, about the z axis of the body: the spin whose deformation is already in
+      I₀.
+
+    The attitude at t − delay is computed as if the body had turned at the present body rate since
+    then. Source: Folkner, Williams, Boggs, Park, Kuchynka 2014, The planetary and lunar ephemerides
+    DE430 and DE431, IPN Progress Report 42-196, section III.
 
     >>> tide, body = Tide(3.0, 0.0, 1.0, [1.0, 0.0, 0.0]), rj.Inertia(4.0 * jnp.eye(3))
     >>> tide(0.0, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]), body).diagonal()

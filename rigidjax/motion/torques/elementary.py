@@ -15,8 +15,9 @@ from rigidjax.rotation import quaternion
 class ConstantTorque(base.AbstractTorque):
     """Apply a constant torque in the body frame, such as a thruster's: `τ = const`.
 
-    **Arguments:** `torque` (3,) N m, body frame (in the world frame: `InSpace`). A constant torque
-    about a principal axis spins the body up linearly (Euler 1758).
+    **Arguments:** `torque` (3,) N m, body frame (for a torque in the world frame take `InSpace`). A
+    constant torque about a principal axis increases the rate about this axis linearly in time
+    (Euler 1758).
 
     >>> ConstantTorque([0.0, 0.0, 1.0])(0.0, rj.Spin([0.0, 0.0, 5.0]), None).tolist()
     [0.0, 0.0, 1.0]
@@ -32,11 +33,11 @@ class ConstantTorque(base.AbstractTorque):
 
 
 class InSpace(base.AbstractTimeTorque):
-    """Apply a torque given in the world frame: `τ = Rᵀ τ_w`.
+    """Apply a torque given in the world frame: `τ = Rᵀ τ_w`, with the attitude R of the body.
 
     **Arguments:** `torque` τ_w, N m, world frame: (3,), or a callable Module of time, t → (3,),
-    such as `Linear(times, values)`. A constant τ_w adds τ_w t to the angular momentum; the
-    component of the momentum normal to τ_w is conserved.
+    such as `Linear(times, values)`. In a time t a constant τ_w adds τ_w t to the angular momentum
+    in the world frame; the component of this momentum normal to τ_w is conserved.
 
     >>> turned = rj.Attitude([0.0, 1.0, 0.0, 0.0], [0.0, 0, 0])  # half a turn about x
     >>> InSpace([0.0, 0.0, 1.0])(0.0, turned, None).tolist()  # in body axes
@@ -70,9 +71,9 @@ class _AbstractRateTorque(base.AbstractTorque):
 class Damping(_AbstractRateTorque):
     """Apply linear damping `τ = −c Ω`, component by component.
 
-    **Arguments:** `coefficient` (3,) c along the body axes, N m s/rad. The rate of a sphere of
-    inertia I decays as exp(−c t/I); a ball in a viscous fluid has c = 8πηr³ (Kirchhoff 1876; Lamb,
-    Hydrodynamics, §334).
+    **Arguments:** `coefficient` (3,) c along the body axes, N m s/rad. The rate Ω of a sphere with
+    the moment of inertia I decays as exp(−c t/I); a ball of radius r in a fluid of viscosity η has
+    c = 8πηr³ (Kirchhoff 1876; Lamb, Hydrodynamics, §334).
 
     >>> Damping([0.1, 0.1, 0.1]).coefficient.shape
     (3,)
@@ -86,9 +87,10 @@ class QuadraticDamping(_AbstractRateTorque):
     """Apply quadratic damping `τ = −c |Ω| Ω`, component by component: drag at a large Reynolds
     number.
 
-    **Arguments:** `coefficient` (3,) c along the body axes, N m s²/rad². A rate about a principal
-    axis decays as Ω0/(1 + c Ω0 t/I) (Newton, Principia, Book II, Section II). At Ω = 0 the first
-    derivative is zero, and a second derivative does not exist.
+    **Arguments:** `coefficient` (3,) c along the body axes, N m s²/rad². The rate about a principal
+    axis with the moment of inertia I decays from Ω₀ as Ω₀/(1 + c Ω₀ t/I) (Newton, Principia, Book
+    II, Section II). At Ω = 0 the first derivative of the torque with respect to Ω is zero, and the
+    second derivative does not exist.
 
     >>> QuadraticDamping([0.1, 0.1, 0.1]).coefficient.shape
     (3,)

@@ -19,9 +19,11 @@ _NONE: Any = (0.0, 0.0, 0.0)
 
 
 class UniformGravity(base.AbstractForce):
-    """Apply uniform gravity: `F = m g`, no torque about the centre, `U = −m g·x`.
+    """Apply uniform gravity: the force `F = m g` on a body of mass m, without a torque about the
+    centre of mass.
 
-    **Arguments:** `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81]. Source: notes, eq 84.
+    The potential energy is `U = −m g·x`, with the position x of the centre of mass. **Arguments:**
+    `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81]. Source: notes, eq 84.
 
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
@@ -52,10 +54,12 @@ class UniformGravity(base.AbstractForce):
 class CentralGravity(base.AbstractForce):
     """Attract a body of some size to a centre at the world's origin.
 
-    `U = −μ m/r − (μ/2r³)(Tr I − 3 r̂·I_w r̂)` (MacCullagh's formula), `I_w = R I Rᵀ`. The force and
-    the torque of this potential act on the body: the energy and the angular momentum about the
-    origin are conserved. **Arguments:** `mu` μ = G M, m³/s². Source: Hughes, Spacecraft Attitude
-    Dynamics, §8.1.
+    The potential energy is `U = −μ m/r − (μ/2r³)(Tr I_w − 3 r̂·I_w r̂)` (MacCullagh's formula),
+    with the mass m of the body, the vector of length r and direction r̂ from the origin to the
+    centre of mass, and the inertia `I_w = R I Rᵀ` in world axes (R is the attitude). Both the force
+    and the torque of this potential act on the body, so that the energy and the angular momentum
+    about the origin are conserved. **Arguments:** `mu` μ, m³/s², the constant of gravitation times
+    the mass of the centre. Source: Hughes, Spacecraft Attitude Dynamics, §8.1.
 
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], 1e-9 * jnp.eye(3))
     >>> state = rj.Rigid([2.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
@@ -98,13 +102,20 @@ def _distance_direction_inertia_and_trace(
 
 
 class Drag(base.AbstractForce):
-    """Apply the drag of a fluid: `F = −k |u| u`, `u = v − wind`, at a point of the body.
+    """Apply the drag of a fluid at a point of the body: `F = −k |u| u`, where `u = v − wind` is the
+    velocity of the centre of mass relative to the fluid.
 
-    **Arguments:** `coefficient` k = ½ ρ C_d A, kg/m; `centre` (3,) c, the point where the drag
-    acts, m, body frame, from the centre of mass (`τ = c × RᵀF`); `wind` (3,) the fluid's velocity,
-    m/s, world frame. The rotation of the body does not enter u; for the drag on the rotation take
-    `Damping` or `QuadraticDamping`. At u = 0 the first derivative is zero, and a second derivative
-    does not exist. Source: Newton, Principia, Book II, Section II.
+    **Arguments:**
+
+    - `coefficient`: k = ½ ρ C_d A, kg/m, with the density ρ of the fluid, the drag coefficient C_d
+      and the area A.
+    - `centre`: c (3,), m, body frame, the point where the drag acts, from the centre of mass; the
+      torque is `τ = c × RᵀF`, with the attitude R.
+    - `wind`: (3,) m/s, world frame, the velocity of the fluid.
+
+    The rotation of the body does not enter u; for the drag on the rotation take `Damping` or
+    `QuadraticDamping`. At u = 0 the first derivative of F with respect to u is zero, and the second
+    derivative does not exist. Source: Newton, Principia, Book II, Section II.
 
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([0.0, 0, 0], [3.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
@@ -125,15 +136,22 @@ class Drag(base.AbstractForce):
 
 
 class Rotors(base.AbstractForce):
-    """Apply the forces of propellers: thrust `F_i = k_i n_i² d_i` at r_i, and the reaction `τ_i =
-    −s_i c_i n_i² d_i`.
+    """Apply the forces of R propellers: the thrust `F_i = k_i n_i² d_i` at the place r_i, and the
+    reaction of the drag of the blades, the torque `τ_i = −s_i c_i n_i² d_i`.
 
-    **Arguments:** `positions` r (R, 3) m, body frame, from the centre of mass; `directions` d (R,
-    3) of the thrusts, body frame, unit; `spins` s (R,), 1 for a rotor that turns about d by the
-    right-hand rule, −1 for the opposite; `thrust` k, N s²/rad², and `drag` c, N m s²/rad², each one
-    number or (R,); `speeds` n (R,) rad/s: constant, a callable Module of time such as
-    `Held(times, values)`, or `Input("speeds")`. Source: Mahony, Kumar and Corke 2012, Multirotor
-    aerial vehicles, eqs 4–6, doi:10.1109/MRA.2012.2206474.
+    **Arguments:**
+
+    - `positions`: r (R, 3), m, body frame, from the centre of mass.
+    - `directions`: d (R, 3), unit vectors along the thrusts, body frame.
+    - `spins`: s (R,), 1 for a rotor that turns about d by the right-hand rule, −1 for a rotor that
+      turns in the opposite sense.
+    - `thrust`: k, N s²/rad², one number or (R,).
+    - `drag`: c, N m s²/rad², one number or (R,).
+    - `speeds`: n (R,), rad/s: constant, a callable Module of time such as `Held(times, values)`, or
+      `Input("speeds")`.
+
+    Source: Mahony, Kumar and Corke 2012, Multirotor aerial vehicles, eqs 4–6,
+    doi:10.1109/MRA.2012.2206474.
 
     **Raises:** `ValueError` for a direction that is not a unit vector, or a spin that is not 1 or
     −1.
@@ -190,13 +208,17 @@ class Rotors(base.AbstractForce):
 
 
 class BodyDrag(base.AbstractForce):
-    """Apply drag along the body's axes: `F = −R (a ∘ u + b ∘ |u| u)`, `τ = c × RᵀF`, `u = Rᵀ (v −
-    wind)`.
+    """Apply a drag that differs along the axes of the body: `Fᵢ = −(aᵢ + bᵢ |uᵢ|) uᵢ` along body
+    axis i.
 
-    **Arguments:** `linear` a (3,) kg/s, such as the drag of rotors in a cross-flow; `quadratic` b
-    (3,) kg/m, with |u| u computed axis by axis; `centre` c (3,), the point where the drag acts, m,
-    body frame, from the centre of mass; `wind` (3,) the air's velocity, m/s, world frame. For a
-    sphere see `Drag`.
+    Here `u = Rᵀ (v − wind)` is the velocity of the centre of mass relative to the air, in body
+    axes, and R the attitude. The torque is `τ = c × F` in body axes. For a sphere see `Drag`.
+    **Arguments:**
+
+    - `linear`: a (3,), kg/s, such as the drag of rotors in a cross-flow.
+    - `quadratic`: b (3,), kg/m.
+    - `centre`: c (3,), m, body frame, the point where the drag acts, from the centre of mass.
+    - `wind`: (3,) m/s, world frame, the velocity of the air.
 
     Source: Faessler, Franchi and Scaramuzza 2018, eq 5, doi:10.1109/LRA.2017.2776353, for the
     linear part; Hoerner 1965, Fluid-Dynamic Drag, for the quadratic part.

@@ -21,10 +21,11 @@ Law = TypeVar("Law")
 
 
 class Input(eqx.Module):
-    """Name an input of a torque, which the loop sets: see `rollout(…, inputs=…)`.
+    """Name an input of a torque, a signal whose values are given when a motion is computed, such as
+    by `rigidjax.batch.rollout(…, inputs=…)`.
 
-    **Arguments:** `name` the key of the input among all inputs. A torque calls the input with the
-    time; `bind` gives the input a value.
+    **Arguments:** `name` the name under which `inputs` holds the values of this input. A torque
+    calls the input with the time; `bind` replaces the input by its values.
 
     >>> law = bind(Input("speed"), {"speed": jnp.array([3.0])})
     >>> law(0.0)
@@ -58,17 +59,19 @@ class Delayed(eqx.Module):
     """Delay a function of time: `t → source(t − delay)`.
 
     **Arguments:** `source` a function of time such as `Held(times, values)`, or `Input("u")`;
-    `delay` s, one number, which may be free in a fit; negative for an earlier time.
+    `delay` s, one number, which may be free in a fit; a negative delay shifts the function to
+    earlier times.
 
-    The `jump_times` move with the delay. `simulate` ends steps at these times: the derivative with
-    respect to the delay is correct although the source jumps. `rigidjax.batch.rollout` and
-    `identify.fit` hold sampled inputs constant over each step; a delayed sample changes inside a
-    step, and so the step is split in two at the change, and the result is exact as well. The first
-    sample also holds before its time, the last sample after it. `Linear` and `Series` can be
-    delayed anywhere.
+    The `jump_times` move with the delay. `simulate` ends steps at these times, so that the
+    derivative of a motion with respect to the delay is correct although the source jumps.
+    `rigidjax.batch.rollout` and `identify.fit` hold each sample of an input constant over one step.
+    A delayed input changes inside a step: the step is therefore split in two at the change, and the
+    derivative with respect to the delay is correct as well. The first sample also holds before its
+    own time, and the last sample after its own time. `Linear` and `Series` can be delayed, too.
 
-    **Raises:** `TypeError` for a source that has states (delay its input: `Lagged(Delayed(u, d),
-    T)`); `ValueError` for a delay as long as the record.
+    **Raises:** `TypeError` for a source that has states of its own (delay the input of the source
+    instead, as in `Lagged(Delayed(u, delay), time)`); `ValueError` for a delay that is not shorter
+    than the record of the source.
 
     >>> float(Delayed(rj.torques.Held([0.0, 1.0, 2.0], [5.0, 6.0, 7.0]), 0.7)(1.5))
     5.0
@@ -110,17 +113,22 @@ class Delayed(eqx.Module):
 
 
 class Lagged(eqx.Module):
-    """Apply a lag of first order, such as a motor's: `T dy/dt = u(t) − y`, whose value is y.
+    """Return a signal y that follows a function of time u with a lag of first order, as a motor
+    does: `T dy/dt = u(t) − y`.
 
-    The lag has a state of its own, which is integrated with the state of the body (see
-    `AbstractTorque`). A `Lagged` can replace any function of time: `Rotors(…,
+    y is a state of its own, which is integrated with the state of the body (see `AbstractTorque`).
+    A `Lagged` can replace any function of time inside a torque: `Rotors(…,
     speeds=Lagged(Input("speeds"), 0.05))`.
 
-    **Arguments:** `source` u, a function of time such as `Held(times, values)`, or `Input("u")`;
-    `time` T, s, > 0: one number, or one for each channel, which may be free in a fit; `start` y at
-    the start, or `None` for u at the start. If u jumps from 0 to 1, y is `1 − exp(−t/T)` (Åström
-    and Murray, Feedback Systems). **Raises:** `ValueError` for a time that is not positive,
-    unless JAX traces it.
+    **Arguments:**
+
+    - `source`: u, a function of time such as `Held(times, values)`, or `Input("u")`.
+    - `time`: the time constant T, s, > 0, one number or one for each channel of u; it may be free
+      in a fit.
+    - `start`: the value of y at the start of the motion, or `None` for the value of u at the start.
+
+    If u jumps from 0 to 1 at t = 0, y is `1 − exp(−t/T)` (Åström and Murray, Feedback Systems).
+    **Raises:** `ValueError` for a `time` that is not positive, unless JAX traces this number.
 
     >>> push = rj.torques.InSpace(Lagged(lambda t: jnp.array([0.0, 0.0, 1.0]), 0.5, jnp.zeros(3)))
     >>> body, start = rj.Inertia(jnp.eye(3)), rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
@@ -146,19 +154,20 @@ class Lagged(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times (n,), s, at which the source jumps: the value then has a kink."""
+        """Return the times (n,), s, at which the source jumps and the lagged signal has a kink."""
         return jump_times_of(self.source)
 
     def state0(self, t: ScalarLike, state: PyTree, body: Body) -> Array:
-        """Return the value y of the lag at the start, the initial value of its own state: the field
-        `start`, or the value of the source at the time `t`, s, if `start` is `None`.
+        """Return the initial value of the lagged signal y, which is the state of this object: the
+        field `start`, or the value of the source at the time `t`, s, if `start` is `None`.
         """
         return self.source(t) if self.start is None else self.start
 
     def rate(self, t: ScalarLike, own: Array, state: PyTree, body: Body) -> Array:
-        """Return dy/dt = (u − y)/T, the derivative of the lag's own state y = `own` with respect to
-        time, in the unit of the source u per second, at the time `t`, s; `state` and `body` are not
-        used.
+        """Return dy/dt = (u − y)/T, the derivative of the lagged signal y = `own` with respect to
+        time, at the time `t`, s, in the unit of u per second.
+
+        Here u is the value of the source, and T the time constant; `state` and `body` are not used.
         """
         wanted = _checks.numeric_array(self.source(t), "source(t)").astype(own.dtype)
         if wanted.shape != own.shape:
@@ -220,9 +229,13 @@ class InputRow(NamedTuple):
 def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
     """Return the torque with values in place of each `Input`.
 
-    **Arguments:** `law` a torque, a force, or a tree of them; `inputs` by name an array, which is
-    constant, or a function of time such as `Held(times, values)`; `None` changes nothing.
-    **Raises:** `ValueError` for an input of the torque without a value.
+    **Arguments:**
+
+    - `law`: a torque, a force, or a tree of them.
+    - `inputs`: the value for each name of an `Input`: an array, which holds at all times, or a
+      function of time such as `Held(times, values)`; `None` changes nothing.
+
+    **Raises:** `ValueError` if the torque reads an input that has no value in `inputs`.
 
     >>> bind(Input("u"), {"u": rj.torques.Held([0.0, 1.0], [2.0, 4.0])})(1.0)
     Array(4., dtype=float64)

@@ -85,8 +85,8 @@ class Tabulated(AbstractTorque):
     world frame take `InSpace(Linear(times, torques))`, for constant pieces `Pulses`. **Raises:** as
     `Linear`.
 
-    A solver that steps over a kink loses its order, and a step over a pulse misses it: `simulate`
-    gives `jump_times` to the step controller.
+    A solver that steps over a kink loses its order, and a step over a whole pulse misses the pulse:
+    `simulate` therefore ends a step at each of the `jump_times`.
 
     >>> Tabulated([0.0, 2.0], [[0.0, 0, 0], [0.0, 0, 4]]).jump_times
     Array([0., 2.], dtype=float64)
@@ -122,8 +122,9 @@ class Pulses(AbstractTorque):
     edge i until edge i + 1. One pulse: `Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]])`. **Raises:**
     `ValueError` for another number of edges, edges that do not increase, NaN.
 
-    The torque at a time has no derivative with respect to the edges. A motion has this derivative
-    if the solver ends steps at `jump_times`. `impulse` is exact.
+    The value of the torque at one time has no derivative with respect to the edges. A motion has
+    this derivative if the solver ends steps at `jump_times`, as `simulate` does. The derivative of
+    `impulse` is exact.
 
     >>> Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]]).impulse
     Array([0. , 0. , 1.5], dtype=float64)
@@ -160,7 +161,7 @@ class Pulses(AbstractTorque):
 
 def _index_of_row_at(times: Float[Array, " n"], t: Scalar) -> Int[Array, ""]:
     """Return the index of the row of a table that applies at the time `t`, s: the last row whose
-    time is not after t, or −1 before the first row. At a jump this is the row that begins.
+    time is not after t, or −1 before the first row. Exactly at the time of a row, this row applies.
 
     - `times`: (n,) s, increasing, the times of the rows
     """
@@ -200,9 +201,9 @@ def _checked_times_and_rows(
     - `times`: (n,) s, the times of the rows, or the edges of intervals with a constant value
     - `rows_name`: the name of the argument `values`, for messages
     - `values`: the rows
-    - `times_beyond_rows`: how many times there are more than rows, which then have the shape (3,):
-      0 for a row at each time, 1 for a row in each interval between two times. `None` allows n rows
-      of any shape.
+    - `times_beyond_rows`: the number of times minus the number of rows, where each row has the
+      shape (3,): 0 for a row at each time, 1 for a row in each interval between two times. `None`
+      also means a row at each time, but rows of any shape.
     """
     edges, rows = (
         _checks.array_of_rows(times, (), times_name),

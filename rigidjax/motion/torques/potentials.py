@@ -20,15 +20,16 @@ from rigidjax.rotation.linalg3 import apply, components, cross, dot
 
 
 class HeavyTop(base.AbstractTorque):
-    """Apply gravity to a body with a fixed point: `τ = c × m Rᵀg`, `U = −m g·Rc`.
+    """Apply gravity to a body with a fixed point: the torque `τ = c × m Rᵀg`, with the potential
+    energy `U = −m g·Rc`; R is the attitude.
 
-    **Arguments:** `mass` m, kg; `com` (3,) c, from the fixed point to the centre of mass, m, body
-    frame; `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81]. The body's `Inertia` is the
-    one **about the fixed point** (`MassProperties.inertia_about`, `Inertia.shift`). Any top is
-    allowed: Lagrange's, Kovalevskaya's, Goryachev–Chaplygin's, a general one, the physical
-    pendulum.
+    **Arguments:** `mass` m, in kg; `com` c (3,), the vector from the fixed point to the centre of
+    mass, in metres, body frame; `gravity` g (3,), in m/s², world frame, such as [0, 0, −9.81]. The
+    `Inertia` of the body must be that **about the fixed point** (`MassProperties.inertia_about`,
+    `Inertia.shift`). Any top is allowed: Lagrange's, Kovalevskaya's, Goryachev–Chaplygin's, a
+    general one, the physical pendulum.
 
-    This torque conserves the energy and the momentum along g. Source: Landau and Lifshitz,
+    The energy and the angular momentum along g are conserved. Source: Landau and Lifshitz,
     Mechanics, §35; Arnold, Mathematical Methods of Classical Mechanics, §30. **Raises:**
     `TypeError` on a `Rigid`, which has no fixed point.
 
@@ -54,8 +55,11 @@ class HeavyTop(base.AbstractTorque):
         return self.gravity
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
-        """Return the potential energy, J: `U = −m g·Rc`, which is zero where the centre of mass is
-        level with the fixed point.
+        """Return the potential energy, in joules: `U = −m g·Rc`, which is zero where the centre of
+        mass is level with the fixed point.
+
+        Here m is the mass, g the gravity, R the attitude, and c the vector from the fixed point to
+        the centre of mass.
         """
         return -self.mass * dot(self.com, quaternion.rotate_inverse(state.q, self.gravity))
 
@@ -70,20 +74,27 @@ class HeavyTop(base.AbstractTorque):
 
 
 class GravityGradient(base.AbstractTimeTorque):
-    """Apply the torque of a far point mass: `τ = (3μ/r³) u × Iu − Σ (μ/rⁿ⁺¹) u × ∇Hₙ(u)`, `u =
-    Rᵀr/r`.
+    """Apply the gravity-gradient torque of a far point mass on a body with the inertia I: `τ =
+    (3μ/r³) u × Iu − Σ (μ/rⁿ⁺¹) u × ∇Hₙ(u)`, a sum over the degrees n = 3, 4, … of `harmonics`.
 
-    **Arguments:** `mu` μ = G M of the point mass, m³/s²; `position` r (3,) m, world frame, from the
-    body to the point mass (without `harmonics` the sign does not matter): constant, or a callable
-    Module of time, t → (3,), for an orbit; `harmonics` the body's gravity of higher degree n in
-    body axes: an array (2n + 1,) for each n = 3, 4, …, kg mⁿ, the mass of the body times Rⁿ times
-    the Stokes coefficients (Cn0, Cn1, Sn1, Cn2, Sn2, …), not normalised, for a radius R. For
-    several masses take a `Sum`.
+    Here r is the distance of the point mass and u (3,) its direction, in body axes. Hₙ is the solid
+    harmonic of degree n of the body's own gravity, `Σ ρⁿ Pₙₘ (C cos mλ + S sin mλ)`, a sum over m =
+    0, …, n, at a point with the distance ρ from the centre of mass and the longitude λ; Pₙₘ is an
+    associated Legendre function of the sine of the latitude. The potential energy is `U = (μ/2r³)(3
+    u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`, MacCullagh's formula and its next terms. The torque does not
+    change the orbit. **Arguments:**
 
-    Hₙ is the solid harmonic `Σ rⁿ Pₙₘ (C cos mλ + S sin mλ)` of degree n. The potential is `U =
-    (μ/2r³)(3 u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`, MacCullagh's formula and its next terms; the torque
-    does not change the orbit. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein, Poole
-    and Safko, Classical Mechanics, eq 5.86; Montenbruck and Gill, Satellite Orbits, §3.2.
+    - `mu`: μ, m³/s², the constant of gravitation times the mass of the point mass.
+    - `position`: the vector (3,), in metres, world frame, from the body to the point mass:
+      constant, or a callable Module of time, t → (3,), for an orbit. Without `harmonics` its sign
+      does not matter.
+    - `harmonics`: the coefficients C and S of Hₙ, an array (2n + 1,) for each degree n = 3, 4, …,
+      in kg times metreⁿ and in body axes. They are the mass of the body times the n-th power of its
+      reference radius times its Stokes coefficients (Cn0, Cn1, Sn1, Cn2, Sn2, …), not normalised.
+
+    For several point masses take a `Sum`. Source: Hughes, Spacecraft Attitude Dynamics, §8.1;
+    Goldstein, Poole and Safko, Classical Mechanics, eq 5.86; Montenbruck and Gill, Satellite
+    Orbits, §3.2.
 
     >>> law, body = GravityGradient(1.0, [1.0, 1.0, 0.0]), rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
@@ -118,8 +129,8 @@ class GravityGradient(base.AbstractTimeTorque):
         return None if callable(source) else source
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Scalar:
-        """Return the part of the potential energy that depends on the attitude, J: `U = (μ/2r³)(3
-        u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`.
+        """Return the terms of the potential energy that depend on the attitude, in joules: `U =
+        (μ/2r³)(3 u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`, with the quantities that the class defines.
         """
         tensor = tensor_of(body)
         u, strength, slopes = self._direction_strength_and_harmonic_gradients(t, state)
@@ -139,11 +150,15 @@ class GravityGradient(base.AbstractTimeTorque):
     def _direction_strength_and_harmonic_gradients(
         self, t: ScalarLike, state: HasAttitude
     ) -> tuple[Vec3, Scalar, list[Vec3]]:
-        """Return three things about a far point mass that attracts the body: its direction, a unit
-        vector u (3,), body axes; the strength μ/r³ of its gravity gradient, 1/s², with its
-        gravitational parameter μ (the gravitational constant times its mass) and its distance r;
-        and a list with μ/rⁿ⁺¹ times the gradient (3,) at u of Hₙ, the solid harmonic of degree n of
-        the body's own gravity, for each degree n = 3, 4, … that is given.
+        """Return three things about a far point mass that attracts the body at the distance r, with
+        μ, the constant of gravitation times its mass:
+
+        - its direction, a unit vector u (3,), body axes
+        - the strength μ/r³ of its gravity gradient, 1/s²
+        - a list with one vector (3,) for each degree n = 3, 4, … in the field `harmonics`: μ/rⁿ⁺¹
+          times the gradient at u of Hₙ, the solid harmonic of degree n of the body's own gravity
+
+        **Arguments:**
 
         - `t`: s, the time
         - `state`: a state with the attitude of the body
@@ -164,8 +179,9 @@ def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]
     """Return the gradients (3,) of solid harmonics at a unit vector, one for each degree n = 3, 4,
     …, by Cunningham's recurrence (1970, doi:10.1007/BF01229495).
 
-    The solid harmonic of degree n is Hₙ = Σ rⁿ Pₙₘ (C cos mλ + S sin mλ), a sum over m = 0, …, n,
-    with the associated Legendre functions Pₙₘ of z/r and the longitude λ.
+    The solid harmonic of degree n at a point (x, y, z) is Hₙ = Σ rⁿ Pₙₘ (C cos mλ + S sin mλ), a
+    sum over m = 0, …, n, with the distance r of the point from the origin, its longitude λ, and the
+    associated Legendre functions Pₙₘ of z/r.
 
     - `harmonics`: for each degree n the coefficients (2n + 1,) in the order Cn0, Cn1, Sn1, Cn2,
       Sn2, …
@@ -173,8 +189,9 @@ def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]
     """
     x, y, z = components(u)
     zero = jnp.zeros_like(z)
-    # The real and imaginary parts of rⁿ Pₙₘ exp(imλ) for m = 0 … n + 1: of this degree n (`here`),
-    # and of the degree n − 1 (`before`).
+    # In the loop, `here` holds the real and imaginary parts of the solid harmonics rᵏ Pₖₘ exp(imλ)
+    # of the degree k = n − 1 for m = 0 … k + 1, and `before` holds those of the degree n − 2.
+    # Harmonics with m above their degree are zero.
     before, here = [(zero, zero)] * 2, [(jnp.ones_like(z), zero), (zero, zero)]
     out = []
     for n in range(1, len(harmonics) + 3):
@@ -193,11 +210,13 @@ def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]
 def _solid_harmonic_gradient(
     coefficients: Sequence[Scalar], n: int, lower_harmonics: Sequence[tuple[Scalar, Scalar]]
 ) -> Vec3:
-    """Return the gradient (3,) at one point of the solid harmonic Hₙ = Σ rⁿ Pₙₘ
-    (C cos mλ + S sin mλ), a sum over m = 0, …, n, with the associated Legendre functions Pₙₘ of z/r
-    and the longitude λ.
+    """Return the gradient (3,) of the solid harmonic Hₙ = Σ rⁿ Pₙₘ (C cos mλ + S sin mλ) at one
+    point (x, y, z), a sum over m = 0, …, n.
 
-    - `coefficients`: the 2n + 1 numbers Cn0, Cn1, Sn1, Cn2, Sn2, …
+    Here r is the distance of the point from the origin, λ its longitude, and Pₙₘ the associated
+    Legendre functions of z/r.
+
+    - `coefficients`: C and S, the 2n + 1 numbers Cn0, Cn1, Sn1, Cn2, Sn2, …
     - `n`: the degree
     - `lower_harmonics`: for m = 0, 1, …, n the real and imaginary parts of rⁿ⁻¹ Pₙ₋₁,ₘ exp(imλ),
       the solid harmonics of degree n − 1, at the point; zero for m = n
@@ -219,12 +238,12 @@ def _solid_harmonic_gradient(
 
 
 class MagneticDipole(base.AbstractTimeTorque):
-    """Apply the torque on a magnetic moment fixed in the body, in a uniform field: `τ = m × RᵀB`,
-    `U = −m·RᵀB`.
+    """Apply the torque of a uniform magnetic field on a magnetic moment that is fixed in the body:
+    `τ = m × RᵀB`, with the potential energy `U = −m·RᵀB`; R is the attitude.
 
-    **Arguments:** `moment` (3,) m, A m², body frame; `field` B, T, world frame: (3,), or a callable
-    Module of time, t → (3,), for a field that changes along an orbit. Source: Jackson, Classical
-    Electrodynamics, eqs 5.71, 5.72.
+    **Arguments:** `moment` m (3,), in ampere metre², body frame; `field` B, in tesla, world frame:
+    (3,), or a callable Module of time, t → (3,), for a field that changes along an orbit. Source:
+    Jackson, Classical Electrodynamics, eqs 5.71, 5.72.
 
     >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> MagneticDipole([0.0, 0.0, 2.0], [3.0, 0.0, 0.0])(0.0, state, None).tolist()  # z × x = y
@@ -247,7 +266,9 @@ class MagneticDipole(base.AbstractTimeTorque):
         return None if callable(source) else source
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
-        """Return the potential energy, J: `U = −m·RᵀB`."""
+        """Return the potential energy, J: `U = −m·RᵀB`, with the magnetic moment m, the field B and
+        the attitude R.
+        """
         return -dot(self.moment, self._magnetic_field_in_body(t, state))
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
@@ -263,9 +284,10 @@ class MagneticDipole(base.AbstractTimeTorque):
 class FromPotential(base.AbstractTorque):
     """Apply the torque of any potential `U(q)` of the attitude, by differentiation.
 
-    **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world. The
-    torque about body axis i is `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about this
-    axis. Source: Landau and Lifshitz, Mechanics, §34.
+    **Arguments:** `potential` a callable Module that returns the potential energy U, J, from the
+    unit quaternion q (4,), body → world. The torque about body axis i is `τ_i = −∂U/∂q · ½ q ⊗
+    e_i`: minus the derivative of U with respect to the angle of a turn about this axis. Source:
+    Landau and Lifshitz, Mechanics, §34.
 
     >>> class Spring(eqx.Module):
     ...     k: Array

@@ -11,16 +11,17 @@ from rigidjax.motion.torques.base import AbstractTorque
 
 
 class RandomTorque(AbstractTorque):
-    """Describe white torque noise: `E[τᵢ(t) τᵢ(s)] = density δ(t − s)`, independent along the body
-    axes.
+    """Describe a torque that is white noise, independent along the three body axes: `E[τᵢ(t)
+    τᵢ(t′)] = density · δ(t − t′)` for each body axis i and any two times t and t′.
 
     **Arguments:** `density` N² m² s, one number or one for each body axis (3,), ≥ 0. In a time t
-    the rate about an axis of moment I changes by about √(density · t)/I.
+    the rate about an axis with the moment of inertia I changes by about √(density · t)/I.
 
-    `simulate` and a fit of `rigidjax.identify` use the mean, zero. As the `process` of a
-    `rigidjax.identify.Model`: `filter`, `smooth` and `log_likelihood` allow for the noise, and
-    `sample` draws a motion under it. Several random torques are added by `Sum`. Source: Gelb,
-    Applied Optimal Estimation (1974), §3.6. **Raises:** `ValueError` for a density below zero.
+    `simulate` and a fit of `rigidjax.identify` use the mean of the torque, which is zero. If the
+    torque is the `process` of a `rigidjax.identify.Model`, the functions `filter`, `smooth` and
+    `log_likelihood` allow for the noise, and `sample` draws a motion under this noise. `Sum` adds
+    several random torques. Source: Gelb, Applied Optimal Estimation (1974), §3.6. **Raises:**
+    `ValueError` for a density below zero.
 
     >>> RandomTorque(1e-4).density
     Array([0.0001, 0.0001, 0.0001], dtype=float64)
@@ -40,9 +41,9 @@ class RandomTorque(AbstractTorque):
 class CorrelatedTorque(AbstractTorque):
     """Describe correlated torque noise (Ornstein–Uhlenbeck): `T dτ/dt = −τ + white noise`.
 
-    **Arguments:** `density` N² m² s of the white noise, one number or (3,), ≥ 0; `time` T, s,
-    positive: the correlation time. `E[τ(t) τ(s)] = density/(2T) exp(−|t − s|/T)` about each body
-    axis: for T → 0 this is a `RandomTorque` with an equal density.
+    **Arguments:** `density` of the white noise, N² m² s, one number or (3,), ≥ 0; `time` T, s,
+    positive: the correlation time. About each body axis `E[τ(t) τ(t′)] = density/(2T) exp(−|t −
+    t′|/T)` for any two times t and t′: for T → 0 this is a `RandomTorque` with an equal density.
 
     `simulate` and a fit use the mean of the torque, which is zero; see `RandomTorque`. The state of
     a filter contains the torque. Source: Uhlenbeck and Ornstein 1930, doi:10.1103/PhysRev.36.823.

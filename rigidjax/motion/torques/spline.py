@@ -25,10 +25,11 @@ class Series(eqx.Module):
     A division finds the interval of a time, so that the spline costs little in a solver; the
     derivative of the spline is continuous, so that a step may pass over a sample.
 
-    **Arguments:** `times` (n,) s, evenly spaced to 1e-6 of a step and the round-off of times such
-    as 1.7e9 s; `values` (n,) or (n, k). Both may be traced: a spline can be made under `jit`,
-    `vmap` and `grad`. The third derivative does not jump at the second sample and the last but one
-    ("not a knot": de Boor, A Practical Guide to Splines, ch. IV).
+    **Arguments:** `times` (n,) s, evenly spaced, with an error of at most 1e-6 of a step plus the
+    round-off of the times, which is large for times such as 1.7e9 s; `values` (n,) or (n, k). Both
+    may be traced: a spline can be made under `jit`, `vmap` and `grad`. The third derivative of the
+    spline does not jump at the second sample and at the last sample but one ("not a knot": de Boor,
+    A Practical Guide to Splines, ch. IV).
 
     **Raises:** `ValueError` (`equinox` error under `jit`) for fewer than four samples, lengths that
     differ, NaN, uneven times.
@@ -88,9 +89,9 @@ class Series(eqx.Module):
 
 
 def _numbers_in_full_precision(value: NumbersLike, name: str) -> Any:
-    """Return numbers as an array with all their digits: as a NumPy array of float64 unless JAX
-    traces them, because the times of a log have more than the seven digits of float32; as an array
-    of JAX in its default precision if JAX traces them.
+    """Return numbers as an array in the highest precision that is possible, because the times of a
+    log have more than the seven digits of float32: as a NumPy array of float64, or, if JAX traces
+    the numbers, as a JAX array in the default precision of JAX.
 
     - `value`: the numbers
     - `name`: the name of the argument, for messages
@@ -124,17 +125,24 @@ def _spline_slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *chan
 
 
 class Wheel(eqx.Module):
-    """Describe the momentum of a wheel about a fixed axis whose speed was logged: `h = J s(t) a`.
+    """Describe the momentum of a wheel whose speed was logged: `h = J w(t) a`, about an axis a that
+    is fixed in the body.
 
     Pass a wheel to `Flywheel`: if the momentum of a wheel is known, a fit determines the absolute
-    inertia of a body, not its ratios alone.
+    inertia of a body, not only ratios of moments of inertia. **Arguments:**
 
-    **Arguments:** `inertia` J, kg m², about the axis; `axis` (3,) a, body frame, unit; `speed` s,
-    rad/s, relative to the body, a callable Module of time such as `Series(times, speeds)`; `delay`
-    s: the log's value at t belongs to t − delay; `tilt` (2,) tangents (rad, if small) of the axis's
-    tilt towards two directions across it (about x, y and z: the next two axes in turn, y and z, z
-    and x, x and y). `None` means no delay, or no tilt. **Raises:** `ValueError` for an axis that is
-    not a unit vector.
+    - `inertia`: J, kg m², about the axis.
+    - `axis`: a (3,), a unit vector, body frame.
+    - `speed`: w, rad/s, relative to the body, a callable Module of time such as `Series(times,
+      speeds)`.
+    - `delay`: s, the time by which the log is late: the value that it holds for the time t is the
+      speed at t − delay. `None` means no delay.
+    - `tilt`: (2,), the tangents of the two angles by which the axis is tilted towards two
+      directions across it; a small tangent is the angle in rad. For an axis along x these
+      directions are y and z, for y they are z and x, and for z they are x and y. `None` means no
+      tilt.
+
+    **Raises:** `ValueError` for an axis that is not a unit vector.
 
     >>> speed = Series([0.0, 1.0, 2.0, 3.0], [0.0, 10.0, 20.0, 30.0])
     >>> bool(abs(Wheel(2.0, [0.0, 0.0, 1.0], speed)(0.5)[2] - 10.0) < 1e-12)

@@ -25,9 +25,9 @@ _MEMBERS_THAT_TAKE_STATES = ("energy", "internal_momentum")
 
 
 class FrozenLaw(eqx.Module):
-    """Wrap a torque or function of time `law` that has states of its own (such as the speed of a
-    wheel), with the values `own` of these states inserted, so that it can be called without them;
-    `freeze_own_states` makes it.
+    """Hold a torque or function of time `law` that has states of its own (such as the speed of a
+    wheel) together with the values `own` of these states, so that `law` can be called without them.
+    `freeze_own_states` makes this object.
     """
 
     law: Any

@@ -31,12 +31,15 @@ class Flywheel(base.AbstractTimeTorque):
     constant speed, or a callable Module of time, t → (3,), such as `Linear(times, values)`, but not
     a function that jumps (`Held`, samples of an `Input`), because dh/dt acts on the body.
 
-    The body's `Inertia` must fit h. If the inertia includes the wheels as locked, h is the momentum
-    of the wheels relative to the body. If the axial moments of the wheels are subtracted (I − Σ J a
-    aᵀ), h is the whole axial momentum of the wheels, and dh/dt is the torque of the motors.
+    The inertia I of the body and h must belong together. If I is the inertia of the body with its
+    wheels locked, h is the momentum of the wheels relative to the body. If the moments of inertia J
+    of the wheels about their axes a are subtracted from this inertia (I − Σ J a aᵀ), h is the whole
+    momentum of the wheels along their axes, the rotation of the body included, and dh/dt is the
+    torque of the motors.
 
-    The momentum in space, `R (IΩ + h)`, is conserved; so is the energy `½ Ω·IΩ` if h is constant.
-    Source: Zhukovsky 1885, Volterra 1898; Hughes, Spacecraft Attitude Dynamics, chs. 3, 6.
+    The momentum in the world frame, `R (IΩ + h)`, is conserved, with the attitude R and the body
+    rate Ω; so is the energy `½ Ω·IΩ` if h is constant. Source: Zhukovsky 1885, Volterra 1898;
+    Hughes, Spacecraft Attitude Dynamics, chs. 3, 6.
 
     >>> Flywheel([0.0, 0.0, 2.0]).internal_momentum(0.0)
     Array([0., 0., 2.], dtype=float64)
@@ -83,20 +86,23 @@ class ReactionWheels(base.AbstractTorque):
     - `motor`: the torque of each motor on its wheel (R,), N m, positive if it increases s:
       constant, a function of time such as `Held(times, values)`, `Input("motor")`, or `None`.
     - `feedback`: a function `(t, state, speeds) → (R,)`, N m, added to `motor`; or `None`.
-    - `max_torque` N m, `max_speed` rad/s, each one number, (R,), or `None` for no limit. The
-      motors' torque is limited to `max_torque`. A torque that would bring a wheel beyond
-      `max_speed` decreases to zero over the last 5 % below `max_speed`, as 6 x⁵ − 15 x⁴ + 10 x³:
-      derivatives of runs that reach `max_speed` are then accurate to the tolerance of the run
-      (along a straight line: to 1e-4 at `rtol=1e-9`).
+    - `max_torque` N m, `max_speed` rad/s, each one number, (R,), or `None` for no limit. The torque
+      of motor and feedback is limited to `max_torque`. A torque that would bring a wheel beyond
+      `max_speed` is multiplied by 6 x⁵ − 15 x⁴ + 10 x³, where x falls from 1 to 0 over the last 5 %
+      of the speed below `max_speed`. With this smooth factor the derivatives of runs that reach
+      `max_speed` are accurate to the tolerance of the run (with the factor x their error would be
+      1e-4 at `rtol=1e-9`).
     - `viscous` c, N m s/rad, and `coulomb` d, N m, of the bearings, each one number, (R,), or
-      `None`: the friction `−c s − d tanh(s/s₀)`; `turn_over` s₀, rad/s: Coulomb friction changes
-      its sign smoothly over this speed, for derivatives and long steps.
+      `None`: the friction is `−c s − d tanh(s/s₀)`.
+    - `turn_over`: s₀, rad/s. Coulomb friction changes its sign smoothly over about this speed, so
+      that derivatives exist and steps can be long.
 
-    The states are the wheels' whole axial momenta `h = J (s + a·Ω)`; u is the torque of motor and
-    bearing on a wheel. The body's inertia is **without** J a aᵀ: `without_wheels` subtracts these
-    terms from an inertia with the wheels locked. The equations are exact for balanced wheels,
-    symmetric about their axes. `R (IΩ + Σ h a)` is conserved for any motor torque; `½ Ω·IΩ + Σ
-    h²/2J` changes by `Σ u s`.
+    The states of this torque are the momenta of the wheels along their axes, `h = J (s + a·Ω)`, the
+    body rate Ω included; u is the torque of motor and bearing on a wheel. The inertia I of the body
+    must be **without** the wheels' moments J a aᵀ: `without_wheels` subtracts these terms from an
+    inertia with the wheels locked. The equations are exact for balanced wheels that are symmetric
+    about their axes. `R (IΩ + Σ h a)`, with the attitude R, is conserved for any motor torque; the
+    energy `½ Ω·IΩ + Σ h²/2J` changes at the rate `Σ u s`.
 
     Source: Markley and Crassidis 2014, Fundamentals of Spacecraft Attitude Determination and
     Control, §3.3.5, doi:10.1007/978-1-4939-0802-8; friction: §4.8 there, after Bialke 1998, with
@@ -162,15 +168,17 @@ class ReactionWheels(base.AbstractTorque):
 
     @property
     def steady(self) -> bool:
-        """Return whether the momenta of the wheels are constant: the energy is then conserved."""
+        """Return whether no torque acts on the wheels about their axes (no motor, feedback or
+        friction): their momenta are then constant, and the energy is conserved.
+        """
         parts = (self.motor, self.feedback, self.viscous, self.coulomb)
         return all(part is None for part in parts)
 
     jump_times = property(base.jump_times_of_fields)
 
     def without_wheels(self, body: OneBody) -> OneBody:
-        """Return the body with the inertia I − Σ J a aᵀ, from which the moments of the wheels about
-        their axes are subtracted.
+        """Return the body with the inertia I − Σ J a aᵀ: the moments of inertia J of the wheels
+        about their axes a are subtracted from the inertia I of `body`.
 
         - `body`: an `Inertia` or `MassProperties` whose inertia I includes the locked wheels
         """
@@ -243,8 +251,8 @@ class ReactionWheels(base.AbstractTorque):
         return self._vector_sum_over_wheels(own)
 
     def energy(self, t: ScalarLike, state: HasSpin, body: object, own: Array) -> Scalar:
-        """Return the kinetic energy of the wheels about their axes, Σ h²/2J, J, with their axial
-        momenta h = `own` (R,), N m s, and their moments of inertia J.
+        """Return the kinetic energy of the wheels about their axes, Σ h²/2J, in joules, with their
+        axial momenta h = `own` (R,), N m s, and their moments of inertia J, kg m².
         """
         return jnp.sum(own * own / (2.0 * self.inertia))
 
