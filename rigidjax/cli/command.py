@@ -330,7 +330,7 @@ def _channels_of_options(
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
         if alone:
             raise LogError(
-                f"--{alone[0]}: not together with --sensor, which holds it itself, as in "
+                f"--{alone[0]}: not together with --sensor, whose text holds unit and noise, as in "
                 "--sensor gyro=wx,wy,wz:deg/s:0.1"
             )
         return [spec.parse_channel(text) for text in options.sensor]
@@ -355,7 +355,7 @@ def _read_logs(
         words = "free motion shows ratios only; a scale needs a --wheel"
         raise LogError(f"--model {options.model}: {words}")
     if "delay" in options.free and not wheels:
-        raise LogError("--free delay: wanted a --wheel, whose delay it is, got none")
+        raise LogError("--free delay: wanted a --wheel, whose delay is to be fitted, got none")
     how: dict[str, Any] = dict(window=options.window, wheels=wheels, free=options.free)
     records, of_first = [], None
     for path in options.logs:

@@ -123,8 +123,9 @@ class _QuadraticAngle(eqx.Module):
 def turntable(rate: ScalarLike, growth: ScalarLike = 0.0) -> InFrame:
     """Return the scene of a puck on a frictionless table that turns about z, in the table's frame.
 
-    **Arguments:** `rate` Ω at t = 0, rad/s; `growth` dΩ/dt, rad/s². The puck moves straight in the
-    inertial frame; `turntable(…).frame` transforms states in both directions (notes, eqs 85–91).
+    **Arguments:** `rate` the angular rate Ω of the table at t = 0, rad/s; `growth` dΩ/dt, rad/s².
+    In the inertial frame the puck moves in a straight line. `turntable(…).frame` transforms states
+    between the frame of the table and the inertial frame (notes, eqs 85–91).
 
     >>> turntable(2.0).acceleration(0.0, Point([1.0, 0, 0], [0.0, 0, 0])).tolist()
     [4.0, 0.0, 0.0]

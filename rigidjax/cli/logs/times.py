@@ -21,10 +21,11 @@ _GAP = 1e5
 
 
 def mask_of_increasing(t: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of times that increase, which leaves out as few times as possible.
+    """Return a mask (n,) that keeps as many of the times `t` (n,) as possible, such that the kept
+    times increase.
 
-    The chosen times are a longest increasing subsequence, found by patience sorting. A time that is
-    repeated, backward, far too large or missing (NaN) therefore costs its own row only.
+    The kept times are a longest increasing subsequence, found by patience sorting. If one time is
+    repeated, backward, far too large or missing (NaN), only the row of this time is therefore lost.
 
     >>> mask_of_increasing(np.array([0.0, 1.0, 1.0, 90.0, 2.0, np.nan, 3.0])).tolist()
     [True, True, False, False, True, False, True]

@@ -8,10 +8,10 @@ from rigidjax.cli.logs.columns import Columns
 
 
 def read_ulog(path: Path, columns: Sequence[str]) -> Columns:
-    """Return two things: the names of all fields of PX4's ULog as `topic.field`, such as
-    `sensor_combined.gyro_rad[0]`; and a dict of the wanted fields.
+    """Return two things: the names of all fields in a ULog of PX4, as `topic.field`, such as
+    `sensor_combined.gyro_rad[0]`; and a dict of the fields that `columns` name.
 
-    The fields of a second instance of a topic are `topic#1.field`; times are in µs.
+    A field of the second instance of a topic has the name `topic#1.field`. Times are in µs.
     """
     reader, arrays = _checks.import_library("pyulog", "ulog", str(path)).ULog, {}
     # The file is opened here, since the library does not close a file that it opened and cannot

@@ -75,8 +75,8 @@ def unit_of_columns(
     allowed: Sequence[str],
     message_start: str,
 ) -> str:
-    """Return the unit of columns, which is the unit that the user or the names of the columns
-    state, else the usual unit.
+    """Return the unit of columns of one quantity: the unit that the user states, else the unit in
+    the names of the columns, else the usual unit.
 
     **Arguments:**
 
@@ -86,8 +86,9 @@ def unit_of_columns(
     - `allowed`: the units that such a column may have.
     - `message_start`: the first words of messages.
 
-    **Raises** `LogError` if names and user, or two names, state different units, or if a name
-    states a unit that is not allowed. It **warns** of an unknown unit in brackets.
+    **Raises** `LogError` if the names and the user state different units, if two names do so, or if
+    a name states a unit that is not allowed. It **warns** of a name with an unknown unit in
+    brackets, if the user states no unit.
     """
     in_names = {name: unit for name in columns if (unit := unit_in_column_name(name, allowed))}
     for name, unit in in_names.items():

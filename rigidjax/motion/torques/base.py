@@ -165,9 +165,11 @@ def require_torque(torque: object, name: str = "torque") -> None:
 
 
 def may_read_attitude(torque: Torque | None) -> bool:
-    """Return whether a torque, or any torque in a `Sum`, may read the attitude of the body. The
-    attribute `feels` tells: a torque with `feels = HasSpin` reads the body rate only, and a torque
-    without this attribute may read anything; `None` reads nothing.
+    """Return whether a torque, or any torque in a `Sum`, may read the attitude of the body.
+
+    The attribute `feels` of the torque tells: a torque with `feels = HasSpin` reads the body rate
+    only, any other torque may read the attitude, and so may a torque without this attribute. The
+    torque `None` reads nothing.
     """
     if hasattr(torque, "parts"):
         return any(may_read_attitude(part) for part in torque.parts)  # pyright: ignore

@@ -54,12 +54,13 @@ class UniformGravity(base.AbstractForce):
 class CentralGravity(base.AbstractForce):
     """Attract a body of some size to a centre at the world's origin.
 
-    The potential energy is `U = −μ m/r − (μ/2r³)(Tr I_w − 3 r̂·I_w r̂)` (MacCullagh's formula),
-    with the mass m of the body, the vector of length r and direction r̂ from the origin to the
-    centre of mass, and the inertia `I_w = R I Rᵀ` in world axes (R is the attitude). Both the force
-    and the torque of this potential act on the body, so that the energy and the angular momentum
-    about the origin are conserved. **Arguments:** `mu` μ, m³/s², the constant of gravitation times
-    the mass of the centre. Source: Hughes, Spacecraft Attitude Dynamics, §8.1.
+    The potential energy is `U = −μ m/r − (μ/2r³)(Tr I_w − 3 r̂·I_w r̂)` (MacCullagh's formula).
+    Here m is the mass of the body, r and r̂ are the length and the direction of the vector from the
+    origin to the centre of mass, and `I_w = R I Rᵀ` is the inertia in world axes, with the inertia
+    I in body axes and the attitude R. Both the force and the torque of this potential act on the
+    body, so that the energy and the angular momentum about the origin are conserved. **Arguments:**
+    `mu` μ, m³/s², the constant of gravitation times the mass of the centre. Source: Hughes,
+    Spacecraft Attitude Dynamics, §8.1.
 
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], 1e-9 * jnp.eye(3))
     >>> state = rj.Rigid([2.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])

@@ -216,7 +216,8 @@ def _finite_nonempty_array(value: NumbersLike, name: str) -> Array:
 
 
 class InputRow(NamedTuple):
-    """Hold the values of all inputs of a torque during one step, or during a part of a step.
+    """Hold the values of all inputs of a torque during one step of an integrator, or during a part
+    of a step, if the step is split where a delayed input changes.
 
     - `values`: the value of each `Input`, by name
     - `delayed`: the value of each delayed input, in the order of these inputs in the torque

@@ -62,10 +62,11 @@ class Linear(_Table):
 class Held(_Table):
     """Hold each sample of a function of time, t → (*k), until the next sample (zero-order hold).
 
-    **Arguments:** `times` (n,) s, increasing; `values` (n, *k), where row i holds from time i on,
-    and the first row also before its time. Both may be traced. The value jumps at `times`: a torque
-    that reads the value has these `jump_times`, too, and adaptive steps end at these times. For
-    fixed steps give the samples to `rigidjax.batch.rollout` as `inputs`. **Raises:** as `Linear`.
+    **Arguments:** `times` (n,) s, increasing; `values` (n, *k), where row i holds from time i until
+    time i + 1, the first row also before its time, and the last row for all later times. Both may
+    be traced. The value jumps at `times`; these times are the `jump_times` also of a torque that
+    reads the value, and adaptive steps end at them. For fixed steps give the samples to
+    `rigidjax.batch.rollout` as `inputs`. **Raises:** as `Linear`.
 
     >>> Held([0.0, 1.0, 2.0], [[5.0], [6.0], [7.0]])(1.5)
     Array([6.], dtype=float64)

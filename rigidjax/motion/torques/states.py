@@ -1,9 +1,9 @@
 """Handle torques and functions of time with states of their own, which are integrated with the
 state of the body.
 
-Such a torque has `state0`, the initial states, and `rate`, the derivative of the states; the states
-are the last argument of the torque. `freeze_own_states` inserts the states: for the rest of the
-library the result is a plain torque.
+A torque with states of its own has `state0`, the initial states, and `rate`, the derivative of the
+states; it is called with the states as its last argument. `freeze_own_states` inserts the values of
+the states: the result is a plain torque for the rest of the library.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,8 @@ class FrozenLaw(eqx.Module):
 
     def __getattr__(self, name: str) -> Any:
         # All members of the torque (`feels`, `jump_times`, …) are members of this object as well,
-        # except `state0` and `rate`: it has no states that somebody must integrate.
+        # except `state0` and `rate`: the values of the states are fixed here, so that no integrator
+        # must find states in this object.
         if name.startswith("_") or name in ("law", "own", "state0", "rate"):
             raise AttributeError(name)
         attribute = getattr(self.law, name)
@@ -100,9 +101,10 @@ def freeze_own_states(torque: Tree, own: tuple[PyTree, ...]) -> Tree:
 def initial_own_states(
     torque: PyTree, t: ScalarLike, state: PyTree, body: Body
 ) -> tuple[PyTree, ...]:
-    """Return the initial states of a torque, as a tuple with a tree of arrays for each part of the
-    torque that has states of its own (inner parts first), in the precision of the state of the
-    body.
+    """Return the initial values of the states that a torque has of its own, in the precision of the
+    state of the body: a tuple with one tree of arrays for each part of the torque with states.
+
+    If a part contains another part with states, the states of the inner part come first.
 
     - `torque`: the torque
     - `t`: s, the time of the start
@@ -154,8 +156,8 @@ def rates_of_own_states(
 
 
 def require_frozen_states(torque: PyTree) -> None:
-    """Raise `TypeError` if `torque` has states of its own, such as the speed of a wheel, whose
-    values are not inserted (see `freeze_own_states`).
+    """Raise `TypeError` if `torque` has states of its own, such as the speed of a wheel, and is not
+    yet wrapped together with their values (see `freeze_own_states`).
     """
     if has_own_states(torque):
         words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate and "
