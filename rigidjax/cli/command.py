@@ -242,8 +242,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
         help="a wheel whose speed was logged: its inertia in kg m², axis x, y or z, rad/s or rpm"),
     "--model": dict(
         choices=tuple(spec.MODELS), default="ratios",
-        help="which numbers of the body the fit may change (default: ratios of the inertia, all "
-        "that free motion shows)"),
+        help="which numbers of the body the fit may change (default: ratios, which is all that "
+        "free motion shows)"),
     "--typical": dict(
         type=float, default=1.0, metavar="KG_M2",
         help="about how large a moment of inertia of the body is, kg m² (default: 1)"),

@@ -123,8 +123,9 @@ class Instant(eqx.Module):
 
 
 def _require_transformable(state: PyTree) -> None:
-    """Raise an error unless `state` is one state that can be transformed between frames: with `x`
-    (3,) and `v` (3,), with `q` (4,) and `omega` (3,), or with all four fields.
+    """Raise an error unless `state` is one state, not a batch, that can be transformed between
+    frames: a state with `x` (3,) and `v` (3,), with `q` (4,) and `omega` (3,), or with all four
+    fields.
     """
     point = hasattr(state, "x") and hasattr(state, "v")
     attitude = hasattr(state, "q") and hasattr(state, "omega")

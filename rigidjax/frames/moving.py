@@ -259,11 +259,13 @@ def require_frame(frame: object, name: str) -> MovingFrame:
 
 
 class _ComposedMotion(eqx.Module):
-    """Describe the motion, relative to the inertial frame, of a frame that moves relative to the
-    moving frame `outer` as `inner` does relative to an inertial frame.
+    """Describe the motion of a composed frame relative to the inertial frame. The composed frame
+    moves relative to the moving frame `outer` as the frame `inner` moves relative to an inertial
+    frame.
 
     The methods `rotation`, `rate` and `origin` are functions of the time, s, for a `MovingFrame`:
-    the rotation matrix (3, 3), the angular velocity (3,), rad/s, and the origin (3,), m.
+    the rotation matrix (3, 3) of the composed frame; its angular velocity (3,), rad/s, in its own
+    axes; and its origin (3,), m, in the axes of the inertial frame.
     """
 
     outer: MovingFrame
@@ -286,7 +288,8 @@ class _InverseMotion(eqx.Module):
     """Describe the motion of the inertial frame relative to the moving frame `frame`.
 
     The methods `rotation`, `rate` and `origin` are functions of the time, s, for a `MovingFrame`:
-    the rotation matrix (3, 3), the angular velocity (3,), rad/s, and the origin (3,), m.
+    the rotation matrix (3, 3), inertial → moving frame; the angular velocity (3,), rad/s, in the
+    axes of the inertial frame; and the origin (3,), m, in the axes of the moving frame.
     """
 
     frame: MovingFrame

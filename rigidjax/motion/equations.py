@@ -226,10 +226,11 @@ def _normalise_reproducibly(q: Quat) -> Quat:
     """Return the quaternion `q` (4,) divided by its length, rounded to the same digits in every
     compiled program.
 
-    XLA replaces q/√n, where n is the squared length of q, by a product with 1/√n in some programs.
-    Reverse-mode differentiation computes the steps of a solver again in another program: a
-    different last digit changes the step lengths, and the gradient would belong to another
-    discretisation (an error of 7e-6 at a tolerance of 1e-11). A root and a quotient that are
-    separate operations round equally everywhere.
+    Let n be the squared length of q. XLA replaces the quotient q/√n by the product of q and 1/√n in
+    some programs, which changes the last digit. Reverse-mode differentiation computes the steps of
+    a solver again in another program. A different last digit there would change the lengths of the
+    steps, and the gradient would belong to another discretisation (an error of 7e-6 at a tolerance
+    of 1e-11). Here the root and the quotient are kept as two separate operations, which round
+    equally in every program.
     """
     return q / lax.optimization_barrier(jnp.sqrt(squared_quaternion_length(components(q))))

@@ -165,16 +165,16 @@ def _apply_change_to_leaves(
     of_quaternion: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> PyTree:
-    """Return a state after a change, computed leaf by leaf: one function changes quaternions,
-    another function changes all other arrays.
+    """Return a tree like `state`, computed leaf by leaf from the state and a change of it: one
+    function is applied to quaternions, and another function to all other arrays.
 
     - `state`: a tree of arrays
     - `change`: (n,), the changes of all leaves one after another: a rotation vector of three
       numbers for a quaternion, and as many numbers as the leaf has for any other leaf
-    - `of_quaternion`: a function (q, vector) of a quaternion (4,) and its rotation vector (3,),
-      which returns the new quaternion
+    - `of_quaternion`: a function (q, vector) of a quaternion q (4,) and its rotation vector (3,),
+      which returns the array (4,) that takes the place of q in the result
     - `of_others`: a function (leaf, change) of any other array and its change, of equal shape,
-      which returns the new array
+      which returns the array that takes the place of the leaf in the result
     """
     (leaves, tree), out = jax.tree.flatten(state), []
     for leaf, place, turned in zip(

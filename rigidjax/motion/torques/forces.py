@@ -89,9 +89,10 @@ class CentralGravity(base.AbstractForce):
 def _distance_direction_inertia_and_trace(
     state: HasPose, inertia_tensor: Mat3
 ) -> tuple[Scalar, Vec3, Vec3, Scalar]:
-    """Return the four quantities of MacCullagh's formula for gravity from the world's origin: the
-    distance r of the centre of mass from the origin, m; the unit vector r̂ from the origin to the
-    body, (3,), body axes; I r̂, (3,), kg m²; and the trace of I, kg m².
+    """Return four quantities for the gravity of a centre at the world's origin, by MacCullagh's
+    formula: the distance r of the centre of mass from the origin, m; the unit vector r̂ (3,) from
+    the origin to the centre of mass, body axes; the product I r̂ (3,) with the inertia tensor I of
+    the body, kg m²; and the trace of I, kg m².
 
     - `state`: a state with the position of the centre of mass (m, world frame) and the attitude
     - `inertia_tensor`: I (3, 3), kg m², body frame, about the centre of mass

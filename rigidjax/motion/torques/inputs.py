@@ -44,9 +44,11 @@ class Input(eqx.Module):
 
 
 class _ConstantFunction(eqx.Module):
-    """Return one `value` at every time. This function of time takes the place of an `Input` (a
-    signal that a torque reads by its name, and whose values the caller gives) while the value of
-    the input is constant, such as during one step.
+    """Return one `value` at every time.
+
+    An `Input` is a signal that a torque reads by name and whose values the caller gives. This
+    function of time takes its place while the value of the signal is constant, such as during one
+    step.
     """
 
     value: Array
@@ -202,11 +204,10 @@ def require_no_jumps(source: PyTree, name: str) -> None:
 
 
 def _finite_nonempty_array(value: NumbersLike, name: str) -> Array:
-    """Return `value` as an array, of any shape, of finite numbers: one number, or one for each
-    channel (component) of a signal. **Raises:** `ValueError` for an empty array or, unless JAX
-    traces the numbers, for a number that is not finite.
+    """Return `value` as an array of its own shape. **Raises:** `ValueError` for an empty array, and
+    for a number that is not finite, unless JAX traces the numbers.
 
-    - `value`: the numbers
+    - `value`: one number, or one for each channel (component) of a signal
     - `name`: the name of the argument, for messages
     """
     array = _checks.numeric_array(value, name)
@@ -267,9 +268,11 @@ def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
 
 
 def _is_delayed_input(node: PyTree) -> bool:
-    """Return whether `node` (a torque, or anything that a torque contains) is a delayed input: a
-    `Delayed` (a function of time, shifted by a delay) whose function is an `Input`, a signal that
-    has a name and whose values the caller gives.
+    """Return whether `node`, a torque or anything that a torque contains, is a delayed input: a
+    `Delayed` whose `source` is an `Input`.
+
+    A `Delayed` is a function of time, its `source`, that is shifted by a delay. An `Input` is a
+    signal that a torque reads by name and whose values the caller gives.
     """
     return isinstance(node, Delayed) and isinstance(node.source, Input)
 

@@ -153,8 +153,8 @@ class GravityGradient(base.AbstractTimeTorque):
         """Return three things about a far point mass that attracts the body at the distance r, with
         μ, the constant of gravitation times its mass:
 
-        - its direction, a unit vector u (3,), body axes
-        - the strength μ/r³ of its gravity gradient, 1/s²
+        - the direction from the body to the point mass, a unit vector u (3,), body axes
+        - the strength μ/r³ of the gravity gradient of the point mass, 1/s²
         - a list with one vector (3,) for each degree n = 3, 4, … in the field `harmonics`: μ/rⁿ⁺¹
           times the gradient at u of Hₙ, the solid harmonic of degree n of the body's own gravity
 
@@ -183,8 +183,8 @@ def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]
     sum over m = 0, …, n, with the distance r of the point from the origin, its longitude λ, and the
     associated Legendre functions Pₙₘ of z/r.
 
-    - `harmonics`: for each degree n the coefficients (2n + 1,) in the order Cn0, Cn1, Sn1, Cn2,
-      Sn2, …
+    - `harmonics`: for each degree n an array (2n + 1,) of the coefficients C and S, in the order
+      Cn0, Cn1, Sn1, Cn2, Sn2, …
     - `u`: (3,), the unit vector at which the gradients are taken
     """
     x, y, z = components(u)
