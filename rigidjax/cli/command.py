@@ -187,7 +187,9 @@ def _cache_folder() -> Path:
 
 
 class _EscapingParser(argparse.ArgumentParser):
-    """Read the command line; its error messages contain no control characters of file names."""
+    """Read the command line, with error messages in which control characters, which the name of a
+    file may contain, are escaped.
+    """
 
     def error(self, message: str) -> NoReturn:
         """Print the message with its control characters escaped, and end the program with exit code

@@ -124,9 +124,10 @@ def _units_of_kind(kind: str) -> tuple[str, ...]:
 
 
 def broadcast_noise(noise: Sequence[float], message_start: str) -> tuple[float, ...]:
-    """Return the noise of three axes, from one positive number or three.
+    """Return the noise of three axes, from one positive number for all axes, or three.
 
-    It raises `LogError` for other numbers; the message begins with `message_start`.
+    **Raises** `LogError` for another count of numbers, or a number that is not positive; the
+    message begins with the text `message_start`.
     """
     if len(noise) not in (1, 3):
         raise LogError(f"{message_start}: wanted one noise or three, got {len(noise)}")
@@ -232,8 +233,11 @@ def _first_finite_time(t: np.ndarray) -> float:
 
 
 def unit_of_channel(path: str | Path, channel: Channel) -> str:
-    """Return the unit of a channel: its stated unit, else the unit in the names of its columns,
-    else the usual unit of such columns.
+    """Return the unit of the readings of a sensor: the unit that `channel` states, else the unit in
+    the names of its columns, else the usual unit of such columns in such a log.
+
+    - `path`: the path of the log; its ending tells the format of the log.
+    - `channel`: the sensor: its kind, columns and stated unit.
     """
     allowed = _units_of_kind(channel.kind)
     usual = known_unit_of_column(path, channel.columns[0]) or allowed[0]
@@ -241,20 +245,24 @@ def unit_of_channel(path: str | Path, channel: Channel) -> str:
 
 
 def unit_of_time(path: str | Path, column: str, stated_unit: str | None) -> str:
-    """Return the unit of times: the `stated_unit`, else the unit in the name of the `column`, else
-    the usual unit of such a column.
+    """Return the unit of the times in a log: the unit that the user states, else the unit in the
+    name of the time column, else the usual unit of the times in such a log.
+
+    - `path`: the path of the log; its ending tells the format of the log.
+    - `column`: the name of the time column.
+    - `stated_unit`: the unit that the user states, or `None`.
     """
     usual = known_unit_of_column(path, column) or "s"
     return unit_of_columns([column], stated_unit, usual, TIME_UNITS, str(path))
 
 
 def _median_body_rate(path: str | Path, channel: Channel, rates: np.ndarray) -> float:
-    """Return the median length of the body rates, rad/s, and raise `LogError` if there are none or
-    all are zero.
+    """Return the median magnitude of the body rates, rad/s. Raise `LogError` if there are no rates,
+    or if all rates are zero.
 
     - `path`: the path of the log, for the message.
     - `channel`: the gyro, with the names of its columns, for the message.
-    - `rates`: (n, 3) the rates.
+    - `rates`: (n, 3) the rates, rad/s.
     """
     names = ", ".join(channel.columns)
     if not rates.size:
@@ -331,8 +339,10 @@ def _fill_missing_rows(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, n
 def _wheel_speed_series(
     path: str | Path, t: np.ndarray, table: dict[str, np.ndarray], wheels: Sequence[WheelColumn]
 ) -> dict[str, Series]:
-    """Return the logged speed of each wheel as a series in time, rad/s, by the name (`wheel`, or
-    `wheel 1`, `wheel 2`, … if there are several) under which the torque finds it.
+    """Return the logged speed of each wheel, rad/s, as a function of time (a `Series`), in a dict.
+
+    The keys are the names under which the torques of the wheels read their speeds: `wheel`, or
+    `wheel 1`, `wheel 2`, … if there are several wheels.
 
     - `path`: the path of the log, for messages.
     - `t`: (T,) the times, s.
@@ -354,10 +364,8 @@ def _wheel_speed_series(
 
 
 def _torque_of_options(wheels: Sequence[WheelColumn], free: Sequence[str]) -> Torque | None:
-    """Return the torque on the body: that of the wheels and, if `free` contains "drag", a linear
-    drag with coefficients initially zero.
-
-    Without wheels and drag it returns `None`.
+    """Return the torque on the body: the torque of the wheels and, if `free` contains "drag", a
+    linear drag, whose coefficients are initially zero. Without wheels and drag return `None`.
 
     - `wheels`: the wheels whose speeds were logged.
     - `free`: some of `bias`, `drag`, `delay`, the numbers that a fit may move; for `delay` each

@@ -221,10 +221,11 @@ class _Flight:
         return place
 
     def _decode_frame(self, stream: _Bytes, frame_type: Any) -> tuple[Any, ...]:
-        """Return the numbers of one frame (a record of the log), decoded from the bytes at the
-        present place of `stream`.
+        """Return the numbers of one frame (a record of the log), decoded from the bytes that begin
+        at the present place of `stream`.
 
-        `frame_type` is the type of the frame, such as INTRA for a frame that holds whole values.
+        `frame_type` is the type of the frame, such as INTRA for an I frame, which holds whole
+        values.
         """
         context, fields, values = self.context, self.fields[frame_type], ()
         context.frame_type, context.field_index = frame_type, 0
@@ -239,8 +240,8 @@ class _Flight:
     def _read_event_kind_and_integers(self, stream: _Bytes) -> tuple[int, list[int]]:
         """Read one event from the `stream`, and return its kind and the integers that it holds.
 
-        An event is a record of the log without readings, such as the end of a pause. The kind of an
-        unknown event is -1.
+        An event is a record of the log without readings, such as the end of a pause of the logging.
+        For an event of an unknown kind the kind is -1, and no integers are read.
         """
         event = next(stream)
         if event == _LOG_END:
@@ -342,8 +343,10 @@ class _Order:
 
 
 def _read_variable_length_integer(stream: _Bytes) -> int:
-    """Read an integer of variable length, with seven bits in each byte; the eighth bit is set if
-    more bytes follow.
+    """Return the integer of variable length that begins at the present place of `stream`.
+
+    Each byte holds seven bits of the integer, the lowest bits first; the eighth bit is set if more
+    bytes follow. An integer of more than five bytes is damaged, and the result is zero.
     """
     number, shift = 0, 0
     while shift < 35:
@@ -366,10 +369,12 @@ def _closely_follows_frame(last_frame: Sequence[int], frame: Sequence[int]) -> b
 
 
 def _factors_to_deg_per_s_and_g(headers: Mapping[str, Any]) -> dict[str, float]:
-    """Return the factors from raw integers to units: deg/s for rates, g for accelerations.
+    """Return the factors that convert the raw integers of a log: rates to deg/s, accelerations to
+    g.
 
-    `headers` are the entries of the log's header. The keys of the result are the names of the
-    fields, `gyroADC` and `accSmooth`, without an index.
+    `headers` holds the entries of the header of the log, by name. The keys of the result are the
+    names of the fields, `gyroADC` (rates) and `accSmooth` (accelerations), without an index; a
+    field whose scale is not in the header has no factor.
     """
     factors = {}
     if "gyro_scale" in headers:

@@ -36,7 +36,9 @@ _UNITS[".bfl"] = _UNITS[".bbl"]
 
 
 def known_unit_of_column(path: str | Path, column: str) -> str | None:
-    """Return the unit that a column of a binary log is known to have, or `None`."""
+    """Return the unit that a column has in every log of this format, or `None` if the format does
+    not determine the unit; the ending of `path` tells the format.
+    """
     units = _UNITS.get(lowercase_file_ending(Path(path)), {})
     return next((units[part] for part in re.split(r"[.\[]", column) if part in units), None)
 

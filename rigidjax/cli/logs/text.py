@@ -175,7 +175,9 @@ class _NumberReader:
         return value
 
     def _replace_decimal_comma(self, cell: str) -> str:
-        """Return the cell with a point in place of its decimal comma."""
+        """Return the cell with a point in place of its decimal comma; raise `ValueError` if earlier
+        cells have decimal points, or if the comma may mark thousands.
+        """
         if "." in cell or self.decimal == ".":
             raise ValueError(f"{cell!r} is not a number; the decimals above have the other sign")
         # Between tabs, 1,200 may mean a thousand and two hundred.

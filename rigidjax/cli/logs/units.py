@@ -41,7 +41,7 @@ _SIGNS = str.maketrans({
 
 
 def unit_in_column_name(column: str, allowed: Sequence[str]) -> str | None:
-    """Return the unit at the end of the name of a column, or `None`.
+    """Return the unit at the end of the name of a column, or `None` if no known unit is there.
 
     A unit in brackets may be any of `UNITS`. A unit without brackets, after a blank, a comma or an
     underscore, must be one of `allowed`. A power may be written with `^`, `**` or raised digits.
@@ -60,8 +60,8 @@ def unit_in_column_name(column: str, allowed: Sequence[str]) -> str | None:
 
 
 def _normalise_unit_spelling(unit: str) -> str:
-    """Return the text of a unit in small letters, with one spelling of each sign, as in the table
-    `_SPELLINGS`. For example, "°/S" gives "°/s", and "m/s²" gives "m/s2".
+    """Return the text of a unit in small letters and with one spelling of each sign. For example,
+    "°/S" gives "°/s", and "m/s²" gives "m/s2".
 
     A capital G stays unchanged, since it means gauss, while g is the acceleration of gravity.
     """
