@@ -8,10 +8,12 @@ Bodies are divided along their first axis among processes (`distributed.share`),
 devices of each process (`devices="all"`), then into chunks, which a device computes one after
 another. Numbers that all bodies share are copied to every device. `distributed.total` adds the sums
 that each process has computed, such as the sums of a fit or of `reduce=`. Each process writes its
-own states (`distributed.save`), or `distributed.gather` sends all states to every process. Shuffle
-bodies with adaptive steps before `share`, so that no process gets all of the slow ones. When one
-process ends early, every other process ends within `patience` seconds (an argument of
-`distributed.connect`); `distributed.recover` reads the shares that had been written before.
+own states (`distributed.save`), or `distributed.gather` sends all states to every process.
+
+Under adaptive steps some bodies need more steps than others: shuffle the bodies before `share`, so
+that no process gets most of the slow bodies. If one process ends early, every other process ends
+within `patience` seconds (an argument of `distributed.connect`); `distributed.recover` reads the
+files that the processes wrote before.
 """
 
 from rigidjax._names import define_dir_and_getattr

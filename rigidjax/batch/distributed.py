@@ -48,7 +48,10 @@ def connect(address: str, processes: int, process: int, *, patience: int = 20) -
 
 
 def share(tree: PyTree) -> PyTree:
-    """Return the share of this process, ⌈N / processes⌉ rows or one fewer, of each array of a tree.
+    """Return the rows of the bodies that this process computes, of each array of a tree.
+
+    The N bodies are divided in order among P processes: each process gets ⌈N/P⌉ bodies, or one
+    fewer.
 
     **Arguments:** `tree` of arrays with a leading axis of N bodies; leave out the numbers that all
     bodies share.

@@ -36,10 +36,12 @@ State = TypeVar("State", Spin, Attitude, Rigid)
 Reduced = TypeVar("Reduced")
 # The type of `reduce`: (carried value, time, state of one body) → next carried value.
 Reduce = Callable[[Any, Array, Any], Any]
-# The type of `inputs`: samples (N, steps, *k) by name; each sample is constant during its step.
+# The type of `inputs`: by the name of each input of the torque an array (N, steps, *k), which has
+# a sample of the shape k for each of N bodies and each step. A sample is constant during its step.
 Inputs = Mapping[str, ArrayLike] | None
 Solver = AbstractExplicit | Magnus4 | AbstractSplitting | None
-# The largest size, bytes, of the intermediate states that reverse mode stores for all chunks.
+# The largest size, in bytes, of the intermediate states that reverse mode stores for all chunks
+# together. If they are larger, reverse mode computes each chunk once more instead.
 _MOST_KEPT = 2**23
 
 
@@ -107,18 +109,21 @@ def rollout(
 
     **Arguments:**
 
-    - `bodies`: an `Inertia`, (3, 3) for all bodies or (N, 3, 3), one each, kg m², body frame;
-      likewise a `MassProperties` for `Rigid` states.
-    - `states0`: `Spin`, `Attitude` or `Rigid` whose arrays have a leading axis N, at `t0`.
-    - `step_size`: s, equal for all bodies.
-    - `num_steps`: a Python `int`; another number compiles again.
+    - `bodies`: an `Inertia` in kg m², body frame: (3, 3) if all bodies share it, or (N, 3, 3), one
+      for each body. For `Rigid` states a `MassProperties`, shared or one for each body.
+    - `states0`: the states at `t0`: a `Spin`, `Attitude` or `Rigid` whose arrays have a leading
+      axis N.
+    - `step_size`: the length of a step in seconds, equal for all bodies.
+    - `num_steps`: the number of steps, a Python `int`; for another number the function is compiled
+      again.
     - `torque`: `None`, or any torque that `rigidjax.simulate` takes. All bodies share its arrays
       unless `torque_axes` says otherwise.
-    - `torque_axes`: which arrays of the torque have a leading axis N: `None` none; 0 all
-      (`jax.vmap` of the torque's constructor makes such a torque); a function that selects arrays
-      or parts of the torque (`lambda law: law.speed`, for a `Sum` `lambda law: law.parts[1]`,
-      several in a tuple); or a tree like the torque, with 0 for each array that has the axis N and
-      `None` for each array that has not.
+    - `torque_axes`: which arrays of the torque have a leading axis N, with one row for each body.
+      `None` means that no array has it. 0 means that all have it (`jax.vmap` of the torque's
+      constructor makes such a torque). A function selects the arrays, or the parts of the torque
+      that hold them: `lambda law: law.speed`, or `lambda law: law.parts[1]` for a `Sum`; it returns
+      several in a tuple. A tree like the torque has 0 in the place of each array with this axis,
+      and `None` in the place of each array without it.
     - `solver`: `None` takes `Magnus4` for the attitude of a free body or under a torque that does
       not depend on the attitude, and `rigidjax.solvers.RungeKutta4` otherwise. Any explicit method
       of `rigidjax.solvers` may be given; its steps agree with those of `diffrax` to round-off. Runs
@@ -126,14 +131,14 @@ def rollout(
       next addition), so that the round-off of n steps grows as √n, not as n.
     - `save_every`: `None` returns the last states only; a number k returns the states after k, 2k,
       … steps.
-    - `reduce`, `initial`: a function `(carried, t, state) → carried` of one body, which is called
-      after every `save_every` steps (every step by default), and the first carried value. With
-      `reduce` only the last states are returned. Define the function once, best as a Module: each
-      new function compiles again.
-    - `t0`: s, the time of the first step.
+    - `reduce`: a function `(carried, t, state) → carried` of one body, which is called after every
+      `save_every` steps (every step by default). With `reduce` only the last states are returned.
+      Define the function once, best as a Module: JAX compiles again for each new function.
+    - `initial`: the first carried value of `reduce`, the same for all bodies.
+    - `t0`: the time at which the first step begins, in seconds.
     - `inputs`: the inputs of the torque, by the names of its `rigidjax.torques.Input`s: arrays (N,
-      num_steps, *k). Row i of a body is constant during step i; a `rigidjax.torques.Delayed` input
-      is late by its delay.
+      num_steps, *k). Row i of a body is constant during step i. Inside a `rigidjax.torques.Delayed`
+      each row acts later by the delay.
     - `chunk`: the number of bodies computed at a time; `None` takes as many as fill the
       first-level cache (64 in float64) on CPU, and all bodies on a GPU. Another `chunk` changes the
       last digits at most.
@@ -141,7 +146,7 @@ def rollout(
       sequence of devices. The devices get equal shares of the bodies. Another choice changes the
       last digits at most.
     - `progress_meter`: a progress meter of diffrax, such as `diffrax.TextProgressMeter()`, which is
-      moved after each chunk; without `devices`.
+      moved after each chunk; it cannot be given together with `devices`.
 
     **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
     (N, num_steps // save_every); with `reduce` the pair (last states, carried value). Under a
@@ -157,8 +162,8 @@ def rollout(
     for shapes that do not agree, an input that is missing or that no torque reads, a step that is
     not positive, or a `save_every` that does not divide `num_steps`. Known numbers are checked too:
     `ValueError` for an inertia that no mass has, for a moment of zero, and for a quaternion that is
-    not unit. A traced inertia of this kind, or of NaN, makes the states of its body NaN and those
-    of no other body.
+    not unit. For a traced inertia that is NaN, or that no mass has, no error is raised: it makes
+    the states of its own body NaN, and those of no other body.
 
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))
@@ -211,9 +216,10 @@ def _take_fixed_steps_of_bodies(
     - `reduce`: a function `(carried, t, state) → carried` of one body, called at the time of each
       saved state, even if only the last states are returned; or `None`.
     - `constants`: what bodies, initial states and torque hold besides arrays.
-    - `numbers`: five things: the arrays that all bodies share; a pair of the arrays of bodies,
-      states and torque with a row for each body, and of the inputs of the torque; the first carried
-      value; the step size, s; and the time at which the first step begins, s.
+    - `numbers`: five things: the arrays that all bodies share; a pair of trees, the first with the
+      arrays of bodies, states and torque that have a row for each body, the second with the inputs
+      of the torque; the first carried value; the step size, s; and the time at which the first step
+      begins, s.
     """
     (solver, count, every, keep), (shared, per_body, initial, h, t0) = steps, numbers
 
@@ -228,8 +234,8 @@ def _take_fixed_steps_of_bodies(
         stepper = stepper_of(solver, field, state0, count)
 
         def advance_to_next_saved_state(carry: PyTree, first: Array) -> tuple[PyTree, PyTree]:
-            # This goes from one saved state, which is followed by the step number `first`, to the
-            # next saved state.
+            # These steps lead from one saved state to the next one. The number of the first of
+            # them is `first`.
             y, carried = carry
             y = march_steps(stepper, h, t0, first, every, y, inputs)
             if reduce is not None:
@@ -250,8 +256,8 @@ def _take_fixed_steps_of_bodies(
 
     size = sum(leaf.size for leaf in jax.tree.leaves(per_body[0])) * h.dtype.itemsize
     if size * (count // every) * (every // steps_per_piece(every) + 1) > _MOST_KEPT:
-        # With this the reverse pass computes each chunk again, and stores the states of one chunk
-        # only.
+        # With `jax.checkpoint` the reverse pass computes each chunk once more, and stores the
+        # states of one chunk at a time.
         step_body = jax.checkpoint(step_body)
     return map_bodies(step_body, (shared, initial, h, t0), per_body, division)
 

@@ -22,8 +22,8 @@ from rigidjax.rotation.barrier import platform
 AXIS = "bodies"
 # The type of `devices`: `None` is JAX's default device.
 Devices = Literal["all"] | Sequence[jax.Device] | None
-# The size, bytes, of an array with one number for each body of a chunk. With this size the arrays
-# of a step stay in the first-level cache, which holds 32 KB on many cores.
+# The size, in bytes, of an array with one number for each body of a chunk. With this size the
+# arrays of a step stay in the first-level cache, which holds 32 KB on many cores.
 _ROW = 512
 # JAX takes this option of XLA only at the outermost jit, and it exists only on CPU.
 _WIDE = {"xla_cpu_prefer_vector_width": 512}
@@ -34,8 +34,8 @@ def compiler_options() -> dict[str, Any]:
     `rigidjax.batch`.
 
     The options enable 512-bit vectors on CPU, which give 1.5 to 2 times the speed on cores with
-    AVX-512; on other backends the result is empty. `rollout` and `simulate` use the options by
-    themselves if they are called outside of any transformation. JAX takes options only at the
+    AVX-512; on other backends the dict is empty. If `rollout` and `simulate` are called outside of
+    any transformation, they use the options without being asked. JAX takes options only at the
     outermost `jit`: if you wrap the call in a `jit` of your own, give the options there.
 
     >>> bool(jax.jit(lambda x: x + 1, compiler_options=compiler_options())(1.0) == 2)
@@ -147,8 +147,9 @@ def divide_batch(
 def chunk_size(chunk: int | None, dtype: np.dtype, num_bodies: int) -> int:
     """Return the number of bodies that a device computes at a time, out of `num_bodies` bodies.
 
-    It is `chunk`, but `num_bodies` at most. If `chunk` is `None`, it is on CPU the number of bodies
-    that fill the cache with numbers of the given `dtype`, and all bodies on other backends.
+    The result is `chunk`, or `num_bodies` if this is smaller. If `chunk` is `None`, the result is
+    on CPU the number of bodies whose numbers, of the given `dtype`, fill the cache; on other
+    backends it is `num_bodies`. Raise `ValueError` for a `chunk` that is not a positive integer.
     """
     if chunk is None:
         small = _ROW // np.dtype(dtype).itemsize
@@ -172,8 +173,8 @@ def map_bodies(
     - `shared`: the arrays that all bodies share.
     - `per_body`: arrays with a leading axis of bodies, of which `row` is one row.
     - `division`: three things: the number of bodies that a device computes at a time; the mesh of
-      devices, which exchange nothing, or `None` for the default device;
-      and the progress meter, which is moved after each chunk.
+      devices, which exchange nothing, or `None` for the default device; and the progress meter,
+      which is moved after each chunk.
     """
     chunk, mesh, meter = division
     count = jax.tree.leaves(per_body)[0].shape[0]
@@ -181,8 +182,9 @@ def map_bodies(
     share = -(-count // parts)
     chunk = min(chunk, share)
     if chunk == share and platform() != "cpu":
-        # XLA gives each thread of a GPU two or four elements of an array of even length, and the
-        # numbers of two or four bodies do not fit into the registers of a thread.
+        # The length of the chunk is made odd: of an array of even length XLA gives each thread of a
+        # GPU two or four elements, and the numbers of two or four bodies do not fit into the
+        # registers of a thread.
         chunk += 1 - chunk % 2
     room = -(-count // (chunk * parts)) * chunk * parts
 

@@ -65,9 +65,9 @@ class Batch(eqx.Module, Generic[State]):
       order of the given bodies; NaN at times that a body did not reach.
     - `result`: a `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `nonfinite_input` (an
       impossible inertia or state), `max_steps_reached` or `dt_min_reached`.
-    - `num_steps` (N,): the number of accepted and rejected steps, 0 for the closed form.
-    - `own`: a tuple of the states that the torques have, with the axes of `ys`; `None` if no torque
-      has a state.
+    - `num_steps` (N,): the number of all steps, rejected steps included; 0 for the closed form.
+    - `own`: a tuple of the states that torques have of their own, such as the speed of a wheel,
+      with the leading axes (N, T); `None` if no torque has a state.
 
     >>> bodies, omega = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0]))), jnp.ones((5, 3))
     >>> rj.batch.simulate(bodies, rj.Spin(omega), [0.0, 1.0]).ys.omega.shape
@@ -200,8 +200,8 @@ def _simulate_bodies(
         return map_bodies(simulate_body, (shared, ts), per_body, division)
 
     def initial_speed(row: PyTree) -> Array:
-        # This is |Ω| + √|dΩ/dt| at the start, rad/s, to sort by: the number of steps grows with
-        # this speed.
+        # The bodies are sorted by |Ω| + √|dΩ/dt| at the first time, in rad/s, where Ω is the body
+        # rate: the larger this number is, the more steps a body needs.
         body, state0, torque = inertia_state_and_torque(shared, row, constants)
         y0 = with_own_states(body, state0, torque, ts[0])
         slope = motion_of(equations_of_motion(body, y0, torque)(ts[0], y0, None))
@@ -238,17 +238,20 @@ def _results_after_fixed_steps(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
     return jax.vmap(status)(batch.per_body, ys)
 
 
-# XLA on CPU computes loops over bodies in groups of 16 doubles or 32 floats; the bodies of an
-# incomplete last group are rounded differently. This is the size of a group of floats.
+# XLA on CPU computes loops over bodies in groups of 16 numbers in float64, or 32 in float32; the
+# bodies of an incomplete last group are rounded differently. `_UNROLLED` is the size of the larger
+# group.
 _UNROLLED = 32
 
 
 def sort_bodies_for_chunks(key: Array, chunk: int, num_devices: int) -> tuple[Array, Array]:
     """Sort bodies so that those that are computed together need similar numbers of steps.
 
-    A chunk is the bodies that a device computes together; all of them wait for the slowest. The
-    place of a body within its chunk does not depend on the keys of other bodies, since the rounding
-    of its results depends on this place.
+    A chunk is the bodies that a device computes together; all of them wait for the slowest. XLA
+    computes the bodies of a chunk in groups, so that the rounding of a body's results depends on
+    its place within the chunk. Each body therefore keeps its place within a chunk, whatever the
+    keys of other bodies are, and only its chunk is chosen by its key. If `chunk` is a multiple of
+    32, which is the size of a group, only the place within the group is kept.
 
     **Arguments:**
 

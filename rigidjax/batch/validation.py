@@ -82,8 +82,8 @@ def check_batch(
     """Check the bodies, initial states and torque of `rollout`, and return them as a `BodyBatch`.
 
     The arguments are those of `rollout` with the same names. Raise `TypeError` and `ValueError` for
-    wrong types and shapes. Where the numbers are checked on the device,
-    `BodyBatch.require_valid_numbers` raises the error, later.
+    wrong types and shapes. The numbers of few bodies are checked here, too; those of many bodies
+    are checked on the device, and `BodyBatch.require_valid_numbers` raises the error later.
     """
     if not isinstance(states0, Spin | Attitude | Rigid):
         raise TypeError(
@@ -115,8 +115,9 @@ def check_batch(
             f"bodies: wanted one body (3, 3), or one for each of the {count} states, ({count}, 3, "
             f"3), got shape {tensor.shape}"
         )
-    # The tensors are checked before they are cast to the precision of the states: in a higher
-    # precision the rounded inertia of a flat body looks like an inertia that no mass has.
+    # The tensors are checked before they are cast to the precision of the states. The moments of a
+    # flat body are at the limit of what a mass can have; rounded to float32 they may be beyond it,
+    # by more than is allowed in float64.
     bodies, checks = _check_inertia(bodies)
     if isinstance(states0, HasAttitude):
         checks += _check_unit_quaternions(states0.q)
@@ -153,7 +154,7 @@ def checked_inputs_of_bodies(
     num_steps: int,
     step_size: Array,
 ) -> dict[str, Array] | None:
-    """Return the inputs of a torque as arrays (N, count, *k) by name, after a check.
+    """Return the inputs of a torque as arrays (N, num_steps, *k) by name, after a check.
 
     **Arguments:**
 
@@ -305,8 +306,8 @@ def checked_step_size_and_number(
     """Return the length of a step, s, and the number of steps, after a check of each.
 
     `step_size` and `num_steps` are the arguments of `rollout`; `dtype` is the precision that the
-    length gets. Raise `ValueError` for a length that is known not to be positive, and an error for
-    a number of steps below 1.
+    length gets. Raise `ValueError` for a known length that is not positive and finite, and for a
+    number of steps below 1; raise `TypeError` for a number of steps that is not an integer.
     """
     h = _checks.array_of_shape(step_size, (), "step_size").astype(dtype)
     if _checks.is_known(h) and not 0 < float(h) < np.inf:

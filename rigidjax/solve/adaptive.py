@@ -95,9 +95,9 @@ def integrate_with_diffrax(
 
     - `solver`, `controller`, `dt0`, `max_steps`, `adjoint`, `progress_meter`: as for
       `diffrax.diffeqsolve`.
-    - `field`: a vector field `f(t, y, args)`. If `jumps` is a list, its `args` is a list with one
-      array for each part of the field that jumps, the times at which steps end for this part;
-      `None` for at most one such part.
+    - `field`: a vector field `f(t, y, args)`. If several parts of the field jump, `args` is a
+      sequence with one array for each of these parts: the times at which steps end for this part.
+      Otherwise `args` is `None`.
     - `ts`: (T,) s, the times of the states; increasing if `jumps` is a list.
     - `y0`: the state at `ts[0]`.
     - `jumps`: a list with one array of times, s, for each part of the field that jumps. Steps end

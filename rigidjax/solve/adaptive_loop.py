@@ -1,9 +1,9 @@
 """Run an explicit method under any step controller of diffrax, for one body or for many.
 
 The bodies are in the last axis of every array. For derivatives the steps are recorded. A run is
-divided into segments of `SEGMENT` steps; the record stores the state at the start of each segment,
-but the single steps of the last segment only. A derivative runs each earlier segment once more to
-get the steps of this segment.
+divided into segments of `SEGMENT` steps. The record stores the state at the start of each segment,
+but the single steps of the last segment only. For a derivative each earlier segment is run once
+more, from its stored state, to get its steps.
 """
 
 from collections.abc import Callable
@@ -32,8 +32,8 @@ NONFINITE: Any = dfx.RESULTS.nonfinite
 
 # The number of steps in one segment of a record (see the module), rejected steps included.
 SEGMENT = 512
-# Additional rows for a segment that is run again: if the second program rounds differently, the
-# segment may take a few steps more.
+# The number of additional rows for a segment that is run again for derivatives: if the program for
+# derivatives rounds differently from the program of the run, the segment may take a few more steps.
 _MORE = 64
 # XLA on CPU makes one kernel of a loop whose state is smaller than a kilobyte. Steps are therefore
 # written into a block of at most `_BLOCK` bytes and `_MOST` rows, and full blocks into the record.
@@ -105,7 +105,8 @@ class LoopState(NamedTuple):
     state: Any  # the states of the step controller and the progress meter
 
 
-# Each recorded attempt at a step is one row (4 + n, *bodies). The first `HEAD` = 4 entries are the
+# Each recorded attempt at a step is one row (4 + n, *bodies), where n is the number of numbers of a
+# state, and *bodies one last axis of bodies, or no axis. The first `HEAD` = 4 entries are the
 # start time of the step, its length, its kind and the index of the next stop; the other n entries
 # are the state at the start. The kind is NONE if the step was rejected or not taken, LAST if the
 # accepted step ends at the next stop, and STEP for any other accepted step.
@@ -199,9 +200,10 @@ def start_length_and_end_of_steps(run: Run, rows: Rows) -> tuple[Array, Array, A
     """Return the start, length and end of recorded steps, s, with their derivatives.
 
     Stops are the times at which steps have to end, because the field jumps there. The derivatives
-    are those with respect to the stops and to `run.t0`: the start of a step moves with the last
-    stop before it (with `run.t0` before the first stop); the end of a step moves with a stop only
-    if the step ends at this stop.
+    are those with respect to the stops and to `run.t0`, the start of the run. The start of a step
+    moves with the last stop before it, or with `run.t0` if there is no such stop. The end of a step
+    that ends at a stop moves with this stop. Any other step keeps its length, and its end moves
+    with its start.
 
     - `run`: holds the start `t0` and the stops.
     - `rows`: (4 + n, …) the recorded steps: in each row the start time, the length, the kind of the
@@ -218,9 +220,10 @@ def start_length_and_end_of_steps(run: Run, rows: Rows) -> tuple[Array, Array, A
 
 
 def row_of_each_body(rows: Array, index: Array) -> Array:
-    """Return `rows[index]` of each body, where each body has an index of its own.
+    """Return for each body the row of an array that has the index of this body.
 
-    An index out of range is replaced by the nearest one that is in range.
+    For one body this is `rows[index]`. An index out of range is replaced by the nearest one that is
+    in range.
 
     - `rows`: (J, *bodies) the rows; `*bodies` is one last axis for the bodies of a batch, or no
       axis.
@@ -453,9 +456,9 @@ def _attempt_step(
     - `constants`: the arrays on which the field depends.
     - `run`: the start of the run, and the times at which steps end (stops).
     - `loop`: the loop state before the step.
-    - `until`: if recorded steps are repeated for derivatives, the time at which the repeated part
-      of the run ends, s; else `None`. Only repeated steps have derivatives with respect to the
-      times of the run.
+    - `until`: if recorded steps are repeated for derivatives, the time in seconds at which the
+      repeated part of the run ends; else `None`. Only repeated steps have derivatives with respect
+      to the times of the run.
     - `dense`: whether the stages of dense output, which gives states within a step, are evaluated,
       too.
 
@@ -592,7 +595,7 @@ def segment_of_rows(rows: Rows, end: Array, count: Array) -> Segment:
 def fill_saved_states_of_segment(
     method: Method, constants: Arrays, run: Run, segment: Segment, ys: Array
 ) -> Array:
-    """Return the array of saved states, with the states filled in whose times lie in one segment.
+    """Fill in the saved states whose times lie in one segment, and return all saved states.
 
     - `method`: the explicit method and the field.
     - `constants`: the arrays on which the field depends.
@@ -654,14 +657,15 @@ def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
     `*bodies` is one last axis for the bodies of a batch, or no axis for one body.
 
     - `method`: holds the weights of the method, and scales a quaternion to length 1.
-    - `t`: the time, s.
+    - `t`: the time, in seconds.
     - `step`: the start, the length and the first state of the step.
     - `slopes`: (n, s, *bodies) the values of the field at all s stages of the step, those of dense
-      output included.
+      output included; n is the number of numbers of the state.
     """
     theta = ((t - step.t) / jnp.where(step.h == 0, 1, step.h)).astype(slopes.dtype)
-    # The polynomial in θ is evaluated for the weights of the slopes, which are one number for each
-    # stage. To evaluate it for the rows F_r of dense output would take n numbers for each row.
+    # Dense output is a polynomial in θ, the fraction of the step before the time t. It is evaluated
+    # for the weights of the slopes, which are one number for each stage: with states as
+    # coefficients, each coefficient would have n numbers.
     rows = arrays_of_tableau(method.tableau, slopes.dtype).dense
     shares = change_within_step(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
     rise = jnp.sum(shares[None] * slopes, 1)

@@ -1,10 +1,10 @@
 """Compute tangents and cotangents of a recorded run by a second pass over its steps.
 
 The function that is differentiated is the sequence of steps that the run took. Their lengths are
-held constant, except that a step that was cut short at a stop moves with the stop. Each segment of
-the record but the last is run once more. If the second program rounds differently, it may divide a
-segment into other steps; the derivative is then that of these steps, and the difference is within
-the tolerance.
+held constant, except that a step that was cut short at a stop moves with the stop. The record has
+the single steps of the last segment only; each other segment is run once more. If the second run
+rounds differently, it may divide a segment into other steps. The derivative is then that of the new
+steps, and differs from the derivative of the old steps by no more than the tolerance.
 """
 
 from functools import partial
@@ -83,12 +83,12 @@ def transpose_saved_states(
 
     - `method`: the explicit method and the field.
     - `run`: holds the K saved times `run.between`.
-    - `step`, `slopes`: the step, and the slopes (values of the field) at all its stages, (n, s,
-      *bodies).
+    - `step`: the step: its start, length and end, and the state (n, *bodies) at its start.
+    - `slopes`: (n, s, *bodies) the values of the field at all s stages of the step.
     - `first`, `last`: the indices of the saved times in this step go from `first` to `last` − 1.
     - `state_cotangents`: (K, n, *bodies), the cotangents of all saved states.
-    - `time_cotangents`: (K, *bodies), the cotangents of the saved times, as far as they are summed
-      up, or `None` if these cotangents are not wanted.
+    - `time_cotangents`: (K, *bodies), the cotangents of the saved times, summed over the steps that
+      have been treated so far; or `None` if these cotangents are not wanted.
 
     **Returns** three things: the array `time_cotangents`, to which the cotangents of the saved
     times in this step are added (or `None`); the cotangents of the step; and the cotangents of the

@@ -29,7 +29,7 @@ class Layout(NamedTuple):
     """Describe which arrays of a program have a last axis for the bodies of a batch."""
 
     bodies: bool  # whether the arrays of each body have this axis; without it there is one body
-    shared: tuple[bool, ...]  # for each constant, whether all bodies share it: it has no such axis
+    shared: tuple[bool, ...]  # for each constant, whether all bodies share it, without this axis
 
     def vmap_over_bodies(self, function: Callable[..., PyTree]) -> Callable[..., PyTree]:
         """Map `function(constants, t, y)`, which takes the arrays of one body, over all bodies.
@@ -87,8 +87,8 @@ def run_with_bodies_last(
     - `constants`: arrays, each of which all bodies may share.
     - `each`: arrays in which each body has values of its own.
     - `num_linear`: the number of arrays at the end of `each` in which the program is linear, such
-      as tangents. A `jax.vmap` over these arrays alone gives several tangents of one motion; its
-      axis is not treated as an axis of bodies.
+      as tangents. A `jax.vmap` over these arrays alone adds tangents, not bodies: its axis is not
+      moved to the end.
     - `layout`: says which of the given arrays have a last axis of bodies already; `None` stands for
       one body.
 

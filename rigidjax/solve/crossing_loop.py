@@ -2,10 +2,13 @@
 
 Each pass through the loop attempts the next step, or only a part of a step, which ends at the
 guessed time of a zero. The state at a zero is therefore as accurate as the state at the end of a
-step. A step may contain zeros that the signs of g at its two ends do not show. In two cases the
-step is therefore taken once more, only up to the extremum of g: if the cubic polynomial through the
-values and slopes of g at both ends has such zeros; or if this polynomial turns back before zero,
-but the tangents at both ends do not exclude a zero.
+step.
+
+A step may contain two zeros that the signs of g at its ends do not show. Between two such zeros g
+has an extremum. To look for them, the cubic polynomial with the values and slopes of g at both ends
+of the step is examined. The step is taken once more, only up to the extremum of this polynomial, in
+two cases: if the polynomial has two such zeros; or if it has none, but the tangents at both ends do
+not exclude that g has two.
 """
 
 from collections.abc import Callable
@@ -28,8 +31,9 @@ from rigidjax.solve.batching import Arrays, add_leading_axes
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
 from rigidjax.solve.tableaus import Tableau
 
-# The number of guesses for one zero by Newton's method; after them the interval is halved. It is
-# also the largest number of times that a step is taken again because g has an extremum in it.
+# The largest number of guesses for one zero by Newton's method; after these guesses the interval
+# that contains the zero is halved again and again. `_GUESSES` is also the largest number of times
+# that a step is taken again because g has an extremum in it.
 _GUESSES = 8
 # The largest number of guesses and halvings for one zero.
 _MOST = 70
@@ -56,7 +60,7 @@ class Path(NamedTuple):
     y0: Array  # (n,) the state at t0
     rtol: Array  # the relative tolerance of a step
     atol: Array  # the absolute tolerance
-    h0: Array  # the length of the first step, NaN if it is to be chosen
+    h0: Array  # the length of the first step; NaN if the search chooses it
 
     @property
     def last_times_before_jumps(self) -> Array:
@@ -82,8 +86,8 @@ class Motion(NamedTuple):
     longest: Array  # the length of the longest step
     # condition(t, y) returns g, dg/dt, dy/dt and the size that g may have from round-off alone.
     condition: Callable[[Array, Array], tuple[Array, ...]]
-    # counts(t, y, steps) returns whether a zero of g after this number of steps is a true zero, and
-    # not only round-off.
+    # counts(t, y, steps) returns whether a zero of g at the time t and the state y is a true zero,
+    # and not caused by round-off alone. `steps` is the number of steps before it.
     counts: Callable[[Array, Array, Array], Array]
     project: Callable[[Array], Array]  # scales a quaternion to length 1
 
@@ -158,8 +162,8 @@ def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
     """
     t0, y0 = run.t0, run.y0
     g, rate, *_ = motion.condition(t0, y0)
-    # If g is zero at the start to within the round-off of the time, the sign of dg/dt tells on
-    # which side of zero the motion is.
+    # If g is zero at the start, to within the round-off of the time, the sign of g is not known.
+    # Soon after the start g has the sign of dg/dt, which is taken instead.
     eps = jnp.finfo(t0.dtype).eps
     little = 16 * eps * jnp.maximum(jnp.abs(t0), jnp.abs(run.stops[-1])).astype(g.dtype)
     there = jnp.abs(g) <= little * jnp.abs(rate)
@@ -201,8 +205,9 @@ def _is_searching(search: Search, run: Path, body: _SearchState) -> Array:
     """Return for each body whether its search for a zero of a condition g goes on.
 
     The search of a body ends in any of four cases: a zero was found; the end of the run is reached;
-    the largest number of passes is used up; or the length of the next step is not above 0, because
-    the step would be shorter than the time can resolve (0) or the run met NaN (NaN).
+    the largest number of passes is used up; or no next step is possible. In the last case the
+    length of the next step is 0 if the step would be shorter than the round-off of the time, and
+    NaN if the run met NaN.
 
     - `search`: holds the largest number of passes; a pass is one attempted step, or a part of one.
     - `run`: holds the stops, the times at which steps end; the last stop is the end of the run.
@@ -264,8 +269,8 @@ def _next_search_state(
     eps = jnp.finfo(h.dtype).eps
     long_enough = turn > 8 * eps * jnp.maximum(jnp.abs(t), eps * whole)
     shorter = good & hidden & long_enough & (body.tries < _GUESSES)
-    # A crossing in the direction that is not asked for is not located: the step is accepted, and
-    # only the new side of zero is stored.
+    # If g crosses zero in the direction that is not asked for, the time of the zero is not
+    # computed: the step is accepted, and only the new sign of g is stored.
     crossed = good & ~shorter & other & asked
     accept = good & ~shorter & ~crossed
     next_h = jnp.where(shorter, turn, jnp.where(step & ~crossed, following, h))
@@ -310,15 +315,18 @@ def _newton_step(
 ) -> tuple[Array, Array, Array, Array]:
     """Take one step of Newton's method towards a zero of g, from a guess between two interval ends.
 
-    - `body`: the state of the search; only the time and length of the step and the number of
-      guesses so far are used.
+    - `body`: the state of the search; only three of its fields are used: the time and the length of
+      the step of the motion, and the number of guesses so far.
     - `low`, `high`: the ends of the interval, at which the condition g has opposite signs.
     - `here`: the guess, with g and dg/dt there.
 
-    **Returns** four things: whether this step reaches the zero; whether the search has to end at
-    the guess in any case, because no floating-point time lies between `low` and `high` or all
-    guesses are used up; the length of the step, s, or 0 if the step does not reach the zero; and
-    the next guess, as a time after the start of the step, s.
+    **Returns** four things:
+
+    - whether Newton's step reaches the zero, because it is short enough;
+    - whether the search has to end at the guess even if Newton's step does not reach the zero,
+      because no floating-point time lies between `low` and `high` or all guesses are used up;
+    - the length of Newton's step, s, or 0 if it does not reach the zero;
+    - the next guess, as a time after the start of the step of the motion, s.
     """
     rate, eps = here.rate, jnp.finfo(body.h.dtype).eps
     move = (-here.g / jnp.where(rate == 0, jnp.ones_like(rate), rate)).astype(here.x.dtype)
@@ -338,8 +346,8 @@ def _choose_end(condition: Array, if_true: _IntervalEnd, if_false: _IntervalEnd)
     """Return `if_true` for the bodies for which `condition` is true, and `if_false` for the others.
 
     - `condition`: one truth value for each body.
-    - `if_true`, `if_false`: two times with the values there of g, the function whose zero is
-      searched for, and of dg/dt.
+    - `if_true`, `if_false`: two ends of intervals, each a time with the values of g and dg/dt at
+      this time; g is the function whose zero is searched for.
     """
     pairs = zip(if_true, if_false, strict=True)
     return _IntervalEnd(*(jnp.where(condition, x, y) for x, y in pairs))
@@ -348,22 +356,27 @@ def _choose_end(condition: Array, if_true: _IntervalEnd, if_false: _IntervalEnd)
 def _may_hide_zeros(
     sign_at_low: Array, low: _IntervalEnd, high: _IntervalEnd, round_off: Array
 ) -> tuple[Array, Array]:
-    """Return whether g may have two more zeros in an interval than its signs at the ends show.
+    """Return whether a condition g may have two zeros in an interval that its signs do not show.
 
-    Two more zeros leave the signs at the ends as they are. The cubic polynomial is examined that
-    has the values and slopes of g at both ends. There may be such zeros if this polynomial has an
-    extremum within the interval at which its sign is not that of g at `low`, and at which it is
-    farther from zero than `round_off`; or if the tangents at both ends meet on that side of zero.
-    If the signs at the ends differ, only the extremum counts, and only if the polynomial then comes
-    back to the sign of g at `low`.
+    If g crosses zero twice, its signs at the ends of the interval do not change. The function
+    therefore examines the cubic polynomial that has the values and slopes of g at both ends. Below,
+    an extremum "beyond zero" is one at which the polynomial has the opposite sign of g at `low`,
+    and is farther from zero than `round_off`.
+
+    If g has the same sign at both ends, it may have two zeros in two cases: if the polynomial has
+    an extremum beyond zero in the interval; or if it has an extremum in the interval, and the
+    tangents at both ends meet beyond zero. If g has opposite signs at the ends, it may have two
+    more zeros in one case: if the polynomial has an extremum beyond zero in the interval, and after
+    it an extremum with the sign of g at `low`.
 
     - `sign_at_low`: the sign of g at `low`, 1 or −1.
-    - `low`, `high`: the ends of the interval: their times after the start of the step, s, with g
-      and dg/dt there.
+    - `low`, `high`: the ends of the interval, each a time after the start of the step, s, with the
+      values of g and dg/dt at this time.
     - `round_off`: the size that g may have from round-off alone.
 
-    **Returns** two things: whether there may be such zeros; and the time of the extremum, as a
-    length from `low`, s. If g has two zeros, one lies on each side of this extremum.
+    **Returns** two things: whether g may have two zeros that its signs do not show; and the time of
+    the extremum, s, counted from `low`. If g has two such zeros, one lies on each side of this
+    extremum.
     """
     width = (high.x - low.x).astype(low.g.dtype)
     a, b = sign_at_low * low.rate * width, sign_at_low * high.rate * width
@@ -374,14 +387,14 @@ def _may_hide_zeros(
     root = jnp.sqrt(jnp.maximum(c * c - 4 * a * d, 0))
     q = -0.5 * (c + jnp.where(c < 0, -root, root))
     one, other = a / jnp.where(q == 0, 1, q), q / jnp.where(d == 0, 1, d)
-    # The slope of the cubic increases through zero at its minimum, and decreases through zero at
-    # its maximum.
+    # The slope of the cubic has two zeros. It increases through zero at the minimum of the cubic,
+    # and decreases through zero at the maximum.
     least, most = jnp.where(c < 0, other, one), jnp.where(c < 0, one, other)
 
     value = lambda x: first + x * (a + x * (0.5 * c + x * d / 3))  # noqa: E731
     within = lambda x: (x > 0) & (x < 1)  # noqa: E731
-    # The tangents at both ends meet beyond zero. A function with one extremum and these tangents
-    # may reach zero, so that a zero is not excluded.
+    # `touch` is true if the tangents at both ends meet beyond zero. A function with these tangents
+    # and one extremum may then reach zero, even if the cubic does not.
     meet = (last - b - first) / jnp.where(a == b, 1, a - b)
     touch = (a < 0) & (b > 0) & (first + a * meet < -round_off)
     two = (last > 0) & ((value(least) < -round_off) | touch)
@@ -403,8 +416,8 @@ def _guess_zero(sign_at_low: Array, low: _IntervalEnd, high: _IntervalEnd) -> Ar
     The guess is in seconds. The condition g is a function of the time and the state of a body.
 
     - `sign_at_low`: the sign of g at `low`, 1 or −1; at `high` the sign is the opposite one.
-    - `low`, `high`: the ends of the interval: their times x after the start of the step, s, with g
-      and dg/dt there.
+    - `low`, `high`: the ends of the interval, each a time x after the start of the step, s, with
+      the values of g and dg/dt at this time.
 
     The guess is x(0), where x(g) is the cubic polynomial in g that has the times and the slopes
     dx/dg at `low` and `high`. The guess is the middle of the interval if g moves away from zero at
@@ -466,10 +479,10 @@ def acceptance_and_next_step_of_search(
     - `order`: the order of this error.
     - `t`, `h`: the time at which the step began, and its length, s.
     - `uncut_length`: the length, s, that the step would have had if it had not been cut short.
-    - `ends_at_stop`: whether the step was the last before a stop (a time at which a step has to
-      end), and was cut short to end there.
-    - `run_length`: the length of the run, s. Near t = 0, where the round-off of t vanishes, the
-      round-off of this length is taken instead.
+    - `ends_at_stop`: whether the step was cut short to end at a stop, a time at which a step has to
+      end. Such a step may be short although the next step can be long.
+    - `run_length`: the length of the run, s, which gives a lower limit for the length of a step
+      near t = 0, where the round-off of t vanishes.
     """
     good, following = acceptance_and_next_step_size(error_norm, order, h)
     uncut_length = lax.stop_gradient(uncut_length)

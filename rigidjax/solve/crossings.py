@@ -3,8 +3,8 @@
 The crossings are found without derivatives. To get the derivatives, the motion is computed again up
 to the times of the crossings, which are now constants. At such a fixed time g is zero but for a
 small error. From g and its time derivatives ġ and g̈ along the motion, one step of Chebyshev's
-method gives the time and the state of the crossing; the first and second derivatives of this step
-are those of the crossing:
+method gives the time and the state of the crossing. The first and second derivatives of the results
+of this step are those of the crossing:
 
     τ = −(g/ġ)(1 + ½ g g̈/ġ²),   y = y* + f τ + ½ (df/dt) τ².
 
@@ -14,12 +14,13 @@ the vector field, and y the state at the crossing.
 If g jumps over zero, the time of the jump is found by halving an interval. How this time depends on
 the parameters is not known, so that its derivatives are NaN.
 
-A zero that is only round-off does not count. Such zeros occur if the motion conserves g, or if g is
-a component of the state that stays at zero. At such a zero |ġ| is at most a small multiple of ε
-(|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ) times the square root of the number of steps. Here ε is the relative
-rounding error, and rᵢ is the size of the terms that are summed up in ẏᵢ. This size is estimated as
-the sum of two norms, taken over that array of the state (Ω, x, …) to which yᵢ belongs: the norm of
-ẏ, and the norm of the change of ẏ when each number of y changes by the norm of its array.
+A zero that is caused by round-off alone is no crossing. Round-off causes zeros if the motion
+conserves g, or if g is a component of the state that stays at zero. At a zero of this kind |ġ| is
+at most a small multiple of ε (|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ) times the square root of the number of
+steps. Here ε is the relative rounding error, and rᵢ is the size of the terms that are summed up in
+ẏᵢ, the time derivative of the number yᵢ of the state. This size is estimated as the sum of two
+norms, each taken over the array of the state (Ω, x, …) that contains yᵢ: the norm of ẏ, and the
+norm of the change of ẏ if each number of y changes by up to the norm of its own array.
 """
 
 from collections.abc import Callable
@@ -81,16 +82,16 @@ class Event(eqx.Module):
 
     - `condition`: a Module or function `(t, state, body) → scalar` that is smooth along the motion;
       it may hold traced numbers. If the condition jumps over zero (`jnp.sign(…)`), the event is at
-      the jump, and its time has NaN derivatives. Under a law with states of its own the state is a
-      `Coupled`: use `state.motion.omega` and `state.own`.
+      the jump, and its time has NaN derivatives. If the torque has states of its own, the state is
+      a `Coupled`: use `state.motion.omega` and `state.own`.
     - `direction`: 1 for a zero on the way up, −1 for a zero on the way down, 0 for both (as in
       SciPy). In a run backwards in time, the way up means that the condition increases from step to
       step, that is with decreasing t.
-    - `max_step`: the longest step, s. A zero is found if the sign of the condition is different at
-      the end of a step, or if the condition has one extremum within the step.
+    - `max_step`: the longest step, s. A zero is found if the condition has different signs at the
+      two ends of a step; two zeros are found if the condition has one extremum between them.
 
-    A start at a zero is no event, and neither is a zero of a condition that is always zero to
-    round-off (see `crossings`).
+    If the condition is zero at the start of the run, this zero is no event. A condition that is
+    zero but for round-off all along the motion has no event (see `crossings`).
 
     **Raises:** `TypeError` if `condition` is not a function; `ValueError` for another `direction`,
     or for a `max_step` that is not positive.
@@ -175,28 +176,29 @@ def crossings(
     - `body`, `state0`, `torque`: as for `simulate`; `state0` is the state at `t0`.
     - `t0`, `t1`: the start and the end of the run, s; `t1 < t0` goes back in time.
     - `condition`, `direction`: as for `Event`. The condition may depend on the time (a stroboscopic
-      section is `sin(½(t − t₀)ω)`).
+      section with the angular frequency ω is `sin(½(t − t₀)ω)`).
     - `max_crossings`: K, the length of the results; the run ends at crossing number K.
-    - `max_step`: the longest step, s, for a condition that changes much faster than the motion.
-      Several zeros in one step are found if the cubic through the values and slopes of the
-      condition at both ends of the step shows them.
+    - `max_step`: the longest step, s. Give it for a condition that changes much faster than the
+      motion. Several zeros in one step are found if the cubic polynomial with the values and slopes
+      of the condition at both ends of the step shows them.
     - `solver`: an explicit method of `rigidjax.solvers`; `None` is the closed form for a free body,
       and `rigidjax.solvers.DormandPrince8` for any other.
     - `rtol`, `atol`: as for `simulate`. A crossing is as accurate as a step; in closed form it is
       accurate to round-off.
     - `max_steps`: the largest number of steps, parts of steps included.
 
-    A start on the section does not count, and a tangential contact may be missed. A zero counts if
-    the rate of the condition there is at least 16 times the rate that round-off could give it
-    (under a solver, times the root of the number of steps): the energy minus its initial value has
-    no crossing. For many bodies use `jax.vmap`.
+    A start on the section is no crossing, and a tangential contact with the section may be missed.
+    A zero is a crossing only if round-off cannot have caused it: the rate of the condition at the
+    zero has to be at least 16 times the rate that round-off could give it; under a solver, 16√n
+    times after n steps. The energy minus its initial value, for example, has no crossing. For many
+    bodies use `jax.vmap`.
 
     **Returns** a `Crossings`. Its times and states have first and second derivatives with respect
-    to all numbers of the scene, of `condition` and of `state0`, in forward and reverse mode. Near a
-    tangential contact these derivatives grow without bound, as the true ones do.
+    to all numbers of `body`, `torque`, `condition` and `state0`, in forward and reverse mode. Near
+    a tangential contact these derivatives grow without bound, as those of the exact crossing do.
 
-    Source: Newton's method on the step from the last accepted state, instead of Hénon's change of
-    variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3).
+    Source: Hénon 1982, doi:10.1016/0167-2789(82)90034-3, with Newton's method on the length of the
+    step from the last accepted state instead of Hénon's change of variable.
 
     **Raises:** `TypeError` and `ValueError` as `simulate` does, for equal times, and for a
     condition that is not a number, is NaN at the start, or reads a part that the state lacks.
@@ -393,15 +395,15 @@ def _crossings_with_derivatives(
 ) -> tuple[Array, Array]:
     """Return `times` and `states` as they are; their derivatives come from a second run.
 
-    In the second run the motion is computed up to the fixed times, and each crossing is found by
-    one step from nearby. It is computed only if derivatives are taken.
+    In the second run the motion is computed up to the fixed `times`, and each crossing is found by
+    one step from there. The second run is made only if derivatives are taken.
 
     - `times`, `states`: the K crossings found, shapes (K,) and (K, n) for states of n numbers. The
       times are s = σt, where σ is 1 for a run forwards in time t and −1 for a run backwards.
     - `jumps`: (K,), whether the condition, which is zero at a crossing, jumps over zero there.
     - `inputs`: four things: the set-up of the run, which holds the body and the torque; the
-      `Event`, which holds the condition; the state at the start; and the times at which the run
-      begins and ends, s.
+      `Event`, which holds the condition; the state at the start; and the times t, in seconds, at
+      which the run begins and ends.
     """
     return times, states
 
@@ -410,7 +412,7 @@ def _crossings_with_derivatives(
 def _jvp_of_crossings(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[PyTree, PyTree]:
-    """Return the crossings found before, and their tangents from a second run.
+    """Return the times and states of known crossings, and their tangents from a second run.
 
     - `primals`: the times and states of the crossings; whether the condition jumps over zero at
       each of them; then the four inputs of the second run: its set-up, its `Event`, the state at
@@ -439,10 +441,10 @@ def _recompute_crossings(
     - `setup`: the body, the torque, and how the motion is computed: in closed form or by diffrax.
     - `event`: an `Event`, which holds the condition that is zero at a crossing.
     - `state0`: the state at `ts[0]`, of n numbers.
-    - `ts`: (T,) s, of which the first and the last are the times at which the run begins and ends.
+    - `ts`: (T,) times t, in seconds; the run begins at the first and ends at the last of them.
 
-    **Returns** the times (K,), again s = σt, and the states (K, n). Times and states have
-    derivatives with respect to all numbers of `setup`, `event`, `state0` and `ts`.
+    **Returns** two things: the times s = σt of the crossings, (K,); and their states, (K, n). Both
+    have derivatives with respect to all numbers of `setup`, `event`, `state0` and `ts`.
     """
     crossed, (constants, *_) = condition_and_motion_of_run(setup, event, state0, ts)
     there = jnp.isfinite(times)
@@ -458,10 +460,11 @@ def _recompute_crossings(
     return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
 
 
-# The number of samples of a free body's condition in one turn at the body's largest rate.
+# The condition of a free body is sampled this many times in one turn of the body at its largest
+# rate.
 _SAMPLES = 16
-# At a true crossing the rate of the condition is at least this many times the rate that round-off
-# could cause.
+# A zero counts as a crossing if the rate of the condition is at least this many times the rate that
+# round-off could cause.
 _CLEAR = 16
 
 
@@ -469,8 +472,8 @@ class Section(NamedTuple):
     """Hold a condition g and a motion y as functions of the time s = σt, which grows along the run.
 
     σ is 1 if the run goes forwards in time t, and −1 if it goes backwards. The section is the set
-    of states with g = 0. The functions take the arrays that they depend on as a first argument, the
-    `constants`.
+    of states with g = 0. The first argument of each function, `constants`, is a list of the arrays
+    on which the function depends.
     """
 
     solver: AbstractExplicit | None  # `None` is the closed form
@@ -482,7 +485,8 @@ class Section(NamedTuple):
     sizes: list[int]  # how many numbers each array of the state has
     sign: Array  # σ
     # If the inertia is a function of time, `form` replaces the body rate of a state by the momentum
-    # divided by a fixed inertia, and back. `None`: the state itself is integrated.
+    # divided by a fixed inertia, and converts it back. If `form` is `None`, the state itself is
+    # integrated.
     form: ByMomentum | None = None
 
     def vector_of_state(self, t: Array, state: PyTree) -> Array:
@@ -533,10 +537,11 @@ def condition_and_motion_of_run(
     - `setup`: how the run is computed: in closed form or by diffrax.
     - `event`: an `Event`, which holds the condition g and the longest step.
     - `state0`: the state at `ts[0]`.
-    - `ts`: (T,) s, of which the first and the last are the times at which the run begins and ends.
+    - `ts`: (T,) times t, in seconds; the run begins at the first and ends at the last of them.
 
     **Returns** two things: a `Section`, which holds the functions; and the tuple `Numbers`, which
-    holds their constants, the run that is searched for crossings, and its longest step, s.
+    holds three things: the constants of the functions, the run that is searched for crossings, and
+    the length of its longest step in seconds.
     """
     form = (
         equations_by_momentum(setup.body, state0, setup.torque)
@@ -630,10 +635,11 @@ def _locate_crossings_of_bodies(
 ) -> Arrays:
     """Return the fields of `Located` in a list: the crossings of one body, or of many at once.
 
-    They are the times of the crossings, their states, and whether the condition jumps over zero at
-    each; the number of crossings; and at the end of the search the time, the length of the next
-    step, and the number of steps. `run_with_bodies_last` calls this function, and puts the bodies
-    of a batch into the last axis of every array.
+    The list has seven arrays: the times of the crossings, their states, and whether the condition
+    jumps over zero at each of them; the number of crossings; and the time at which the search
+    ended, the length of the step that would follow, and the number of steps.
+    `run_with_bodies_last` calls this function, and puts the bodies of a batch into the last axis of
+    every array.
 
     - `section`: the condition, which is zero at a crossing, and the motion, as functions of the
       time s = σt: σ is 1 for a run forwards in time t, and −1 for a run backwards.
@@ -641,9 +647,8 @@ def _locate_crossings_of_bodies(
       steps.
     - `layout`: which arrays have a last axis of bodies.
     - `constants`: the arrays on which the functions of the section depend.
-    - `each`: a list of arrays with values of each body: those of the run that is searched (its
-      start, the times at which steps end, the tolerances and the first step), then the length of
-      its longest step, s.
+    - `each`: a list of arrays with values of each body: the fields of `Path`, which describe the
+      run that is searched, then the length of its longest step, in seconds.
     """
     run, longest = Path(*each[:-1]), each[-1]
     solver, motion = section.solver, layout.vmap_over_bodies(section.motion)
@@ -753,16 +758,18 @@ def chebyshev_step_to_crossing(
 
     - `section`: holds the condition g and the motion (see `Section`).
     - `constants`: the arrays on which the functions of the section depend.
-    - `s`, `y`: the fixed time s = σt near the crossing, and the numbers (n,) of the state there.
-    - `is_crossing`: a truth value; if it is false, nothing is zero near `s`, and the step has the
-      length 0.
+    - `s`, `y`: the fixed time s = σt near the crossing, and the numbers (n,) of the state there; σ
+      is 1 for a run forwards in time t, and −1 for a run backwards.
+    - `is_crossing`: whether there is a crossing near `s`. If there is none, the step has the length
+      0.
 
     **Returns** two things: the time s of the crossing, and the numbers (n,) of the state there.
     """
     rates = partial(section.rates, constants)
     g, rate, slope = rates(s, y)
-    # The second derivatives of g and of y are multiplied by g², which is zero at the crossing, as
-    # is its first derivative. The derivatives of these second derivatives are therefore not needed.
+    # The second time derivatives of g and of y are multiplied by g². At the crossing g² is zero,
+    # and so is the first derivative of g². The first and second derivatives of the results do
+    # therefore not contain the derivatives of these second time derivatives.
     here = lax.stop_gradient((s, y))
     _, moved = jax.jvp(rates, here, (jnp.ones_like(s), lax.stop_gradient(slope)))
     _, second, turn = lax.stop_gradient(moved)

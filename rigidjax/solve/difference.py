@@ -2,7 +2,8 @@
 
 If a torque switches at a certain time or state, the motion depends on this time or state, but the
 derivatives of `jnp.where`, `jnp.sign` and similar functions leave this dependence out. A difference
-of two values of the function, one on each side of x, includes it.
+of two values of the function that is differentiated includes it. One value is taken on each side of
+x, the argument of the function.
 """
 
 import warnings
@@ -18,27 +19,34 @@ from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
 
-# The longest step of the difference, relative to each number, for numbers of 8 and of 4 bytes. It
-# is half of the error of |q| up to which a quaternion q is accepted as a unit quaternion.
+# The longest step from x to one of the two points, relative to each number of x, for numbers of 8
+# and of 4 bytes. It is half of the error of |q| up to which a quaternion q is accepted as a unit
+# quaternion, so that a quaternion in x stays acceptable.
 _STEP = {8: 5e-7, 4: 5e-4}
-# A value may happen to be zero at x. The size of the value is therefore taken to be at least this
-# part of its change when each number of x changes by its own size.
+# The value of the function may happen to be zero at x, and then does not show its usual size. The
+# size is therefore taken to be at least this fraction of the change of the value when each number
+# of x changes by its own size.
 _SLOW = 1e-3
-# The uncertainty of the values of a second run, relative to the error of the first run.
+# The values at the two points are computed with the smaller tolerances of a second run. Their error
+# is taken to be this fraction of the error of the first run.
 _CLOSER = 0.01
 # Two slopes count as different if their difference is more than this many times its uncertainty.
 _UNSURE = 10.0
 
 
 class Slopes(NamedTuple):
-    """Hold two slopes of a function at a point x, along one direction, in the shape of its value.
+    """Hold two slopes of a function f at a point x along one direction.
+
+    The slope is the change of f(x) divided by the length of the step in this direction.
 
     **Fields:**
 
-    - `derivative`: the slope computed from the derivative.
-    - `difference`: the slope computed from a difference of values.
-    - `differ`: whether the two slopes differ by more than their uncertainty.
-    - `direction`: by how much each number of x changes along the direction, without its sign.
+    - `derivative`: the slope computed from the derivative, in the shape of f(x).
+    - `difference`: the slope computed from a difference of values of f, in the shape of f(x).
+    - `differ`: for each number of f(x) whether its two slopes differ by more than their
+      uncertainty.
+    - `direction`: a tree like x: the absolute value of the change of each number of x, divided by
+      the length of the step.
     """
 
     derivative: Array
@@ -50,8 +58,8 @@ class Slopes(NamedTuple):
 def absolute_or_one_if_all_zero(array: Array) -> Array:
     """Return the absolute value of each number of an array, or ones if all numbers are zero.
 
-    The result is taken as the natural size of each number. If all of them are zero, their natural
-    size is not known, and 1 is taken.
+    The result serves as the natural size of each number. If all numbers are zero, their natural
+    size is not known, and is taken to be 1.
     """
     return jnp.where(jnp.all(array == 0), jnp.ones_like(array), jnp.abs(array))
 
@@ -86,7 +94,7 @@ def step_and_two_points(
     size = jnp.maximum(jnp.max(jnp.abs(value)), _SLOW * rise)
     unsure = jnp.maximum(jnp.max(value_error), float(jnp.finfo(value.dtype).eps) * size)
     # The length of the step is chosen such that the value changes by the geometric mean of its size
-    # and its uncertainty, but is at most `longest`.
+    # and its uncertainty; but no step is longer than `longest`.
     step = jnp.sqrt(unsure * size) / jnp.where(rise > 0, rise, 1)
     longest = _STEP[value.dtype.itemsize]
     step = jnp.where((rise > 0) & (step > 0), jnp.minimum(step, longest), longest)
@@ -103,12 +111,12 @@ def values_at_two_points(
 ) -> Array:
     """Return the values of a function at two points.
 
-    The value is NaN at a point for which the function raises a `RuntimeError`, because it is no
-    valid argument. Under `jit` the numbers of the points are not known, and no error is raised.
+    The value is NaN at a point for which the function raises a `RuntimeError`, because the point is
+    no valid argument. Under `jit` the numbers of the points are not known, and no error is raised.
 
     - `function`: the function, called as `function(x, tolerances)`.
     - `points`: a tree of arrays with the two points in the first axis.
-    - `tolerances`: passed to the function.
+    - `tolerances`: the relative and the absolute tolerance, which are passed to the function.
     """
     if not _checks.is_known((points, tolerances)):
         return lax.map(lambda x: function(x, tolerances), points)
@@ -117,8 +125,8 @@ def values_at_two_points(
         try:
             values.append(function(side, tolerances))
         except RuntimeError:
-            # A flat body is at the limit of what a real body can be, so that one of the two points
-            # is no real body.
+            # The inertia of a flat body is at the limit of what a real body can have. If x is such
+            # an inertia, one of the two points on both sides of x is beyond this limit.
             values.append(np.nan)
     return jnp.stack(jnp.broadcast_arrays(*values))
 
@@ -134,10 +142,12 @@ def slopes_by_derivative_and_values(
     **Arguments:**
 
     - `x`: the numbers at which the derivative is taken.
-    - `value_at_x`: the value at `x`, computed with the same tolerances as `values`.
-    - `step`, `points`: the results of `step_and_two_points`: the length of the step, and the two
-      points, one step from `x` on either side.
-    - `values`: the values at the two points `points`, NaN if there is none.
+    - `value_at_x`: the value of the function at `x`, computed with the same tolerances as `values`.
+    - `step`: the length of the step from `x` to each of the two points, relative to the sizes of
+      the numbers of `x`.
+    - `points`: a tree like `x` with the two points, one on either side of `x`, in a new first axis
+      of each array.
+    - `values`: the values at the two points, NaN at a point that the function refuses.
     - `error`: a `FunctionError` with the derivative, and with the errors of value and derivative.
     """
     # The numbers of the two points have been rounded, so that their difference is not exactly along
@@ -145,7 +155,8 @@ def slopes_by_derivative_and_values(
     moved = jax.tree.map(lambda side, leaf: side - leaf[None], points, x)
     rises = jax.vmap(lambda way: _directional_change(error.derivative, way))(moved)
     there = jnp.isfinite(values)
-    # A missing value is replaced by 2 `value_at_x` minus the other value.
+    # If the function refuses one of the points, the value there is replaced by 2 `value_at_x` minus
+    # the other value, so that the slope is that between `x` and the other point.
     values = jnp.where(there, values, 2 * value_at_x[None] - values[::-1])
     rises = jnp.where(there, rises, -rises[::-1])
     derivative, difference = ((a[1] - a[0]) / (2 * step) for a in (rises, values))
@@ -166,9 +177,10 @@ def slopes_by_derivative_and_values(
 def derivative_error_from_slopes(slopes: Slopes) -> PyTree:
     """Return the error of a function's derivative with respect to each number of its argument x.
 
-    Two slopes along one direction are compared. The error with respect to each number is so large
-    that it alone would explain the whole difference between the slope by the derivative and the
-    slope by values. It is 0 where the slopes agree.
+    The slope of the function by its derivative is compared with its slope by a difference of
+    values, both along one direction. The whole difference between the two slopes may come from the
+    derivative with respect to any one number of x. The error of each of these derivatives is
+    therefore so large that it alone explains the difference. It is 0 where the slopes agree.
 
     - `slopes`: the two slopes and the direction.
 

@@ -1,10 +1,12 @@
 """Estimate the error of a run by a second, more accurate run and three slightly changed runs.
 
 The error of the *steps* is the distance of the states from the states of a second run. The second
-run has a fiftieth of the tolerance or, with equal steps, half of the step. The error of *round-off*
-is three standard deviations over four runs: the run itself and three neighbours, whose inputs
-(body, torque and start) differ from the inputs of the run by about a unit in the last digit. The
-neighbours round differently, and the differences between them grow as rounding errors do.
+run has a fiftieth of the tolerance or, with equal steps, half of the step.
+
+The error of *round-off* is three standard deviations over four runs: the run itself and three
+neighbours. A neighbour is a run whose inputs (body, torque and initial state) differ from the
+inputs of the run by about a unit in the last digit. The neighbours round differently, and the
+differences between them grow as rounding errors do.
 """
 
 import dataclasses
@@ -32,49 +34,56 @@ from rigidjax.solve.sides import hold_piecewise_constant_laws_at
 # The tolerance of the second run divided by the tolerance of the run. With this value a method of
 # order 8 takes 1.6 times as many steps.
 _CLOSER = 2e-2
-# The second run is divided into this many equal parts, and a step ends at the end of each part.
-# Otherwise a run of a few steps would take the same steps again, because no step is longer than ten
-# times the step before it.
+# The second run is divided into this many equal parts, and a step ends at the end of each part. No
+# step is longer than ten times the step before it. In a run of a few steps this limit, and not the
+# tolerance, sets the steps, and without the parts the second run would take the same steps again.
 _CUTS = 8
 # A run evaluates the torque law at its stages only. To find short pulses between the stages, the
 # law is sampled at `_SAMPLES_OF_PART` times in each of `_PARTS` parts of the run. A sample is
-# called sudden if its distance from the chord between its neighbours is greater than `_SUDDEN`
-# times the median of these distances in the part, plus `_ROUGH` roundings.
+# called sudden if its distance from the chord between its two neighbours is greater than `_SUDDEN`
+# times the median of these distances in the part, plus `_ROUGH` times the relative rounding error
+# of the dtype. The distances are relative to the largest sample of the part.
 _PARTS, _SAMPLES_OF_PART, _SUDDEN, _ROUGH = 32, 512, 20.0, 1e3
 # The number of neighbouring runs, and the number of standard deviations that are reported. Three
 # standard deviations over four runs (the run and its neighbours) exceed half of the true error in
 # all but a few of a thousand runs.
 _NEIGHBOURS, _DEVIATIONS = 3, 3.0
-# In float64 the neighbours are run at the square root of the tolerance, but at `_LOOSE` at most, so
-# that they take fewer steps. If a run at this tolerance is farther than `_NEAR` from the run whose
-# error is wanted, errors grow along it in another way, and the tolerance is multiplied by
-# `_FARTHEST`.
+# In float64 the neighbours are run at a larger tolerance, so that they take fewer steps: at the
+# square root of the tolerance of the run, but at `_LOOSE` at most. If a run at the larger tolerance
+# is farther than `_NEAR` from the run whose error is wanted, errors grow along the two runs in
+# different ways. The larger tolerance is then multiplied by `_FARTHEST`, again if necessary.
 _LOOSE, _NEAR, _FARTHEST = 1e-4, 0.03, 1e-3
 # A state counts as lost if its error is above half a radian, or above half of the largest value in
-# the run: such errors no longer grow in proportion.
+# the run: an error so large no longer grows in proportion to the error before it.
 _LOST = 0.5
-# An array smaller than this does not matter. It is the ratio of the default `atol` to the default
+# The smallest size, in SI units, to which the error of an array is compared: an array whose values
+# are smaller need not be known to all digits. It is the ratio of the default `atol` to the default
 # `rtol`.
 _SMALL = 1e-3
-# One rounding is the relative rounding error of the dtype. Errors of steps and rounding errors grow
-# alike along most motions, so that round-off can be neglected if the errors of the steps are much
-# larger from the beginning. Beside an unstable rotation they do not: the errors of the steps vanish
-# there with the distance from the rotation, and the rounding errors stay. Round-off is therefore
-# measured by one neighbour only if the tolerance is above `_COARSE` roundings, and if the error of
-# the steps is above `_CLEAR` times two bounds of round-off: `_ABOVE` times the round-off of all
-# steps as it would be without growth, and `_ABOVE_ONE` times the round-off that this neighbour
-# shows. For a function given to `error_of`, whose steps are not known, the limit is `_PLAIN`
-# roundings.
+# One "rounding" is the relative rounding error of the dtype. Errors of steps and rounding errors
+# grow alike along most motions. If the errors of the steps are much larger from the beginning, one
+# neighbour is then enough to show that round-off can be neglected. Near an unstable rotation the
+# two kinds of errors do not grow alike: the nearer the motion is to the rotation, the smaller are
+# the errors of the steps, but the rounding errors stay as they are.
+#
+# Only one neighbour is therefore run if two conditions hold: the tolerance is above `_COARSE`
+# roundings; and the error of the steps is above `_CLEAR` times each of two bounds of round-off. The
+# first bound is `_ABOVE` times the round-off of all steps as it would be without growth. The second
+# bound is `_ABOVE_ONE` times `_DEVIATIONS` times the change that this neighbour shows.
+#
+# The steps of a function given to `error_of` are not known: there no neighbour is run at all if the
+# tolerance is above `_COARSE` roundings and the error of the steps is above `_PLAIN` roundings of
+# each result.
 _ABOVE, _ABOVE_ONE, _CLEAR, _PLAIN, _COARSE = 100.0, 10.0, 3.0, 1e6, 1e5
-# The search for a tolerance starts with a run at the tolerance `_FIRST`. Its second run has the
-# tolerance that most scenes need, times `_SECOND`: the errors of 800 scenes of `bench_error` were
-# about n²/100 times the tolerance within a factor of ten, where n is the number of steps of the
-# first run. From the second run on, the error is measured. Errors are proportional to the tolerance
-# only up to a factor of four, `_ALLOWED`, by which the estimate of the error is multiplied. The
-# search aims at the wanted accuracy divided by `_AIM`. An error above `_FORESEEN` (0.1 rad) is not
-# proportional to the tolerance, and neither is the error of a run of fewer than `_FEW` steps, or of
-# a run whose number of steps grew by less than `_GROWTH` times what the order of the method
-# implies.
+# The search for a tolerance starts with a run at the tolerance `_FIRST`. The second run of the
+# search has `_SECOND` times the tolerance that most motions need for the wanted accuracy: in 800
+# motions of `bench_error` the error was about n²/100 times the tolerance, within a factor of ten,
+# where n is the number of steps of the first run. From the second run on, the error is measured.
+# Errors are proportional to the tolerance only up to a factor of four, `_ALLOWED`, by which the
+# estimate of the error is multiplied. The search aims at the wanted accuracy divided by `_AIM`. In
+# three cases the error is not proportional to the tolerance: if it is above `_FORESEEN` (0.1 rad);
+# if the run has fewer than `_FEW` steps; and if the number of steps grew from the run before by
+# less than `_GROWTH` times the factor that the order of the method implies.
 _FIRST, _SECOND, _ALLOWED, _AIM = 1e-4, 20.0, 4.0, 2.0
 _FORESEEN, _FEW, _GROWTH = 0.1, 8, 0.9
 # The smallest tolerance, in roundings: `_FLOOR` in the search for a tolerance, and `_DEEPEST` for a
@@ -83,9 +92,9 @@ _FLOOR, _DEEPEST = 20.0, 4.0
 
 
 class Error(eqx.Module):
-    """Hold the distance of each part of a state from the exact motion: `Solution.error`.
+    """Hold the distance of each array of a state from the exact motion: `Solution.error`.
 
-    The exact motion is that of the given numbers of body, torque and start.
+    The exact motion is the solution without any error for the given body, torque and initial state.
 
     **Fields:**
 
@@ -95,12 +104,14 @@ class Error(eqx.Module):
       length of the difference (rad/s, m, m/s). This error is accurate to some percent; after
       `simulate(…, accuracy=…)` it is too large by a factor of about four.
     - `round_off`: the error of rounding, three standard deviations, in arrays by name as in
-      `steps`. It includes the effect of the last digits of body, torque and start (in closed form
-      also of the times). If this error is far below `steps`, only an upper bound is given.
-    - `sizes`: the scale of each name: 1 rad for a quaternion, else the largest value in the run.
+      `steps`. It includes the effect of the last digits of body, torque and initial state (in
+      closed form also of the times). If this error is far below `steps`, only an upper bound is
+      given.
+    - `sizes`: for each name the scale by which its error is divided to get a relative error: 1 rad
+      for a quaternion, else the largest length of the array in the run, but at least 1e-3.
 
-    `steps` and `round_off` are NaN at times that the run did not reach, and inf at times that a run
-    for comparison did not reach.
+    `steps` and `round_off` are NaN at times that the run did not reach. They are inf at times that
+    the run reached, but not the runs with which it is compared.
 
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
     >>> error = rj.simulate(body, start, [0.0, 1.0, 20.0]).error
@@ -125,7 +136,7 @@ class Error(eqx.Module):
     def total(self) -> dict[str, Float[Array, " times"]]:
         """Return the errors of steps and of round-off together, by the names of the arrays.
 
-        Each is an array (T,); it is infinite at times at which the state is `lost`.
+        Each error is an array (T,), which is infinite at times at which the state is `lost`.
         """
         both = jax.tree.map(jnp.hypot, self.steps, self.round_off)
         return jax.tree.map(lambda part: jnp.where(self.lost, jnp.inf, part), both)
@@ -135,8 +146,9 @@ class Error(eqx.Module):
         """Return the largest relative error of the state at each time (T,).
 
         The largest is taken over the arrays of the state (`q`, `omega`, …). For a quaternion the
-        error is an angle, rad; for other arrays it is divided by the largest value in the run. It
-        is infinite at times at which the state is `lost`.
+        relative error is an angle, rad; for another array it is the error divided by the largest
+        length of this array in the run. The result is infinite at times at which the state is
+        `lost`.
         """
         return jnp.where(self.lost, jnp.inf, self._largest_relative_error)
 
@@ -156,11 +168,11 @@ class Error(eqx.Module):
 
     @property
     def _largest_relative_error(self) -> Array:
-        """Return the largest error of a state at each time (T,), without a unit.
+        """Return the largest relative error of the state at each time (T,).
 
-        The largest is taken over the arrays of the state (`q`, `omega`, …), after the error of each
-        array is divided by its scale in `sizes`. In contrast to `relative`, errors above one half
-        are returned as they are, and not as infinity.
+        The relative error of each array of the state (`q`, `omega`, …) is its error divided by its
+        scale in `sizes`. In contrast to `relative`, errors above one half are returned as they are,
+        and not as infinity.
         """
         return _largest_relative_distance(
             jax.tree.map(jnp.hypot, self.steps, self.round_off), self.sizes
@@ -202,9 +214,10 @@ def estimate_error_of_run(
     - `ts`: (T,) s, the times of the states.
     - `ys`: the states at `ts` that the run gave, with a leading time axis.
     - `num_steps`: the number of steps of the run.
-    - `search`: `None`, or two runs of a search for a tolerance, both at larger tolerances: the
-      first run of the search, and the run before `ys`. The run before then serves instead of a
-      second run, and the error of the steps is too large by a factor of about four.
+    - `search`: `None`, or two runs of the search that found the tolerance of the given run: the
+      first run of the search, and the last run before the given one. Both have larger tolerances.
+      The error of the steps is then measured by the last run before the given one, not by a more
+      accurate run, and is too large by a factor of about four.
     """
     setup, ts, ys, num_steps, search = _without_derivatives((setup, ts, ys, num_steps, search))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
@@ -239,7 +252,7 @@ def _error_with_round_off(
     rtol: Array,
     search: tuple[TriedRun, TriedRun] | None,
 ) -> Error:
-    """Return the whole error of a run: the given error of its steps, and its round-off.
+    """Measure the round-off of a run, and return it together with the known error of its steps.
 
     The error of round-off is measured by neighbouring runs, whose body, torque and start differ
     from those of the run by about a unit in the last digit.
@@ -253,14 +266,15 @@ def _error_with_round_off(
       name (`q`, `omega`, …).
     - `rtol`: the relative tolerance of the run.
     - `search`: `None`, or two runs of the search that found the tolerance of the run: the first one
-      and the one before the last. They have larger tolerances, and one of them stands for the run
-      when its round-off is measured, so that no new run is needed for that.
+      and the one before the last. Both have larger tolerances, and take fewer steps. Round-off is
+      measured on one of them in place of the run, so that no run at a larger tolerance has to be
+      made.
     """
     sizes, start = _error_scales_by_name(ys), jax.tree.map(lambda leaf: leaf[0], ys)
     reached = jnp.isfinite(_largest_relative_distance(_distances_of_states(ys, ys), sizes))
-    # This is `_ABOVE` times the sum of the rounding errors of n = `num_steps` steps, about n^1.5
-    # roundings, in a motion without growth of errors: n^0.5 for the body rate, and once more n for
-    # the angle.
+    # `plain` is `_ABOVE` times the sum of the rounding errors of n = `num_steps` steps in a motion
+    # without growth of errors. The sum is about n^1.5 relative rounding errors: n^0.5 for the body
+    # rate, which is summed up over n steps for the angle.
     eps = float(jnp.finfo(ts.dtype).eps)
     plain = {name: _ABOVE * eps * num_steps.astype(ts.dtype) ** 1.5 * sizes[name] for name in sizes}
     coarse = rtol > _COARSE * eps
@@ -275,8 +289,8 @@ def _error_with_round_off(
 
     def neighbour(clear: Array, inputs: Any) -> tuple[Array, tuple[Array, dict[str, Array]]]:
         number, near, later = inputs
-        # If round-off is known to be small, all times of a neighbour are the start, so that it
-        # takes no step.
+        # If round-off is known to be small (`clear`), all times of a neighbour are set to the first
+        # time, so that its run takes no step.
         changes = changes_of_neighbour(near, jnp.where(clear, ts[0], ts * later))
         shown = _lengths_of_changes_by_name(start, _DEVIATIONS * _ABOVE_ONE * changes)
         bounds = {name: jnp.maximum(plain[name], shown[name]) for name in sizes}
@@ -288,11 +302,13 @@ def _error_with_round_off(
     near = jax.tree.map(
         lambda leaf: _copies_changed_in_last_digit(leaf, rng, jnp.abs(leaf)), numbers
     )
-    # The closed form rounds its angle only once, and neighbours may get the same rounded angle. The
-    # times of its neighbours are therefore changed, too.
+    # The closed form computes the angle of rotation without steps and rounds it only once, so that
+    # neighbours may get the same rounded angle. In closed form the times of the neighbours are
+    # therefore changed, too.
     later = jnp.asarray(1.0 + eps * free * np.array([1.0, -1.0, 1.0]), ts.dtype)
     inputs = jnp.arange(_NEIGHBOURS), near, later
-    # The neighbours are run one after another: all at once, in a batch, they would take as long.
+    # The neighbours are run one after another: a batch of them would take no less time, and the
+    # first neighbour may show that the others are not needed.
     clear, (changes, bounds) = lax.scan(neighbour, jnp.asarray(False), inputs)
     off = _lengths_of_changes_by_name(
         start, _DEVIATIONS * jnp.sqrt(_variance_over_neighbours(changes))
@@ -318,14 +334,18 @@ def _run_at_larger_tolerance(
 
     **Returns** three things: the set-up of the run at the larger tolerance, which takes fewer
     steps; its states; and a factor. The round-off of the given run is about the round-off of the
-    new run times the factor. If all round-off came from the steps, the factor would be √k, where k
-    is the quotient of the two numbers of steps, since the round-off of n steps adds up to about √n
-    times that of one step; if all came from the last digits of the inputs, the factor would be 1.
-    The returned factor, the fourth root of k, is between the two. Round-off from both sources grows
-    along the motion in the same way at any tolerance at which the states stay near `ys`.
+    new run times the factor.
 
-    No new run is made for a run in float32, which takes few steps anyway, or for a run in closed
-    form or without `ReplayAdjoint`: the given set-up and states are returned, with the factor 1.
+    The factor depends on k, the number of steps of the given run divided by that of the new run. If
+    all round-off came from the steps, the factor would be √k, since the round-off of n steps adds
+    up to about √n times that of one step. If all came from the last digits of the inputs, the
+    factor would be 1. The returned factor is the fourth root of k, which is between the two. Both
+    kinds of round-off grow along the motion in the same way at any tolerance at which the states
+    stay near `ys`.
+
+    If the given run is in float32, where it takes few steps anyway, no new run is made, and neither
+    for a run in closed form or without `ReplayAdjoint`. The given set-up and states are then
+    returned, with the factor 1.
 
     **Arguments:**
 
@@ -367,7 +387,7 @@ def _run_at_larger_tolerance(
 
 
 def _run_at_tolerance(setup: DiffraxRun, state0: PyTree, ts: Array, rtol: Array) -> TriedRun:
-    """Run a set-up at the relative tolerance `rtol`, and return the run with this tolerance.
+    """Run a set-up at the relative tolerance `rtol`, and return the run as a `TriedRun`.
 
     `setup` holds the body, the torque and the solver, `state0` is the state at the time `ts[0]`,
     and `ts` (T,), s, are the times at which states are saved.
@@ -379,9 +399,10 @@ def _run_at_tolerance(setup: DiffraxRun, state0: PyTree, ts: Array, rtol: Array)
 def _placeholder_run(setup: DiffraxRun, state0: PyTree, ts: Array, rtol: Array) -> TriedRun:
     """Return a `TriedRun` that stands for no run: no step was taken, and its states are NaN.
 
-    Its arrays have the shapes and dtypes of a run of `setup` (the body, the torque and the solver)
-    from the state `state0`, saved at the times `ts` (T,), s. A loop that tries runs at smaller and
-    smaller tolerances can therefore begin with it. `rtol` is stored as its relative tolerance.
+    A loop that tries runs at smaller and smaller tolerances begins with this `TriedRun`. Its arrays
+    therefore have the shapes and dtypes of a true run: a run of `setup` (the body, the torque and
+    the solver) from the state `state0`, saved at the times `ts` (T,), s. `rtol` is stored as its
+    relative tolerance.
     """
     run = eqx.filter_eval_shape(_run_at_tolerance, setup, state0, ts, rtol)
 
@@ -408,9 +429,9 @@ def _distances_of_states(others: PyTree, ys: PyTree) -> dict[str, Array]:
 def _lengths_of_changes_by_name(state: PyTree, changes: Array) -> dict[str, Array]:
     """Return the length of the change of each array of a state, by the name of the array.
 
-    `state` gives the names and the kinds of the arrays. `changes` (…, n) are the n numbers of each
-    change: all arrays of the state joined, where three numbers, a rotation vector, rad, stand for
-    the change of a quaternion. **Returns** a dict with an array (…,) for each name, such as `q` or
+    `state` gives the names and the kinds of the arrays. `changes` (…, n) has the n numbers of each
+    change, joined from the changes of all arrays; the change of a quaternion has three numbers, a
+    rotation vector in radians. **Returns** a dict with an array (…,) for each name, such as `q` or
     `omega`.
     """
     named = parts_by_name(state, changes).items()
@@ -427,11 +448,11 @@ def largest_length_in_run(array: Array) -> Array:
 
 
 def _error_scales_by_name(ys: PyTree) -> dict[str, Array]:
-    """Return the scale by which an error of each array of a state is divided.
+    """Return for each array of a state the scale by which its error is divided.
 
     `ys` are the states of a run, with a leading time axis. **Returns** a dict by the names of the
     arrays (`q`, `omega`, …): 1 rad for a quaternion, else the largest length of the array in the
-    run.
+    run, but at least 1e-3.
     """
     sizes = {}
     for name, leaf in zip(leaf_names(ys), jax.tree.leaves(ys), strict=True):
@@ -457,16 +478,18 @@ def solve_to_accuracy(
 ) -> tuple[DiffraxRun, PyTree, tuple[TriedRun, TriedRun]]:
     """Solve a run at a tolerance at which its global error is below `accuracy`, if there is one.
 
-    Runs are tried at smaller and smaller tolerances. The error of each run is estimated by its
-    distance from the run before, and scaled in proportion to the tolerance.
+    Runs are tried at smaller and smaller tolerances. The distance of each run from the run before
+    is about the error of the run before. The error of the new run is estimated from it, in
+    proportion to the two tolerances. If even the smallest tolerance is not enough, its run is
+    returned.
 
     **Arguments:**
 
     - `setup`: the body, the torque and the solver of the run; its tolerances are not used.
     - `state0`: the state at the time `ts[0]`.
     - `ts`: (T,) s, the times at which states are saved.
-    - `accuracy`: the wanted error, rad for rotations, else relative to the largest value in the
-      run.
+    - `accuracy`: the largest allowed error: for a rotation an angle, rad, else a relative error,
+      the length of the error divided by the largest length in the run.
 
     **Returns** three things: the set-up at the tolerance found; the results of `solve` for this
     set-up; and two of the runs that were tried, the first one and the one before the last.
@@ -479,8 +502,8 @@ def solve_to_accuracy(
 
     def closer(carry: Any) -> Any:
         number, first, _, before, rtol, ended = carry
-        # In a batch, a body whose search has ended is run with all times equal to the start, and
-        # takes no step.
+        # In a batch, the loop goes on until the searches of all bodies have ended. A body whose
+        # search has ended is run with all times equal to the first time, and takes no step.
         new = _run_at_tolerance(cut, still[1], jnp.where(ended, ts[0], ts), rtol)
         is_first = number == 0
         count, counted = new.accepted_steps.astype(ts.dtype), before.accepted_steps.astype(ts.dtype)
@@ -492,8 +515,9 @@ def solve_to_accuracy(
         foreseen = off < _FORESEEN
         off = _ALLOWED * off * rtol / before.rtol
         # In two cases the error of a run does not predict the error of the next run: if the error
-        # is so large that the run is lost; and if the steps are not limited by the tolerance, as in
-        # a run so short that it ends before the steps have grown to their full length.
+        # is so large that it is not proportional to the tolerance; and if the tolerance does not
+        # set the lengths of the steps, as in a run that ends before the steps have grown to their
+        # full length.
         more = (before.rtol / rtol) ** (1 / setup.solver.tableau.order)
         sound = foreseen & (count >= _FEW) & (count >= _GROWTH * more * counted)
         wanted = jnp.where(
@@ -543,8 +567,8 @@ def _with_tolerance(setup: DiffraxRun, rtol: Array) -> DiffraxRun:
     """Return the set-up of a run with another relative tolerance `rtol`.
 
     `setup` holds the body, the torque, the solver and the tolerances. The absolute tolerance
-    becomes 1e-3 times `rtol`. A run of the new set-up raises no error if it fails: its
-    states are NaN from there on.
+    becomes 1e-3 times `rtol`. If a run of the new set-up fails, it raises no error: its states are
+    NaN at the times that it did not reach.
     """
     return dataclasses.replace(setup, rtol=rtol, atol=_SMALL * rtol, throw=False)
 
@@ -552,24 +576,26 @@ def _with_tolerance(setup: DiffraxRun, rtol: Array) -> DiffraxRun:
 def _times_of_sudden_torque(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: PyTree) -> Array:
     """Return times at which the torque changes suddenly, so that a run may miss a short pulse.
 
-    A run does not notice a pulse that is shorter than a step and that no stage of a step hits. The
-    time of the run is therefore divided into 32 equal parts, and in each part the torque is
-    sampled at 512 times, with the state held fixed at a saved state of the part. A sample is sudden
-    if its distance from the chord between its two neighbours is far greater than such distances
-    elsewhere in the part.
+    A run evaluates the torque only at the stages of its steps, and does not notice a short pulse
+    between two stages. The time of the run is therefore divided into 32 equal parts, and in each
+    part the torque is sampled at 512 times. For all samples of a part the state is the last saved
+    state before the middle of the part. A sample is sudden if its distance from the chord between
+    its two neighbours is far greater than the distances of most other samples of the part.
 
     **Arguments:**
 
     - `setup`: the body, the torque and the solver of the run.
-    - `ts`, `ys`: the saved times, s, and the states at these times, with a leading time axis. The
-      states may be fewer: then the last of them stands for all later times.
+    - `ts`, `ys`: the saved times, s, and the states at these times, with a leading time axis. If
+      there are fewer states than times, the last state stands for all later times.
 
-    **Returns** (32,) s: for each part the time of its most sudden sample, or the start of the run
-    if no sample is sudden. The array has no times if the torque depends on the time only by
-    constant pieces (`Held`, `Pulses`), or not at all: steps end at the jumps of such pieces.
+    **Returns** an array (32,): for each part the time, s, of its most sudden sample, or the first
+    of `ts` if no sample is sudden. The array has no times if the torque does not depend on the
+    time, or is constant between its jumps (`Held`, `Pulses`): steps end at these jumps, so that no
+    pulse is missed.
     """
     state0 = jax.tree.map(lambda leaf: leaf[0], ys)
-    # Steps end at each jump of a law of constant pieces, so that nothing is missed between them.
+    # Steps end at each jump of a law that is constant between its jumps, so that no pulse of such a
+    # law is missed. These laws are therefore held fixed here, at their values at the first time.
     field = equations_of_motion(setup.body, state0, setup.torque)
     field = hold_piecewise_constant_laws_at(field, ts[0])
     traced = jax.make_jaxpr(lambda t: field(t, state0, None))(ts[0]).jaxpr
@@ -578,8 +604,8 @@ def _times_of_sudden_torque(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Py
     # The samples are at uneven times: on an even grid, pulses that come once a second could all
     # fall between the samples.
     uneven = np.random.default_rng(1).uniform(-0.25, 0.25, (_PARTS, _SAMPLES_OF_PART + 2))
-    # The first and the last sample of a part serve only as neighbours of other samples. Two
-    # adjacent parts therefore have two times in common.
+    # The first and the last sample of a part serve only as neighbours of other samples. The last
+    # two times of a part are therefore also the first two times of the next part.
     uneven[1:, :2] = uneven[:-1, -2:]
     number = _SAMPLES_OF_PART * np.arange(_PARTS)[:, None] + np.arange(_SAMPLES_OF_PART + 2) - 0.5
     share = np.clip((number + uneven) / (_PARTS * _SAMPLES_OF_PART), 0.0, 1.0)
@@ -616,9 +642,10 @@ def _more_accurate_setup(
     - `sudden_times`: (m,) s, times at which steps of the more accurate run are to end, such as the
       times at which the torque changes suddenly. Under fixed steps they are not used.
 
-    **Returns** three things: the set-up of the more accurate run; the relative tolerance of the
-    given run, 0 under fixed steps; and a factor, 1, or 4/3 under fixed steps, which are halved. The
-    error of the given run is its distance to the more accurate run times the factor.
+    **Returns** three things: the set-up of the more accurate run, whose steps are half as long if
+    the given run has fixed steps; the relative tolerance of the given run, 0 under fixed steps; and
+    a factor, 4/3 under fixed steps, else 1. The error of the given run is its distance to the more
+    accurate run times the factor.
     """
     eps = float(jnp.finfo(ts.dtype).eps)
     most = None if setup.max_steps is None else 4 * setup.max_steps
@@ -646,9 +673,9 @@ def _more_accurate_setup(
             "error: a second run needs a diffrax.PIDController or ConstantStepSize, got "
             f"{type(setup.controller).__name__}"
         )
-    # With half of the step the error of a method of order 2 is a quarter, so that its error is 4/3
-    # of the distance. For a method of higher order the factor 4/3 makes the error too large by at
-    # most a third.
+    # In a method of order 2 the run with half of the step has a quarter of the error of the given
+    # run. The distance between the two runs is then 3/4 of the error of the given run. For a method
+    # of higher order the factor 4/3 makes the error too large, by at most a third.
     return dataclasses.replace(setup, dt0=0.5 * setup.dt0), jnp.zeros(()), 4 / 3
 
 
@@ -678,9 +705,10 @@ class FunctionError(eqx.Module):
 
     @property
     def known(self) -> Bool[Array, ""]:
-        """Return whether the length of the derivative's error is below half of the derivative's.
+        """Return whether the derivative is known: its error is below half of the derivative itself.
 
-        If it is not, as in chaos, the derivative means nothing, even if it is finite.
+        The lengths of the two are compared, each taken over all numbers. If the derivative is not
+        known, as in chaos, it means nothing, even if it is finite.
         """
         size = jnp.linalg.norm(ravel_pytree(self.derivative)[0])
         return jnp.linalg.norm(ravel_pytree(self.derivative_error)[0]) < _LOST * size
@@ -705,18 +733,20 @@ def error_of(
     - `rtol`, `atol`: the tolerances of the value and derivative that are returned; by default those
       of `simulate`.
 
-    A second run has a fiftieth of these tolerances. If its distance to the first is not far above
-    round-off (in a `vmap` always), three more runs have the last digits of `x` changed; an array of
-    zeros alone is changed by the last digits of 1. See `Solution.error`. Each call compiles anew:
-    put it into a `jax.jit` of your own to call it often.
+    The error of the steps is the distance to a second run, which has a fiftieth of these
+    tolerances. If this distance is not far above round-off, and always in a `vmap`, the error of
+    round-off is measured by three more runs, in which the last digits of `x` are changed. (If all
+    numbers of an array are zero, they are changed by the last digit of 1.) See `Solution.error`.
+    Each call compiles again: to call `error_of` often, put the call into a `jax.jit` of your own.
 
-    Two more values are computed on both sides of `x` in a random direction, 5e-7 of each number
-    away (5e-4 in float32). If their difference and the derivative disagree by more than the
-    uncertainty of the values, this is an error of the derivative, and a `UserWarning` says so. The
-    derivative then misses the effect of a torque that switches by time or state (`jnp.where`,
-    `jnp.sign`), or of a `stop_gradient`. If `f` refuses the numbers on one side of `x` (a flat
-    body), only the other side is used; if it refuses both sides, neither is used. Under `jit`, `f`
-    has to accept both. A pulse that all runs pass over is not noticed here: see `Solution.error`.
+    Two more values are computed, one on each side of `x` in a random direction, at most 5e-7 of
+    each number away (5e-4 in float32). If their difference and the derivative disagree by more than
+    the uncertainty of the values, this is an error of the derivative, and a `UserWarning` says so.
+    The derivative then misses the effect of a torque that switches by time or state (`jnp.where`,
+    `jnp.sign`), or of a `stop_gradient`. If `f` refuses the numbers on one side of `x`, as it may
+    for a flat body, only the value on the other side is used; if it refuses both sides, neither is
+    used. Under `jit`, `f` has to accept both. A pulse that all runs pass over is not noticed here:
+    see `Solution.error`.
 
     **Returns** a `FunctionError`.
 
@@ -812,15 +842,16 @@ def _copies_changed_in_last_digit(leaf: Array, rng: np.random.Generator, size: A
 
     - `leaf`: (…) the array.
     - `rng`: the generator of the random changes.
-    - `size`: (…) the positive number whose last digit is meant, for each number of `leaf`.
+    - `size`: (…) the size of each number of `leaf`, not negative; the last digit of the size is the
+      digit that is changed.
 
     **Returns** an array (3, …): the copies along a new first axis.
     """
     shape = (_NEIGHBOURS + 1) // 2, *leaf.shape
-    # The change is at least half a unit, because a smaller change would often be rounded away.
-    # Numbers are changed up in one copy and down in another: as a function of the last digits, the
-    # result of a long motion is piecewise constant, and a change to one side may stay on the same
-    # piece.
+    # The change is at least half a unit, because a smaller change would often be rounded away. As a
+    # function of the last digits of its inputs, the result of a long motion is constant over short
+    # pieces. A change to one side may stay on the same piece and show nothing. Numbers are
+    # therefore changed up in one copy and down in another.
     noise = rng.uniform(0.5, 1.0, shape) * rng.choice([-1.0, 1.0], shape)
     noise = np.concatenate([noise, -noise])[:_NEIGHBOURS]
     if leaf.ndim > 1 and leaf.shape[-1] == leaf.shape[-2]:

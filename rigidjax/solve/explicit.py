@@ -21,9 +21,9 @@ from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
 class NestedInterpolation(dfx.AbstractLocalInterpolation):
     """Interpolate the state within a step (dense output) by a polynomial.
 
-    The polynomial is that of `runge_kutta.change_within_step`.
-
-    `coefficients` are the rows F0, F1, … of the polynomial. A quaternion is scaled to length 1.
+    `coefficients` are the coefficients F0, F1, … of the polynomial, each a row of the shape of the
+    state; `runge_kutta.change_within_step` gives the formula. The quaternion of the interpolated
+    state is scaled to length 1.
     """
 
     t0: Any
@@ -117,8 +117,9 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
         # The quaternion is scaled to length 1 once, after the stages: inside the stages this would
         # change the order of the method (jaxsim#192).
         y1 = project_to_group(tree(there.end))
-        # Derivatives hold the lengths of steps constant. The derivative through the lengths is left
-        # out; it is as small as the error of a step, which is below the tolerance.
+        # Derivatives hold the lengths of steps constant, so that the error, from which the lengths
+        # are chosen, needs no derivative. What this leaves out is as small as the error of a step,
+        # which is below the tolerance.
         sizes = [leaf.size for leaf in jax.tree.leaves(y0)]
         error = lax.stop_gradient(error_estimate(self.tableau, sizes, h, there.slopes))
         rows = dense_rows(self.tableau, field, step, there.slopes)

@@ -19,8 +19,9 @@ from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.explicit import AbstractExplicit, require_explicit
 
-# The growth rates in neighbouring intervals are not independent. The error of an exponent is
-# therefore computed from the means over this many parts of the run.
+# The growth rates in neighbouring intervals are not independent, so that their scatter does not
+# give the error of an exponent. The error is computed from the means over this many long parts of
+# the run instead.
 _PARTS = 20
 
 
@@ -30,8 +31,10 @@ class Exponents(eqx.Module):
     **Fields:**
 
     - `values`: (k,) 1/s, the exponents, the largest first.
-    - `errors`: (k,) 1/s, one standard deviation of each exponent, from the differences between the
-      means over twenty parts of the run, plus the sum of the tolerances of all steps.
+    - `errors`: (k,) 1/s, the error of each exponent, one standard deviation. It combines, as the
+      root of the sum of squares: the scatter of the means over twenty parts of the run; the effect
+      of the intervals that belong to none of these parts; and the sum of the tolerances of all
+      steps, divided by the time.
     - `times`: (N,) s, the ends of the intervals after the transient.
     - `running`: (N, k) 1/s, the exponents of the run up to each of these times.
     - `state`: the state at the end of the run.
@@ -66,9 +69,10 @@ def lyapunov_exponents(
 ) -> Exponents:
     """Return the spectrum of Lyapunov exponents along a motion, the largest exponent first.
 
-    An orthonormal frame of tangent vectors is solved along with the motion (continuous QR), and the
-    exponents are the mean rates at which the vectors grow. Tangent vectors of an attitude are small
-    turns in body axes.
+    Tangent vectors are small changes of the state; those of an attitude are small turns in body
+    axes. An orthonormal frame of tangent vectors is solved along with the motion (continuous QR).
+    The exponents are the mean rates at which these vectors would grow if they were not kept at
+    length 1.
 
     **Arguments:**
 
@@ -78,9 +82,9 @@ def lyapunov_exponents(
     - `state0`: the state at `t0`.
     - `time`: the length of the run, s.
     - `number`: k, the number of exponents; `None` computes all, which are 6 for an `Attitude`.
-    - `intervals`: the number of intervals of the run; after each, the frame is made orthonormal to
-      round-off.
-    - `transient`: the number of intervals at the beginning that are not counted.
+    - `intervals`: the number of equal intervals into which the run is divided. At the end of each
+      interval the frame is made orthonormal to round-off.
+    - `transient`: the number of intervals at the beginning whose growth is not counted.
     - `t0`: the start of the run, s.
     - `solver`, `rtol`, `atol`: as for `simulate`.
     - `max_steps`: the largest number of steps in one interval.
@@ -181,8 +185,8 @@ def _exponents_of_run(
             both = (field(t, near, args), slope)
             return jax.jvp(minus_small, (near, y.motion), both)[1]
 
-        # The frame is held orthonormal to second order: the equations of a frame that is not
-        # orthonormal are unstable.
+        # Small errors make the frame lose its orthonormality, and the equations of a frame that is
+        # not orthonormal are unstable. This formula restores it, up to the square of the errors.
         frame = 1.5 * frame - 0.5 * _product_of_small_matrices(
             frame, _product_of_small_matrices(frame.T, frame)
         )
@@ -197,9 +201,10 @@ def _exponents_of_run(
     def interval(carry: Any, i: Array) -> Any:
         state, frame = carry
         ts = t0 + jnp.stack([i, i + 1]).astype(t0.dtype) * step
-        # The logarithm of the growth starts at 1, not at 0, because a relative tolerance of a
-        # number near 0 would ask for too many digits. A relative error of `rtol` of the logarithm
-        # is then about the same relative error of the growth.
+        # The logarithm of the growth in an interval starts at 1, and 1 is subtracted at the end of
+        # the interval. Near 0 a relative tolerance would ask for too many digits of the logarithm.
+        # Near 1 it allows the error `rtol` of the logarithm, which is a relative error `rtol` of
+        # the growth.
         start = Coupled(state, (frame, jnp.ones(many, t0.dtype)))
         run = adaptive(solver, along, ts, start, rtol=rtol, atol=atol, max_steps=max_steps)
         there = jax.tree.map(lambda leaf: leaf[-1], run.ys)
@@ -207,8 +212,9 @@ def _exponents_of_run(
         off = run.num_steps.astype(t0.dtype) * (rtol * (1 + jnp.abs(logs - 1)) + atol)
         return (there.motion, jnp.linalg.qr(frame)[0]), (logs - 1, off, run.result)
 
-    # The first directions are random: along the axes they could lie in a part of the state space
-    # that no tangent vector leaves.
+    # The tangent vectors at the start have random directions. Along the axes of the state they
+    # could lie in a subspace that no tangent vector leaves, and would not show the growth outside
+    # of it.
     shape = (dimension(state0), many)
     frame = jnp.linalg.qr(jax.random.normal(jax.random.key(0), shape, t0.dtype))[0]
     numbers = jnp.arange(intervals, dtype=jnp.int32)
@@ -221,8 +227,8 @@ def _exponents_of_run(
     whole = count // _PARTS * _PARTS
     means = jnp.mean(rates[count - whole :].reshape(_PARTS, -1, many), axis=1)
     apart = jnp.var(means, axis=0, ddof=1) / _PARTS
-    # The twenty equal parts leave out up to 19 intervals at the start. The amount by which these
-    # intervals change the mean is added to the error in full.
+    # Twenty equal parts leave out up to 19 intervals, the first after the transient. The amount by
+    # which these intervals change the mean is one of the errors whose squares are added.
     left = running[-1] - jnp.mean(means, axis=0)
     errors = jnp.sqrt(apart + left**2 + (jnp.mean(off[transient:], axis=0) / step) ** 2)
     first = jnp.argmax(jax.vmap(lambda result: result != dfx.RESULTS.successful)(results))

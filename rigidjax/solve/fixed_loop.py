@@ -39,12 +39,14 @@ def fixed(
     - `field`: a vector field `f(t, y, args)`, such as `equations_of_motion` returns.
     - `ts`: (T,) s, the times of the states.
     - `y0`: the state at `ts[0]`.
-    - `substeps`: a whole number, the number of steps. It may be traced: another number then does
-      not compile again, but reverse mode does not work.
-    - `last`: the index in `ts` at which to stop; the states at later times are set to `y0`. The
-      index may be traced; reverse mode does not work with it. `None` goes to the end.
+    - `substeps`: the number of steps between two times of `ts`, a whole number. If the number is
+      traced, JAX does not compile again for another number, but reverse mode does not work.
+    - `last`: the index in `ts` of the time at which the run ends; the states at later times are set
+      to `y0`. The index may be traced. Reverse mode works only with `None`, which means that the
+      run ends at the last time.
 
-    **Returns** the states at `ts`, with a leading time axis, differentiable in both modes.
+    **Returns** the states at `ts`, with a leading time axis. They are differentiable in forward
+    mode, and in reverse mode if `substeps` is a Python integer and `last` is `None`.
 
     **Raises:** `TypeError` for another solver, and the errors of the solver itself.
 
@@ -113,10 +115,10 @@ def take_equal_step(
     - `stepper`: an object that takes a step of one body.
     - `h`: the length of each step, s.
     - `t0`: the time at which step number 0 begins, s.
-    - `i`: the number of the step.
-    - `y`: the numbers that stand for the state before the step, as the stepper carries them.
+    - `i`: the number of the step, from 0.
+    - `y`: the numbers that stand for the state before the step, in the form of `stepper`.
     - `inputs`: `None`, or an array for each named input of the torque, with one row for each step.
-    - `first_row`: the step uses row `first_row + i` of each array of `inputs`.
+    - `first_row`: the row of `inputs` for step number 0; step `i` uses row `first_row + i`.
     """
 
     def at(i: Array) -> Array:
@@ -127,17 +129,17 @@ def take_equal_step(
     now = jax.tree.map(lambda a: _row_or_nearest_row(a, first_row + i), inputs)
     if not stepper.delays:
         return stepper.step(at(i), at(i + 1), h, y, now)
-    # A delayed input changes inside the step. The step is therefore taken in parts: one up to the
-    # change of each delayed input, and one to the end.
+    # A delayed input changes within the step. The step is therefore divided at these changes, and
+    # its parts are taken one after another, so that all inputs are constant within each part.
     parts, early, late = changes_of_delayed_inputs(stepper.delays, h, i, inputs, first_row)
     edges = jnp.concatenate([jnp.zeros(1, h.dtype), jnp.sort(parts), jnp.ones(1, h.dtype)])
 
     def part(y: Any, ends: tuple[Array, Array]) -> tuple[Any, None]:
         left, right = ends
-        # The value of an input in a part depends on whether the end of the part lies after the
-        # change. If a delay is a whole number of steps, the part before the change has the length
-        # 0, but it still gets the value before the change: this value enters the derivative with
-        # respect to the delay.
+        # An input has its new value in a part that ends after the change of this input, and its old
+        # value in any other part. If a delay is a whole number of steps, the part before the change
+        # has the length 0, but it still gets the old value, because the derivative with respect to
+        # the delay contains this value.
         values = [jnp.where(right <= p, a, b) for p, a, b in zip(parts, early, late, strict=True)]
         t, end = at(i) + left * h, jnp.where(right == 1, at(i + 1), at(i) + right * h)
         return stepper.step(t, end, (right - left) * h, y, InputRow(now, tuple(values))), None
@@ -148,7 +150,7 @@ def take_equal_step(
 def changes_of_delayed_inputs(
     delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: PyTree, first_row: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Return where within a step each delayed input changes, and its values before and after that.
+    """Return where in a step each delayed input changes, and its values before and after this.
 
     An input of a torque is constant during each step; if it is delayed, it changes within a step.
 
@@ -212,8 +214,9 @@ def march_steps(
     - `stepper`: an object that takes a step of one body.
     - `h`: the length of each step, s.
     - `t0`: the time at which step number 0 begins, s.
-    - `first`, `count`: the number of the first step that is taken, and how many steps are taken.
-    - `y`: the numbers that stand for the state at the start, as the stepper carries them.
+    - `first`: the number of the first step that is taken; it begins at `t0` + `first` · `h`.
+    - `count`: how many steps are taken.
+    - `y`: the numbers that stand for the state before the first step, in the form of `stepper`.
     - `inputs`: `None`, or an array for each named input of the torque, with one row for each step.
 
     In reverse mode the run is divided into about √count pieces. The states at the starts of all
