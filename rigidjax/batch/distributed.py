@@ -74,18 +74,24 @@ def share(tree: PyTree) -> PyTree:
         )
     count = counts.pop()
     if count < processes:
-        raise ValueError(f"share: {count} bodies for {processes} processes; start fewer processes")
+        raise ValueError(
+            f"share: wanted at least one body for each of {processes} processes, got {count} bodies; "
+            "start fewer processes"
+        )
     edges = [count * i // processes for i in range(processes + 1)]
     return jax.tree.map(lambda leaf: leaf[edges[process] : edges[process + 1]], tree)
 
 
 def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyTree:
-    """Return, on every process, the joined rows of all processes, in the order of the processes.
+    """Send the rows of each process to all processes, and return the rows of all processes joined.
+
+    The rows are in the order of the processes. Every process has to call this function.
 
     **Arguments:**
 
     - `tree`: arrays with the rows of this process, as `share` returns them.
-    - `checkpoint`: a folder to which `save` first writes the rows of this process, or `None`.
+    - `checkpoint`: a folder to which `save` writes the rows of this process before they are sent,
+      or `None`.
 
     **Returns** the tree with the rows of all processes, in host memory.
 
@@ -118,7 +124,8 @@ def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyT
     **Arguments:**
 
     - `tree`: arrays, which have the same shapes on every process.
-    - `checkpoint`: a folder to which `save` first writes the arrays of this process, or `None`.
+    - `checkpoint`: a folder to which `save` writes the arrays of this process before they are sent,
+      or `None`.
 
     **Raises:** `TypeError` for traced arrays; `RuntimeError` if another process has ended.
 

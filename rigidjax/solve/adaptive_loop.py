@@ -35,10 +35,10 @@ SEGMENT = 512
 # The number of additional rows for a segment that is run again for derivatives: if the program for
 # derivatives rounds differently from the program of the run, the segment may take a few more steps.
 _MORE = 64
-# XLA on CPU makes one kernel of a loop whose state is smaller than a kilobyte. Steps are therefore
-# written into a block of at most `_BLOCK` bytes and `_MOST` rows, and full blocks into the record.
-# (When each row was written into the record directly, second derivatives were wrong for several
-# blocks of bodies whose segments were run again, on jaxlib 0.12.0.1.)
+# XLA on CPU makes one kernel of a loop whose state is smaller than a kilobyte. The rows of steps
+# are therefore collected in a block of at most `_BLOCK` bytes and `_MOST` rows, and each full block
+# is copied to the record. (When each row was written directly to the record, second derivatives
+# were wrong on jaxlib 0.12.0.1, if several blocks of bodies had segments that were run again.)
 _BLOCK, _MOST = 560, 8
 # The next step has the length that the error estimate suggests, times the safety factor `_SAFETY`.
 # The ratio of this length to the length of the last step is limited to `_SMALLEST` … `_LARGEST`.
@@ -68,7 +68,7 @@ class Method(NamedTuple):
 class Run(NamedTuple):
     """Hold the arrays of a run, each with a last axis of bodies if there are several bodies."""
 
-    t0: Array  # the start of the run
+    t0: Array  # the time at which the run begins
     stops: Array  # (J,) the times at which the field jumps, then the end of the run
     between: Array  # (K,) the times whose states are saved
     y0: Array  # (n,) the state at t0
@@ -166,7 +166,7 @@ def _group_by_dtype(tree: PyTree) -> dict[np.dtype, Arrays]:
 
 
 class Record(NamedTuple):
-    """Hold a recorded run: the start of each of its segments, and the steps of the last segment.
+    """Hold a recorded run: its state at the start of each segment, and its last segment's steps.
 
     A segment is a part of the run of about `SEGMENT` steps.
     """
@@ -200,12 +200,12 @@ def start_length_and_end_of_steps(run: Run, rows: Rows) -> tuple[Array, Array, A
     """Return the start, length and end of recorded steps, s, with their derivatives.
 
     Stops are the times at which steps have to end, because the field jumps there. The derivatives
-    are those with respect to the stops and to `run.t0`, the start of the run. The start of a step
-    moves with the last stop before it, or with `run.t0` if there is no such stop. The end of a step
-    that ends at a stop moves with this stop. Any other step keeps its length, and its end moves
-    with its start.
+    are those with respect to the stops and to `run.t0`, the time at which the run begins. The start
+    of a step moves with the last stop before it, or with `run.t0` if there is no such stop. The end
+    of a step that ends at a stop moves with this stop. Any other step keeps its length, and its end
+    moves with its start.
 
-    - `run`: holds the start `t0` and the stops.
+    - `run`: holds the time `t0` at which the run begins, and the stops.
     - `rows`: (4 + n, …) the recorded steps: in each row the start time, the length, the kind of the
       step, the index of the next stop, and the n numbers of the state at the start.
     """
@@ -317,7 +317,7 @@ def map_over_bodies(run: Run, function: Callable[..., Any]) -> Callable[..., Any
 def initial_loop_state(run: Run) -> LoopState:
     """Return the state of the loop over steps before the first step of `run`."""
     zero = jnp.zeros(run.t0.shape, jnp.int32)
-    # A stop at the start or before it needs no step.
+    # A stop that is not after the start of the run needs no step.
     passed = jnp.sum(run.stops[:-1] <= run.t0[None], 0, dtype=jnp.int32)
     still = lax.stop_gradient((run.t0, run.end))
     result = run.result
@@ -329,12 +329,13 @@ def initial_loop_state(run: Run) -> LoopState:
 def is_running(method: Method, run: Run, loop: LoopState, until: Array | None) -> Array:
     """Return for each body whether its run still has a step to take.
 
-    A run goes on to the last of the `run.stops`, unless it fails or `method.max_steps` are taken.
+    A run goes on to the last of the `run.stops`, unless it fails or has taken the largest number of
+    steps, `method.max_steps`.
 
     - `method`: holds the largest number of steps.
     - `run`: holds the stops, the times at which steps end; the last stop is the end of the run.
     - `loop`: the state of the loop over steps.
-    - `until`: a time, s, at which the loop ends earlier, if a part of the run is repeated; or
+    - `until`: if only a part of the run is repeated, the time, s, at which this part ends; else
       `None`.
     """
     well = map_over_bodies(run, lambda result: result == dfx.RESULTS.successful)(loop.result)
@@ -348,7 +349,7 @@ def loop_state_at_end(method: Method, constants: Arrays, run: Run) -> LoopState:
 
     - `method`: the explicit method, the field and the limits.
     - `constants`: the arrays on which the field depends.
-    - `run`: the start of the run, and the times at which steps end.
+    - `run`: the time and state at the start of the run, and the times at which steps end.
     """
     return lax.while_loop(
         lambda loop: jnp.any(is_running(method, run, loop, None)),
@@ -362,7 +363,7 @@ def run_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Array, Lo
 
     - `method`: the explicit method, the field and the limits.
     - `constants`: the arrays on which the field depends.
-    - `run`: the start of the run, the times at which steps end, and the K saved times
+    - `run`: the time and state at the start, the times at which steps end, and the K saved times
       `run.between`.
 
     **Returns** two things: the states (K, n), NaN at a time that the run did not reach; and the
@@ -401,7 +402,7 @@ def _array_for_saved_states(run: Run) -> Array:
     batch, or no axis for one body. All values are NaN, except for a body whose run ends where it
     starts: this run has no step, so that its values are the state at the start.
 
-    - `run`: holds the start, the end, and the saved times `run.between`.
+    - `run`: holds the times at which the run begins and ends, and the saved times `run.between`.
     """
     ended = run.stops[-1] <= run.t0
     still = jnp.where(add_leading_axes(ended, run.y0), run.y0, jnp.nan)
@@ -413,7 +414,7 @@ def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, Loop
 
     - `method`: the explicit method, the field and the limits.
     - `constants`: the arrays on which the field depends.
-    - `run`: the start of the run, the times at which steps end, and the K saved times
+    - `run`: the time and state at the start, the times at which steps end, and the K saved times
       `run.between`.
 
     **Returns** three things: the states (K, n, *bodies) at the saved times, NaN at a time that the
@@ -454,7 +455,7 @@ def _attempt_step(
 
     - `method`: the explicit method, the field, the step controller and the limits.
     - `constants`: the arrays on which the field depends.
-    - `run`: the start of the run, and the times at which steps end (stops).
+    - `run`: the time and state at the start of the run, and the times at which steps end (stops).
     - `loop`: the loop state before the step.
     - `until`: if recorded steps are repeated for derivatives, the time in seconds at which the
       repeated part of the run ends; else `None`. Only repeated steps have derivatives with respect
@@ -548,11 +549,11 @@ def record_segment(
     """Take the steps of one segment (a part of a run), and return them as rows.
 
     A segment that is recorded for the first time ends when the array of rows is full or the run
-    ends. For derivatives a segment is run again, up to the time at which it ended.
+    ends. For derivatives the segment is run again, up to the time at which it ended the first time.
 
     - `method`: the explicit method, the field and the limits.
     - `constants`: the arrays on which the field depends.
-    - `run`: the start of the run, and the times at which steps end.
+    - `run`: the time and state at the start of the run, and the times at which steps end.
     - `loop`: the loop state at the start of the segment.
     - `rows`: the array into which one row is written for each attempted step.
     - `until`: `None` for the first time; else the time at which the segment ends, s.
@@ -658,7 +659,7 @@ def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
 
     - `method`: holds the weights of the method, and scales a quaternion to length 1.
     - `t`: the time, in seconds.
-    - `step`: the start, the length and the first state of the step.
+    - `step`: the start time and the length of the step, and the state at its start.
     - `slopes`: (n, s, *bodies) the values of the field at all s stages of the step, those of dense
       output included; n is the number of numbers of the state.
     """

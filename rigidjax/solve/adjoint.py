@@ -40,11 +40,11 @@ from rigidjax.solve.runge_kutta import Step, stages
 class Smooth(NamedTuple):
     """Hold the arrays of a `Run` that have derivatives, or their tangents or cotangents.
 
-    The arrays are the start of the run, the stops (times at which steps end), the saved times, and
-    the state at the start, with the shapes that they have in `Run`.
+    The arrays are the time at which the run begins, the stops (times at which steps end), the saved
+    times, and the state at the start, with the shapes that they have in `Run`.
     """
 
-    t0: Array  # the start of the run
+    t0: Array  # the time at which the run begins
     stops: Array  # (J,) the times at which the field jumps, then the end of the run
     between: Array  # (K,) the times whose states are saved
     y0: Array  # (n,) the state at t0
@@ -126,7 +126,7 @@ def replay_steps(
 
     - `method`: the explicit method and the field.
     - `constants`: the arrays on which the field depends.
-    - `run`: the start of the run, the stops, and the K saved times `run.between`.
+    - `run`: the time and state at the start, the stops, and the K saved times `run.between`.
     - `record`: the recorded steps, in segments, which are parts of the run.
 
     **Returns** four things: the states (K, n, *bodies) at the saved times; the state (n, *bodies)
@@ -178,8 +178,8 @@ def cotangents_of_run(
 
     - `method`: the explicit method and the field.
     - `constants`: the arrays on which the field depends.
-    - `run`: the start of the run, the stops (times at which the field jumps), and the saved times
-      `run.between`.
+    - `run`: the time and state at the start of the run, the stops (times at which the field jumps),
+      and the saved times `run.between`.
     - `record`: the recorded steps, in segments, which are parts of the run.
     - `state_cotangents`: a list of two arrays: the cotangents of the states at the saved times, and
       the cotangent of the state at the end of the run.
@@ -260,7 +260,7 @@ def _segment_of_record(
 
     - `method`: the explicit method and the field.
     - `constants`: the arrays on which the field depends.
-    - `run`: the start of the run, and the times at which steps end.
+    - `run`: the time and state at the start of the run, and the times at which steps end.
     - `record`: the state of the loop over steps at the start of each segment, and the rows of the
       last segment.
     - `number`: the index of the segment.

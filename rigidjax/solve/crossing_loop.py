@@ -146,7 +146,7 @@ class _SearchState(NamedTuple):
     x: Array  # the next guess for the zero, as a time after the start of the step
     low: _IntervalEnd  # the start of the interval that contains the zero
     high: _IntervalEnd  # its end
-    tries: Array  # the number of guesses for a zero, or of steps taken again because g turns
+    tries: Array  # the number of guesses for a zero, or of steps taken again for an extremum of g
     steps: Array  # the number of passes
     found: Array  # whether a zero was found in this call of the loop
     jumped: Array  # whether g jumped over the zero found last
@@ -157,8 +157,8 @@ def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
 
     - `motion`: takes a step, and evaluates g and the round-off of g.
     - `search`: the direction of the zeros, their largest number, and the largest number of passes.
-    - `run`: the start, the times at which steps end, the tolerances, and the length of the first
-      step.
+    - `run`: the time and state at the start of the run, the times at which steps end, the
+      tolerances, and the length of the first step.
     """
     t0, y0 = run.t0, run.y0
     g, rate, *_ = motion.condition(t0, y0)
@@ -519,7 +519,7 @@ def first_step_length(method: SearchMethod, constants: Arrays, run: Path) -> Arr
 
     - `method`: the explicit method and the field, dy/dt.
     - `constants`: the arrays on which the field depends.
-    - `run`: holds the start, the state there, and the tolerances.
+    - `run`: holds the time and state at the start of the run, and the tolerances.
     """
     y0 = run.y0
     scale = add_leading_axes(run.atol, y0) + add_leading_axes(run.rtol, y0) * jnp.abs(y0)

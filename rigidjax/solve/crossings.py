@@ -149,7 +149,10 @@ class Crossings(eqx.Module, Generic[State]):
 
     @property
     def full(self) -> Array:
-        """Return whether the run ended at crossing number `max_crossings`: more may follow it."""
+        """Return whether the run ended at crossing number `max_crossings`.
+
+        If it did, more crossings may follow before `t1`.
+        """
         return self.result == dfx.RESULTS.event_occurred
 
 
@@ -290,17 +293,17 @@ _compiled_condition_value = eqx.filter_jit(condition_value)
 def solve_until_event(
     setup: ClosedFormRun | DiffraxRun, event: Event, state0: PyTree, ts: Array
 ) -> tuple[PyTree, dict[str, Any], dfx.RESULTS, Array, PyTree]:
-    """Return the saved states of a run that ends at its first event, and the event.
+    """Return the saved states of a run that ends at its first event, and the time of the event.
 
     - `setup`: how the run is computed: in closed form or by diffrax.
     - `event`: the `Event` at which the run ends.
     - `state0`: the state at `ts[0]`.
     - `ts`: (T,) s, the times at which states are saved, in the order of the run.
 
-    **Returns** five things: the states at `ts`, NaN at the times after the event; the dict of step
-    counts that becomes `Solution.stats`; the `diffrax.RESULTS`, which is `event_occurred` if there
-    was an event; the time of the event, s; and the state at the event. If no event occurs, its time
-    and state are NaN.
+    **Returns** five things: the states at `ts`, NaN at the times after the event; a dict of the
+    numbers of steps; how the run ended, a `diffrax.RESULTS` that is `event_occurred` if there was
+    an event; the time of the event, s; and the state at the event. If there is no event, this time
+    and this state are NaN.
     """
     state0 = project_to_group(state0)
     crossed, numbers = condition_and_motion_of_run(setup, event, state0, ts)
@@ -341,9 +344,9 @@ def _set_unknown_derivatives_to_nan(crossing: PyTree, jumps: Array, inputs: PyTr
       in `crossing`.
     - `inputs`: a tree of all numbers with respect to which derivatives are taken.
 
-    The derivatives become NaN in two cases: if a number is NaN itself, and if g jumps over zero at
-    the crossing, because then it is not known how the crossing depends on the inputs. All other
-    derivatives stay as they are.
+    The derivatives of a number in `crossing` become NaN in two cases: if the number itself is NaN;
+    and if g jumps over zero at the crossing, because it is then not known how the crossing depends
+    on the inputs. All other derivatives stay as they are.
     """
 
     def lost(leaf: Array) -> Array:
@@ -598,10 +601,10 @@ def condition_and_motion_of_run(
 def _sampling_interval(body: Any, state0: Any, length: Array) -> Array:
     """Return the interval between two samples, s, of a condition along the motion of a free body.
 
-    Zeros of the condition are searched for within such intervals. The interval is the period of one
-    turn at the largest rate that energy and momentum allow, divided by 16. If the run is so short
-    that the body turns by less than a radian at this rate, the interval is the length of the run
-    divided by 16.
+    A zero of the condition is found if the samples at the ends of an interval show it. The interval
+    is a sixteenth of the time that one turn takes at the largest rate that energy and momentum
+    allow. If the run is so short that the body turns by less than a radian at this rate, the
+    interval is a sixteenth of the length of the run.
 
     - `body`: an `Inertia`, or a body with an `inertia`.
     - `state0`: the state at the start, with the body rate `omega`, rad/s.

@@ -123,7 +123,10 @@ def lyapunov_exponents(
         raise ValueError("state0: wanted an array or a state of numbers, got none")
     many = size if number is None else _checks.integer(number, "number", 1)
     if many > size:
-        raise ValueError(f"number: wanted at most {size}, one for each direction, got {many}")
+        raise ValueError(
+            f"number: wanted at most {size} exponents, one for each dimension of the state, got "
+            f"{many}"
+        )
     dtype = validation.common_dtype(state0, "state0")
     length = _checks.checked_time(time, "time").astype(dtype)
     length = _checks.error_if(length, ~(length > 0), "time: wanted a positive time, s")
