@@ -75,8 +75,8 @@ def share(tree: PyTree) -> PyTree:
     count = counts.pop()
     if count < processes:
         raise ValueError(
-            f"share: wanted at least one body for each of {processes} processes, got {count} bodies; "
-            "start fewer processes"
+            f"share: wanted at least one body for each of {processes} processes, got {count} "
+            "bodies; start fewer processes"
         )
     edges = [count * i // processes for i in range(processes + 1)]
     return jax.tree.map(lambda leaf: leaf[edges[process] : edges[process + 1]], tree)
@@ -103,9 +103,9 @@ def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> Py
     """
 
     def rows_of_all(leaf: np.ndarray) -> np.ndarray:
-        # Shares differ by one row at most, but only arrays of equal shape can be sent: each share
-        # is filled up to the length of the longest share, and the additional row is cut off
-        # afterwards.
+        # Only arrays of equal shape can be sent, but the shares of the processes differ in length
+        # by up to one row. A share that is one row shorter than the longest share gets one more
+        # row before it is sent, and this row is cut off afterwards.
         rows = np.asarray(leaf)
         counts = np.asarray(multihost_utils.process_allgather(jnp.asarray(rows.shape[0])))
         most = int(counts.max())
@@ -137,10 +137,10 @@ def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyT
 
 
 def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
-    """Write the arrays of this process, a `tree`, to the file `folder/share-<process>.npz`.
+    """Write the arrays of `tree`, which this process has computed, to a file in `folder`.
 
-    `<process>` is the index of this process, from 0. The file appears only when it is complete.
-    **Returns** the path of the file.
+    The file is `folder/share-<process>.npz`, where `<process>` is the index of this process, from
+    0. The file appears only when it is complete. **Returns** the path of the file.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:

@@ -213,8 +213,9 @@ def _take_fixed_steps_of_bodies(
       states; and whether these states are saved (otherwise only the last states are returned).
     - `division`: three things: the number of bodies that a device computes at a time; the mesh of
       devices, or `None` for the default device; and the progress meter.
-    - `reduce`: a function `(carried, t, state) → carried` of one body, called at the time of each
-      saved state, even if only the last states are returned; or `None`.
+    - `reduce`: `None`, or a function `(carried, t, state) → carried` of one body. It is called
+      whenever the number of steps between two saved states has been taken, even if only the last
+      states are returned.
     - `constants`: what bodies, initial states and torque hold besides arrays.
     - `numbers`: five things: the arrays that all bodies share; a pair of trees, the first with the
       arrays of bodies, states and torque that have a row for each body, the second with the inputs

@@ -45,10 +45,10 @@ def compiler_options() -> dict[str, Any]:
 
 
 class CompiledFunction:
-    """Call a function under `jit`, with `compiler_options` if its last argument is known.
+    """Call a function under `jit`, with the options of `compiler_options` where JAX takes them.
 
-    If the last argument is traced, the call stands within another `jit`, where JAX takes no
-    options.
+    JAX takes options only at the outermost `jit`. If the last argument of the function is traced,
+    the call is within another `jit`, and no options are given.
     """
 
     def __init__(self, function: Callable[..., Any]):

@@ -55,14 +55,19 @@ class Method(NamedTuple):
     """
 
     tableau: Tableau
-    field: Field  # on states (n, *bodies)
-    project: Callable[[Array], Array]  # on states (n, *bodies): scales a quaternion to length 1
+    field: Field  # field(constants, t, y): dy/dt
+    project: Callable[[Array], Array]  # project(y): the state y with its quaternion of length 1
     halt: Callable[..., Array] | None  # halt(t, y): whether the run ends at the time t
-    # control(again, (state, times), (left, right, error)): the decision of the step controller on
-    # one step. `_Control` in `replay_adjoint` describes the arguments and the result.
+    # control(again, (state, times), (left, right, error)) is the decision of the step controller on
+    # one step. `again` is whether a recorded step is repeated for a derivative; `state` holds the
+    # states of controller and progress meter; `times` are those at which the run begins and ends,
+    # and those at which the step begins and ends; `left` and `right` are the states of the body
+    # before and after the step; `error` is the error of the step. The result is five things:
+    # whether the step is accepted, the time after it, the time at which the next step is to end,
+    # the new `state`, and the result of the run so far.
     control: Callable[..., Any]
     sizes: list[int]  # how many numbers each array of the state has
-    max_steps: int
+    max_steps: int  # the largest number of steps, rejected steps included
 
 
 class Run(NamedTuple):
@@ -469,8 +474,8 @@ def _attempt_step(
     (n, s, *bodies) at its s stages. `*bodies` is one last axis for the bodies of a batch, or no
     axis for one body.
     """
-    # The loop that calls this function goes on while any body has a step to take; other bodies may
-    # have none.
+    # The loop that calls this function goes on while any body of a batch has a step to take. Bodies
+    # that have no step to take are left as they are.
     on = is_running(method, run, loop, until) if run.t0.ndim else True
     stop, end = lax.stop_gradient(
         (
@@ -499,7 +504,8 @@ def _attempt_step(
         step = Step(begin, length, late, loop.y)
     there = stages(method.tableau, method.field, constants, step, dense)
     y = method.project(there.end)
-    # Derivatives hold the lengths of steps constant, so that the error has no derivative.
+    # The error serves only to choose the lengths of steps, which derivatives hold constant. It
+    # therefore needs no derivative.
     left, right, slopes = lax.stop_gradient((loop.y, y, there.slopes))
     error = error_estimate(method.tableau, method.sizes, h, slopes)
     # NaN is treated as infinity, because it may come from a step that is too long: a shorter
@@ -621,7 +627,8 @@ def fill_saved_states_of_segment(
     still = segment.rows[0].at[1:3].set(0)
     pick = jax.vmap(lambda rows, i: rows[i], (-1 if many else None, -1), -1)
     if not many:
-        # The times of one body are in the last axis, where many bodies would be.
+        # For one body the saved times of a window are put into the last axis, where the bodies of a
+        # batch would be.
         field, project = (
             jax.vmap(method.field, (None, -1, -1), -1),
             jax.vmap(method.project, -1, -1),
@@ -629,8 +636,9 @@ def fill_saved_states_of_segment(
         method, still = method._replace(field=field, project=project), still[:, None]
 
     def window(i: Array, ys: Array) -> Array:
-        # A window that would reach beyond the last saved time is moved back, so that some states
-        # are computed twice.
+        # Window number i is the next `width` saved times, whose states are computed together. A
+        # window that would reach beyond the last saved time is moved back, so that some states are
+        # computed twice.
         number = jnp.minimum(first + i * width, size - width)
 
         def cut(a: Array) -> Array:

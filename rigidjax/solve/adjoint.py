@@ -97,9 +97,9 @@ def transpose_saved_states(
     state_at, most = partial(state_in_step, method), run.between.shape[0] - 1
     pick = map_over_bodies(run, lambda a, index: a[index])
 
-    # The saved times in a step are treated one after the other. An axis for them would have the
-    # length of the largest number of saved times in a step of any body, and most bodies have far
-    # fewer.
+    # The saved times in a step are treated one after the other. An array with an axis for them
+    # would be as long as the largest number of saved times in this step of any body, and most
+    # bodies have far fewer.
     def one(state: Any) -> Any:
         number, total, by = state
         inside, there = number < last, jnp.minimum(number, most)

@@ -172,9 +172,9 @@ def _program_and_tangent(
     """
     constants, each = list(primals[:num_constants]), list(primals[num_constants:])
     moving = [not isinstance(t, SymbolicZero) for t in tangents]
-    # The tangents are passed with the arrays `each`, in which every body has values of its own. The
-    # tangents of shared constants therefore need a last axis of bodies; `with_tangents` adds the
-    # same axis to these constants.
+    # The tangents are passed together with the arrays `each`, in which every body has values of its
+    # own. The tangent of a constant that all bodies share therefore needs a last axis of bodies.
+    # `with_tangents` adds this axis to the constant, too, so that it has the shape of its tangent.
     _, along = layout.broadcast_to_bodies(
         list(tangents[:num_constants]), moving[:num_constants], each[0]
     )

@@ -452,7 +452,8 @@ def step_with_error(
     """
     there = stages(method.tableau, method.field, constants, step)
     right = method.project(there.end)
-    # Derivatives hold the lengths of steps constant, so that the error has no derivative.
+    # The error serves only to choose the lengths of steps, which derivatives hold constant. It
+    # therefore needs no derivative.
     left, after, h, slopes = lax.stop_gradient((step.y, right, step.h, there.slopes))
     error = error_estimate(method.tableau, method.sizes, h, slopes)
     largest = jnp.maximum(jnp.abs(left), jnp.abs(after))

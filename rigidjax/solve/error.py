@@ -31,8 +31,8 @@ from rigidjax.solve.linear_map import known_with_derivatives_of
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
 from rigidjax.solve.sides import hold_piecewise_constant_laws_at
 
-# The tolerance of the second run divided by the tolerance of the run. With this value a method of
-# order 8 takes 1.6 times as many steps.
+# The tolerance of the second run divided by the tolerance of the run. With this value the second
+# run of a method of order 8 takes 1.6 times as many steps as the run.
 _CLOSER = 2e-2
 # The second run is divided into this many equal parts, and a step ends at the end of each part. No
 # step is longer than ten times the step before it. In a run of a few steps this limit, and not the
@@ -44,9 +44,9 @@ _CUTS = 8
 # times the median of these distances in the part, plus `_ROUGH` times the relative rounding error
 # of the dtype. The distances are relative to the largest sample of the part.
 _PARTS, _SAMPLES_OF_PART, _SUDDEN, _ROUGH = 32, 512, 20.0, 1e3
-# The number of neighbouring runs, and the number of standard deviations that are reported. Three
-# standard deviations over four runs (the run and its neighbours) exceed half of the true error in
-# all but a few of a thousand runs.
+# The number of neighbouring runs, and the number of standard deviations that are reported as the
+# error. Three standard deviations over four runs (the run and its neighbours) exceed half of the
+# true error in all but a few of a thousand cases.
 _NEIGHBOURS, _DEVIATIONS = 3, 3.0
 # In float64 the neighbours are run at a larger tolerance, so that they take fewer steps: at the
 # square root of the tolerance of the run, but at `_LOOSE` at most. If a run at the larger tolerance
@@ -66,10 +66,11 @@ _SMALL = 1e-3
 # two kinds of errors do not grow alike: the nearer the motion is to the rotation, the smaller are
 # the errors of the steps, but the rounding errors stay as they are.
 #
-# Only one neighbour is therefore run if two conditions hold: the tolerance is above `_COARSE`
+# After the first neighbour no other is run if two conditions hold: the tolerance is above `_COARSE`
 # roundings; and the error of the steps is above `_CLEAR` times each of two bounds of round-off. The
 # first bound is `_ABOVE` times the round-off of all steps as it would be without growth. The second
-# bound is `_ABOVE_ONE` times `_DEVIATIONS` times the change that this neighbour shows.
+# bound is `_ABOVE_ONE` times `_DEVIATIONS` times the change that the first neighbour shows. The
+# larger bound is then reported as the error of round-off.
 #
 # The steps of a function given to `error_of` are not known: there no neighbour is run at all if the
 # tolerance is above `_COARSE` roundings and the error of the steps is above `_PLAIN` roundings of
@@ -80,14 +81,15 @@ _ABOVE, _ABOVE_ONE, _CLEAR, _PLAIN, _COARSE = 100.0, 10.0, 3.0, 1e6, 1e5
 # motions of `bench_error` the error was about n²/100 times the tolerance, within a factor of ten,
 # where n is the number of steps of the first run. From the second run on, the error is measured.
 # Errors are proportional to the tolerance only up to a factor of four, `_ALLOWED`, by which the
-# estimate of the error is multiplied. The search aims at the wanted accuracy divided by `_AIM`. In
-# three cases the error is not proportional to the tolerance: if it is above `_FORESEEN` (0.1 rad);
-# if the run has fewer than `_FEW` steps; and if the number of steps grew from the run before by
-# less than `_GROWTH` times the factor that the order of the method implies.
+# estimate of the error is multiplied. The search aims at the wanted accuracy divided by `_AIM`.
+#
+# In three cases the error is not proportional to the tolerance: if the error is above `_FORESEEN`
+# (0.1 rad); if the run has fewer than `_FEW` steps; and if the number of steps grew from the run
+# before by less than `_GROWTH` times the factor that the order of the method implies.
 _FIRST, _SECOND, _ALLOWED, _AIM = 1e-4, 20.0, 4.0, 2.0
 _FORESEEN, _FEW, _GROWTH = 0.1, 8, 0.9
-# The smallest tolerance, in roundings: `_FLOOR` in the search for a tolerance, and `_DEEPEST` for a
-# run that serves for comparison only.
+# The smallest tolerance, as a multiple of the relative rounding error of the dtype: `_FLOOR` in the
+# search for a tolerance, and `_DEEPEST` for a run that serves for comparison only.
 _FLOOR, _DEEPEST = 20.0, 4.0
 
 

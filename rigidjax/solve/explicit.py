@@ -114,8 +114,8 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
 
         step = Step(jnp.asarray(t0), h, jnp.asarray(t1), numbers)
         there = stages(self.tableau, field, [], step)
-        # The quaternion is scaled to length 1 once, after the stages: inside the stages this would
-        # change the order of the method (jaxsim#192).
+        # The quaternion is scaled to length 1 once, after the stages: if it were scaled in each
+        # stage, the method would have another order (jaxsim#192).
         y1 = project_to_group(tree(there.end))
         # Derivatives hold the lengths of steps constant, so that the error, from which the lengths
         # are chosen, needs no derivative. What this leaves out is as small as the error of a step,

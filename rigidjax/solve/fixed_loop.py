@@ -179,8 +179,9 @@ def changes_of_delayed_inputs(
 def torque_inputs_at_start(torque: Any, h: Array, inputs: PyTree) -> PyTree:
     """Return the values that the inputs of a torque have at the start of a run.
 
-    A delayed input still has an earlier value then. The result is in the form that `bind` takes,
-    the function that sets the inputs of a torque.
+    A delayed input has at the start the value of the row that belongs to the time one delay
+    earlier, or of the first row if there is no such row. The result is in the form that `bind` takes, the function that sets the
+    inputs of a torque.
 
     - `torque`: the torque.
     - `h`: the length of a step, s.
