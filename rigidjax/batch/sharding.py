@@ -117,7 +117,7 @@ def divide_batch(
     dtype: np.dtype,
     num_bodies: int,
 ) -> Division:
-    """Return how a batch of bodies is divided: the size of a chunk, and the devices.
+    """Return a `Division`, which says how a batch of bodies is divided among devices and chunks.
 
     A chunk is the bodies that a device computes at a time. The result also holds the progress
     meter.
@@ -128,7 +128,8 @@ def divide_batch(
     - `dtype`: the dtype of the numbers, on which the default size of a chunk depends.
     - `num_bodies`: the number of bodies.
 
-    **Raises:** `ValueError` for a progress meter together with devices.
+    **Raises:** `ValueError` for a progress meter together with devices, and for a wrong `chunk` or
+    `devices`; `TypeError` for a progress meter that is not one of diffrax.
     """
     if progress_meter is not None and devices is not None:
         raise ValueError(

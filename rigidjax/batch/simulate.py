@@ -60,7 +60,7 @@ class Batch(eqx.Module, Generic[State]):
 
     **Fields:**
 
-    - `ts` (T,): times, s.
+    - `ts` (T,): the times of the states, s.
     - `ys`: the states at these times, of the type of `states0`, with leading axes (N, T), in the
       order of the given bodies; NaN at times that a body did not reach.
     - `result`: a `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `nonfinite_input` (an
@@ -182,7 +182,7 @@ def _simulate_bodies(
       devices, or `None` for the default device; and the progress meter.
     - `constants`: what bodies, initial states and torque hold besides arrays.
     - `numbers`: three things: the arrays that all bodies share; the arrays with a row for each
-      body; and the T times (T,), s, at which states are saved.
+      body; and the times (T,), s, at which states are saved.
 
     **Returns** four things, each with a leading axis of bodies: the states at the saved times; the
     `diffrax.RESULTS` that say how each run ended; the numbers of steps; and the states that the
@@ -255,19 +255,19 @@ def sort_bodies_for_chunks(key: Array, chunk: int, num_devices: int) -> tuple[Ar
 
     **Arguments:**
 
-    - `key`: (N,) a number of each body by which it is sorted, such as its speed; NaN is the
-      largest.
+    - `key`: (N,) for each body the number by which it is sorted, such as its speed; NaN counts as
+      the largest number.
     - `chunk`: the number of bodies of a chunk.
     - `num_devices`: the number of devices, to which consecutive chunks go one after another.
 
-    **Returns** two permutations (N,): the order, which has the old index of each body at its new
-    place; and its inverse.
+    **Returns** two permutations (N,): the order, whose element i is the old index of the body at
+    the new place i; and the inverse of the order.
     """
     count = key.shape[0]
     chunk = min(chunk, -(-count // num_devices))
     size = -(-count // (chunk * num_devices)) * chunk
     # `seats` are the places of the sorted bodies in the array for the devices: first chunk 0 of
-    # every device, then chunk 1 of every device, and so on. A device has `size` places, the last
+    # every device, then chunk 1 of every device, and so on. Each device has `size` places; the last
     # device may have fewer.
     seats = (
         np.arange(size * num_devices).reshape(-1, num_devices, chunk).transpose(1, 0, 2).reshape(-1)

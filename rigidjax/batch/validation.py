@@ -32,8 +32,8 @@ Check = tuple[Any, Callable[[int], None]]
 class BodyBatch(NamedTuple):
     """Hold the bodies, initial states and torque of many runs, split into three trees.
 
-    Each of the three trees has the structure of the tree `(bodies, states0, torque)`, and `None`
-    for each leaf that is in another one of them.
+    Each of the three trees has the structure of the tree `(bodies, states0, torque)`. Each leaf of
+    this tree is in one of the three trees; the other two trees have `None` in its place.
     """
 
     shared: PyTree  # the arrays that all bodies share

@@ -98,7 +98,7 @@ def integrate_with_diffrax(
     - `field`: a vector field `f(t, y, args)`. If several parts of the field jump, `args` is a
       sequence with one array for each of these parts: the times at which steps end for this part.
       Otherwise `args` is `None`.
-    - `ts`: (T,) s, the times of the states; increasing if `jumps` is a list.
+    - `ts`: (T,) the times of the states, s; increasing if `jumps` is a list.
     - `y0`: the state at `ts[0]`.
     - `jumps`: a list with one array of times, s, for each part of the field that jumps. Steps end
       at these times, and at each time with which the field compares its argument t. With `None` no
@@ -168,7 +168,7 @@ def adaptive(
 
     - `solver`: an explicit method of `rigidjax.solvers`.
     - `field`: a vector field `f(t, y, args)`, such as `equations_of_motion` returns.
-    - `ts`: (T,) s, the times of the states, in increasing order.
+    - `ts`: (T,) the times of the states, s, in increasing order.
     - `y0`: the state at `ts[0]`.
     - `rtol`, `atol`: scalars, the relative and the absolute tolerance of each step.
     - `dt0`: the length of the first step, s; with `None` the length is chosen from the field.

@@ -128,7 +128,7 @@ class Crossings(eqx.Module, Generic[State]):
 
     **Fields:**
 
-    - `times`: (K,) s, the times of the crossings in the order of the run; NaN after the last one.
+    - `times`: (K,) the times of the crossings, s, in the order of the run; NaN after the last one.
     - `states`: the states at these times, of the type of `state0`, with a leading axis (K,).
     - `count`: the number of crossings.
     - `result`: a `diffrax.RESULTS`: `successful` if the run reached `t1`, `event_occurred` if it
@@ -298,7 +298,7 @@ def solve_until_event(
     - `setup`: how the run is computed: in closed form or by diffrax.
     - `event`: the `Event` at which the run ends.
     - `state0`: the state at `ts[0]`.
-    - `ts`: (T,) s, the times at which states are saved, in the order of the run.
+    - `ts`: (T,) the times at which states are saved, s, in the order of the run.
 
     **Returns** five things: the states at `ts`, NaN at the times after the event; a dict of the
     numbers of steps; how the run ended, a `diffrax.RESULTS` that is `event_occurred` if there was
@@ -371,7 +371,7 @@ def _crossings_of_run(
     - `max_crossings`: K, the largest number of crossings; the run ends at crossing number K.
     - `max_steps`: the largest number of steps, parts of steps included.
     - `state0`: the state at `ts[0]`.
-    - `ts`: (2,) s, the times at which the run begins and ends.
+    - `ts`: (2,) the times at which the run begins and ends, s.
     """
     state0 = project_to_group(state0)
     crossed, numbers = condition_and_motion_of_run(setup, event, state0, ts)

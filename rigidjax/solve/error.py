@@ -100,7 +100,7 @@ class Error(eqx.Module):
 
     **Fields:**
 
-    - `ts`: (T,) s, the times of the states.
+    - `ts`: (T,) the times of the states, s.
     - `steps`: the error of the steps, one array (T,) for each name (`q`, `omega`, `x`, `v`,
       `own.0`, …). For a quaternion it is the angle of the turn, rad; for other arrays it is the
       length of the difference (rad/s, m, m/s). This error is accurate to some percent; after
@@ -213,7 +213,7 @@ def estimate_error_of_run(
 
     - `setup`: the body, the torque, the solver and the tolerances of the run, a `ClosedFormRun` or
       a `DiffraxRun`.
-    - `ts`: (T,) s, the times of the states.
+    - `ts`: (T,) the times of the states, s.
     - `ys`: the states at `ts` that the run gave, with a leading time axis.
     - `num_steps`: the number of steps of the run.
     - `search`: `None`, or two runs of the search that found the tolerance of the given run: the
@@ -419,9 +419,9 @@ def _distances_of_states(others: PyTree, ys: PyTree) -> dict[str, Array]:
     """Return how far the states of two runs are apart, at each of the T saved times.
 
     `others` and `ys` are the states of the two runs at equal times, with a leading time axis.
-    **Returns** a dict with one array (T,) for each array of a state, by its name (`q`, `omega`, …):
-    for a quaternion the angle of the turn from one state to the other, rad, else the length of the
-    difference.
+    **Returns** a dict with one array (T,) for each array of a state, by its name (`q`, `omega`, …).
+    For a quaternion it is the angle, rad, of the turn from one state to the other; for any other
+    array it is the length of the difference.
     """
     return _lengths_of_changes_by_name(
         jax.tree.map(lambda leaf: leaf[0], ys), jax.vmap(minus)(others, ys)
@@ -441,10 +441,10 @@ def _lengths_of_changes_by_name(state: PyTree, changes: Array) -> dict[str, Arra
 
 
 def largest_length_in_run(array: Array) -> Array:
-    """Return the largest length that a vector of the state has at the T saved times of a run.
+    """Return the largest length that one array of the state has at the T saved times of a run.
 
-    `array` (T, …) is the array with a leading time axis. Times that the run did not reach, where
-    the array is NaN, are left out.
+    `array` (T, …) has the values of this array at the saved times. They are NaN at times that the
+    run did not reach; these times are left out.
     """
     return jnp.nanmax(jnp.linalg.norm(array.reshape(array.shape[0], -1), axis=-1))
 
@@ -489,7 +489,7 @@ def solve_to_accuracy(
 
     - `setup`: the body, the torque and the solver of the run; its tolerances are not used.
     - `state0`: the state at the time `ts[0]`.
-    - `ts`: (T,) s, the times at which states are saved.
+    - `ts`: (T,) the times at which states are saved, s.
     - `accuracy`: the largest allowed error: for a rotation an angle, rad, else a relative error,
       the length of the error divided by the largest length in the run.
 
@@ -640,9 +640,9 @@ def _more_accurate_setup(
 
     - `setup`: the body, the torque, the solver and the tolerances (or the fixed step) of the given
       run.
-    - `ts`: (T,) s, the times of its saved states.
-    - `sudden_times`: (m,) s, times at which steps of the more accurate run are to end, such as the
-      times at which the torque changes suddenly. Under fixed steps they are not used.
+    - `ts`: (T,) the times of its saved states, s.
+    - `sudden_times`: (m,) the times, s, at which the torque changes suddenly, so that steps of the
+      more accurate run are to end there. Under fixed steps they are not used.
 
     **Returns** three things: the set-up of the more accurate run, whose steps are half as long if
     the given run has fixed steps; the relative tolerance of the given run, 0 under fixed steps; and

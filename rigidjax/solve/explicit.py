@@ -32,7 +32,7 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
     coefficients: Any
 
     def evaluate(self, t0: RealLike, t1: RealLike | None = None, left: bool = True) -> PyTree:
-        """Return the state at the time `t0`, or, with `t1`, its change from `t0` to `t1`."""
+        """Return the state at the time `t0`; if `t1` is given, its change from `t0` to `t1`."""
         if t1 is not None:
             return jax.tree.map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
         length = self.t1 - self.t0

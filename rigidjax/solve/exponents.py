@@ -30,13 +30,13 @@ class Exponents(eqx.Module):
 
     **Fields:**
 
-    - `values`: (k,) 1/s, the exponents, the largest first.
-    - `errors`: (k,) 1/s, the error of each exponent, one standard deviation. It combines, as the
+    - `values`: (k,) the exponents, 1/s, the largest first.
+    - `errors`: (k,) the error of each exponent, 1/s, one standard deviation. It combines, as the
       root of the sum of squares: the scatter of the means over twenty parts of the run; the effect
       of the intervals that belong to none of these parts; and the sum of the tolerances of all
       steps, divided by the time.
-    - `times`: (N,) s, the ends of the intervals after the transient.
-    - `running`: (N, k) 1/s, the exponents of the run up to each of these times.
+    - `times`: (N,) the ends of the intervals after the transient, s.
+    - `running`: (N, k) the exponents, 1/s, of the run up to each of these times.
     - `state`: the state at the end of the run.
     - `result`: a `diffrax.RESULTS`: `successful`, or the reason why a run failed.
 

@@ -37,7 +37,7 @@ def fixed(
 
     - `solver`: a method of `rigidjax.solvers`.
     - `field`: a vector field `f(t, y, args)`, such as `equations_of_motion` returns.
-    - `ts`: (T,) s, the times of the states.
+    - `ts`: (T,) the times of the states, s.
     - `y0`: the state at `ts[0]`.
     - `substeps`: the number of steps between two times of `ts`, a whole number. If the number is
       traced, JAX does not compile again for another number, but reverse mode does not work.
@@ -180,8 +180,8 @@ def torque_inputs_at_start(torque: Any, h: Array, inputs: PyTree) -> PyTree:
     """Return the values that the inputs of a torque have at the start of a run.
 
     A delayed input has at the start the value of the row that belongs to the time one delay
-    earlier, or of the first row if there is no such row. The result is in the form that `bind` takes, the function that sets the
-    inputs of a torque.
+    earlier, or of the first row if there is no such row. The result is in the form that `bind`
+    takes, the function that sets the inputs of a torque.
 
     - `torque`: the torque.
     - `h`: the length of a step, s.
