@@ -48,7 +48,7 @@ def connect(address: str, processes: int, process: int, *, patience: int = 20) -
 
 
 def share(tree: PyTree) -> PyTree:
-    """Return the rows of the bodies that this process computes, of each array of a tree.
+    """Return from each array of a tree the rows of the bodies that this process computes.
 
     The N bodies are divided in order among P processes: each process gets ⌈N/P⌉ bodies, or one
     fewer.
@@ -89,7 +89,7 @@ def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> Py
 
     **Arguments:**
 
-    - `tree`: arrays with the rows of this process, as `share` returns them.
+    - `tree`: arrays with one row for each body of this process, in the order of `share`.
     - `checkpoint`: a folder to which `save` writes the rows of this process before they are sent,
       or `None`.
 

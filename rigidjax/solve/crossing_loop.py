@@ -145,11 +145,11 @@ class _SearchState(NamedTuple):
     refining: Array  # whether a zero in a step is searched for, between `low` and `high`
     x: Array  # the next guess for the zero, as a time after the start of the step
     low: _IntervalEnd  # the start of the interval that contains the zero
-    high: _IntervalEnd  # its end
+    high: _IntervalEnd  # the end of this interval
     tries: Array  # the number of guesses for a zero, or of steps taken again for an extremum of g
     steps: Array  # the number of passes
-    found: Array  # whether a zero was found in this call of the loop
-    jumped: Array  # whether g jumped over the zero found last
+    found: Array  # whether a zero was found since the search went on from the zero before
+    jumped: Array  # whether g jumps over zero at the zero that was found last
 
 
 def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
@@ -275,8 +275,8 @@ def _next_search_state(
     accept = good & ~shorter & ~crossed
     next_h = jnp.where(shorter, turn, jnp.where(step & ~crossed, following, h))
 
-    # Newton's method in the interval from `low` to `high`, at whose ends g is on opposite sides of
-    # zero.
+    # A zero is searched for by Newton's method in the interval from `low` to `high`, at whose ends
+    # g has opposite signs.
     refine = on & body.refining
     low = _choose_end(refine & ~other, here, body.low)
     high = _choose_end(refine & other, here, body.high)
@@ -358,10 +358,10 @@ def _may_hide_zeros(
 ) -> tuple[Array, Array]:
     """Return whether a condition g may have two zeros in an interval that its signs do not show.
 
-    If g crosses zero twice, its signs at the ends of the interval do not change. The function
-    therefore examines the cubic polynomial that has the values and slopes of g at both ends. Below,
-    an extremum "beyond zero" is one at which the polynomial has the opposite sign of g at `low`,
-    and is farther from zero than `round_off`.
+    If g crosses zero two more times, its signs at the ends of the interval stay as they are. This
+    function therefore examines the cubic polynomial that has the values and slopes of g at both
+    ends. Below, an extremum "beyond zero" is one at which the polynomial has the opposite sign of g
+    at `low`, and is farther from zero than `round_off`.
 
     If g has the same sign at both ends, it may have two zeros in two cases: if the polynomial has
     an extremum beyond zero in the interval; or if it has an extremum in the interval, and the
@@ -382,7 +382,8 @@ def _may_hide_zeros(
     a, b = sign_at_low * low.rate * width, sign_at_low * high.rate * width
     first, last = sign_at_low * low.g, sign_at_low * high.g
     rise = last - first
-    # The slope of the cubic is a + c x + d x², with x from 0 to 1 between the ends.
+    # The slope of the cubic is a + c x + d x², where x goes from 0 at `low` to 1 at `high`. The
+    # cubic is multiplied by `sign_at_low`, so that it is positive at `low`.
     c, d = 2 * (3 * rise - 2 * a - b), 3 * (a + b - 2 * rise)
     root = jnp.sqrt(jnp.maximum(c * c - 4 * a * d, 0))
     q = -0.5 * (c + jnp.where(c < 0, -root, root))
@@ -473,8 +474,8 @@ def acceptance_and_next_step_of_search(
 ) -> tuple[Array, Array]:
     """Return whether a step is accepted, and the length of the next step, s.
 
-    The next length is 0 if a shorter step would be below the round-off of the time, and NaN if the
-    step ended with NaN.
+    If the step is rejected, and a shorter step would be below the round-off of the time, there is
+    no next step. The next length is then 0, or NaN if the error of the step is not finite.
 
     - `error_norm`: the error divided by the tolerance, as `step_with_error` returns it.
     - `order`: the order of this error.

@@ -182,7 +182,7 @@ class Error(eqx.Module):
 
 
 class TriedRun(NamedTuple):
-    """Hold one run of the search for a tolerance: the tolerance, and what `solve` returned."""
+    """Hold one run of the search for a tolerance: the tolerance, and the results of the run."""
 
     rtol: Array  # (), the relative tolerance of the run
     ys: Any  # the states at the T saved times, with a leading time axis
@@ -345,9 +345,9 @@ def _run_at_larger_tolerance(
     kinds of round-off grow along the motion in the same way at any tolerance at which the states
     stay near `ys`.
 
-    If the given run is in float32, where it takes few steps anyway, no new run is made, and neither
-    for a run in closed form or without `ReplayAdjoint`. The given set-up and states are then
-    returned, with the factor 1.
+    No new run is made in three cases: if the given run is in float32, where it takes few steps
+    anyway; if it is in closed form; and if its steps are not recorded, as they are with a
+    `ReplayAdjoint`. The given set-up and states are then returned, with the factor 1.
 
     **Arguments:**
 
@@ -493,8 +493,9 @@ def solve_to_accuracy(
     - `accuracy`: the largest allowed error: for a rotation an angle, rad, else a relative error,
       the length of the error divided by the largest length in the run.
 
-    **Returns** three things: the set-up at the tolerance found; the results of `solve` for this
-    set-up; and two of the runs that were tried, the first one and the one before the last.
+    **Returns** three things: the set-up at the tolerance found; the results of the run at this
+    tolerance, which are its states at `ts`, its numbers of steps and a `diffrax.RESULTS`; and two
+    of the runs that were tried, the first one and the one before the last.
     """
     still = _without_derivatives((setup, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)

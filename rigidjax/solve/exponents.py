@@ -38,7 +38,7 @@ class Exponents(eqx.Module):
     - `times`: (N,) the ends of the intervals after the transient, s.
     - `running`: (N, k) the exponents, 1/s, of the run up to each of these times.
     - `state`: the state at the end of the run.
-    - `result`: a `diffrax.RESULTS`: `successful`, or the reason why a run failed.
+    - `result`: a `diffrax.RESULTS`: `successful`, or the reason why the run failed.
 
     >>> still = lambda t, y, args: jnp.array([0.5, -1.0]) * y
     >>> lyapunov_exponents(still, jnp.zeros(2), 40.0, intervals=40, transient=20).running.shape
@@ -85,15 +85,15 @@ def lyapunov_exponents(
     - `intervals`: the number of equal intervals into which the run is divided. At the end of each
       interval the frame is made orthonormal to round-off.
     - `transient`: the number of intervals at the beginning whose growth is not counted.
-    - `t0`: the start of the run, s.
+    - `t0`: the time at which the run begins, s.
     - `solver`, `rtol`, `atol`: as for `simulate`.
     - `max_steps`: the largest number of steps in one interval.
 
     Each conserved quantity gives an exponent of zero, and so does the direction of the motion
-    itself. In a run of the length t such an exponent decreases as (log t)/t, a trend that `errors`
-    does not include: look at `running`.
+    itself. The computed value of such an exponent is not zero: it decreases with the length t of
+    the run as (log t)/t. `errors` does not include this trend; it is seen in `running`.
 
-    **Returns** an `Exponents`. Its numbers are NaN if a run fails, and `result` says why.
+    **Returns** an `Exponents`. Its numbers are NaN if the run fails, and `result` says why.
 
     Source: Dieci, Russell and Van Vleck 1997, doi:10.1137/S0036142993247311; for orthonormal
     frames: Christiansen and Rugh 1997, doi:10.1088/0951-7715/10/5/004.
@@ -171,10 +171,10 @@ def _exponents_of_run(
       is left out of the means, and the largest number of steps in one interval.
     - `field`: a vector field `f(t, y, args)` that returns dy/dt.
     - `state0`: the state at `t0`.
-    - `t0`, `length`: the start and the length of the run, s.
+    - `t0`, `length`: the time at which the run begins, and its length, s.
     - `rtol`, `atol`: the relative and the absolute tolerance of each step.
     """
-    # Whole numbers of Python are not arrays: `filter_jit` compiles anew for other numbers.
+    # `options` are not arrays, so that `filter_jit` compiles again if one of them changes.
     solver, many, intervals, transient, max_steps = options
     state0 = project_to_group(state0)
     step = length / intervals
