@@ -83,9 +83,9 @@ def share(tree: PyTree) -> PyTree:
 
 
 def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyTree:
-    """Send the rows of each process to all processes, and return the rows of all processes joined.
+    """Return to every process the rows of all processes, joined in the order of the processes.
 
-    The rows are in the order of the processes. Every process has to call this function.
+    Each process calls this function with its own rows, which are sent to the other processes.
 
     **Arguments:**
 

@@ -602,7 +602,7 @@ def segment_of_rows(rows: Rows, end: Array, count: Array) -> Segment:
 def fill_saved_states_of_segment(
     method: Method, constants: Arrays, run: Run, segment: Segment, ys: Array
 ) -> Array:
-    """Fill in the saved states whose times lie in one segment, and return all saved states.
+    """Compute the saved states whose times lie in one segment, and return all saved states.
 
     - `method`: the explicit method and the field.
     - `constants`: the arrays on which the field depends.
