@@ -10,9 +10,9 @@ FILES = [*PACKAGE.rglob("*.py")]
 VERBS = frozenset(
     """
     Add Apply Attract Broadcast Call Check Choose Compare Compute Connect Control Convert Copy Define Delay Derive Describe
-    Draw Estimate Evaluate Find Fit Follow Give Handle Hold Identify Import Integrate Interpolate Join Locate Make Map
+    Draw Estimate Evaluate Fill Find Fit Follow Give Handle Hold Identify Import Integrate Interpolate Join Locate Make Map
     Measure Minimise Name Normalise Predict Prepare Present Print Provide Raise Read Refuse Return Reverse Run Scale Set
-    Share Show Simulate Solve Sort Store Sum Take Turn Warn Wrap Write Yield
+    Share Show Simulate Solve Sort Split Store Sum Take Trace Turn Warn Wrap Write Yield
     """.split()
 )
 
