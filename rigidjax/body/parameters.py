@@ -150,8 +150,8 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
     return s * jnp.stack([b + c, c + a, a + b])
 
 
-def flat_bend(
-    shape: Float[ArrayLike, "5"] | Numbers, slope: Float[ArrayLike, "5"] | Numbers
+def curvature_rows_near_flat_body(
+    shape: Float[ArrayLike, "5"] | Numbers, misfit_gradient: Float[ArrayLike, "5"] | Numbers
 ) -> Float[Array, "3 5"]:
     """Return three rows b of five numbers, (3, 5). The sum of the matrices b bᵀ is what products of
     first derivatives (Gauss–Newton) lack in the second derivative of a misfit near a flat body.
@@ -163,15 +163,15 @@ def flat_bend(
     The rows are zero for a body that is not flat, and for a misfit that does not decrease as λ
     decreases.
 
-    **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the derivative of the misfit with
-    respect to `shape`.
+    **Arguments:** `shape` (5,) as in `pack_shape`; `misfit_gradient` (5,) the derivative of
+    the misfit with respect to `shape`.
 
     >>> plate = pack_shape(jnp.diag(jnp.array([4.0, 4.0, 1e-12])))
-    >>> flat_bend(plate, -1e-6 * jnp.ones(5)).shape
+    >>> curvature_rows_near_flat_body(plate, -1e-6 * jnp.ones(5)).shape
     (3, 5)
     """
     shape = _checks.array_of_shape(shape, (5,), "shape")
-    slope = _checks.array_of_shape(slope, (5,), "slope")
+    misfit_gradient = _checks.array_of_shape(misfit_gradient, (5,), "misfit_gradient")
     root = _second_moment_root_from_shape(shape)
     # For a flat body the columns of the adjugate of A are along n. A fit needs n in every step, and
     # the adjugate is cheaper than eigenvectors.
@@ -180,9 +180,9 @@ def flat_bend(
     longest = adjugate[jnp.argmax(jnp.abs(jnp.diagonal(adjugate)))]
     n = longest / jnp.sqrt(jnp.sum(longest * longest) + jnp.finfo(root.dtype).tiny)
     a = n @ apply(root, n)
-    d1, d2, s12, s23, s13 = slope
+    d1, d2, s12, s23, s13 = misfit_gradient
     # The misfit does not depend on the size of A: the derivative of the misfit along A is zero.
-    trace = -(shape @ slope)
+    trace = -(shape @ misfit_gradient)
     d3 = (trace - d1 - d2) / 3.0
     pull = from_components(d1 + d3, d2 + d3, d3, 0.5 * s12, 0.5 * s13, 0.5 * s23)
     square = jnp.sum(root * root)
@@ -297,8 +297,8 @@ def _limit_exponent(exponent: Array, map_excess: Callable[[Array], Array] = jnp.
 
 
 __all__ = [
-    "FLAT", "flat_bend", "pack", "pack_moments", "pack_second_moment", "pack_shape", "unpack",
-    "unpack_moments", "unpack_second_moment", "unpack_shape",
+    "FLAT", "curvature_rows_near_flat_body", "pack", "pack_moments", "pack_second_moment",
+    "pack_shape", "unpack", "unpack_moments", "unpack_second_moment", "unpack_shape",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

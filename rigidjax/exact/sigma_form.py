@@ -184,8 +184,8 @@ def sigma_by_taylor_series(u: Scalar, constants: Invariants) -> Sigma:
         )
     )
     t = tuple(-0.5 * (a + 0.25 * b) for a, b in zip(x, commuting_product(x, x), strict=True))
-    # The integral Y = ∫₀ᵘ σ² T⁻² du is ⅓u³ (1 − c₁/5 + 3x/5) to the fifth power of u, with
-    # c₁ = (p + q) u² and the matrix x = X.
+    # The integral Y of σ² T⁻² from 0 to u is ⅓u³ (1 − c₁/5 + 3X/5) to the fifth power of u, where
+    # `c1` is c₁ = (p + q) u², and `x` is the matrix X of the docstring.
     y = _scaled_matrix(_add_to_diagonal(_scaled_matrix(x, 0.6), 1.0 - 0.2 * c1), u * uu / 3)
     return _normalised_sigma(s, _add_to_diagonal(t, 1.0), y)
 

@@ -70,8 +70,8 @@ class Force(AbstractScene):
     """Define the scene of a particle in an inertial frame under a force per mass that you give
     (notes, eq 84).
 
-    **Arguments:** `force` a callable Module `(t, state, body) → (3,)`, m/s², which gets `None` as
-    its `body`; or `None` for a free particle.
+    **Arguments:** `force` a function, or a Module with `__call__`, `(t, state, body) → (3,)`, m/s²,
+    which gets `None` as its `body`; or `None` for a free particle.
 
     >>> fall = Force(lambda t, state, body: jnp.array([0.0, 0.0, -9.8]))
     >>> fall.field(0.0, Point([0.0, 0, 0], [1.0, 0, 0])).v.tolist()

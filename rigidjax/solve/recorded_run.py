@@ -126,10 +126,12 @@ def _batch_method_over_bodies(
 
     **Arguments:**
 
-    - `method`: the method of one body. Its functions `halt(constants, t, y)`, the condition, and
-      `control(again, constants, …)`, the step control, take the constants as an argument.
-    - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
-      progress meter.
+    - `method`: the method of one body. Two of its functions take the constants as an argument:
+      `halt(constants, t, y)`, the condition that ends the run, and `control(again, constants, …)`,
+      the step control, where `again` says whether a recorded step is repeated for a derivative.
+    - `trees`: the tree structures by which lists of arrays are put together again: that of a `Run`
+      (the arrays with which a run starts), and that of the states of step controller and progress
+      meter.
     - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
@@ -172,8 +174,9 @@ def _run_bodies(
 
     - `return_record`: whether the record of the steps is returned, too.
     - `method`: the explicit method of one body, with the field and the step control.
-    - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
-      progress meter.
+    - `trees`: the tree structures by which lists of arrays are put together again: that of a `Run`
+      (the arrays with which a run starts), and that of the states of step controller and progress
+      meter.
     - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
@@ -218,8 +221,9 @@ def _unpack_recorded_run(
 
     - `has_tangent`: which constants, and which arrays of the run, have a tangent.
     - `method`: the explicit method of one body, with the field and the step control.
-    - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
-      progress meter.
+    - `trees`: the tree structures by which lists of arrays are put together again: that of a `Run`
+      (the arrays with which a run starts), and that of the states of step controller and progress
+      meter.
     - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
@@ -268,8 +272,9 @@ def _tangents_of_states(
     - `has_tangent`: two lists of truth values: which constants, and which arrays of the run, have a
       tangent.
     - `method`: the explicit method of one body, with the field and the step control.
-    - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
-      progress meter.
+    - `trees`: the tree structures by which lists of arrays are put together again: that of a `Run`
+      (the arrays with which a run starts), and that of the states of step controller and progress
+      meter.
     - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
@@ -306,8 +311,9 @@ def _cotangents_of_inputs(
     - `has_tangent`: two lists of truth values: which constants, and which arrays of the run, get a
       cotangent.
     - `method`: the explicit method of one body, with the field and the step control.
-    - `trees`: two tree structures: that of a `Run`, and that of the states of step controller and
-      progress meter.
+    - `trees`: the tree structures by which lists of arrays are put together again: that of a `Run`
+      (the arrays with which a run starts), and that of the states of step controller and progress
+      meter.
     - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.

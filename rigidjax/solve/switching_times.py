@@ -386,7 +386,8 @@ def _bisect(
 ) -> list[Array]:
     """Return for each switch the times at which its elements change, found by halving intervals.
 
-    A switch is an equation, such as the comparison `t < 1`, with one or more elements. Each of the
+    A switch is an equation of a traced program, such as `b = t < 1`, whose result jumps in time; it
+    may have several elements. Each of the
     following lists has one entry for each switch, with arrays for k intervals of this switch:
 
     - `timed_switches`: the switches.

@@ -154,8 +154,8 @@ def sentences_about_changes(
 
 def records_in_units_of_base_time(records: Iterable[Measurement]) -> list[Measurement]:
     """Return the records with each time divided by the median time in which the method `BASE`
-    (Dopri8 of diffrax) computes the value on the same scene. Records of other packages are left
-    out.
+    (Dopri8 of diffrax) computes the value, without a gradient, on the same scene. Only records of
+    rigidjax and of diffrax are returned.
 
     Compile times and memory become NaN.
     """

@@ -99,7 +99,7 @@ def test_the_bend_is_the_second_derivative_that_products_do_not_see(name):
 
     jacobian, slope = jax.jacfwd(errors)(vector), jax.grad(lambda v: 0.5 * errors(v) @ errors(v))
     truth = jax.hessian(lambda v: 0.5 * errors(v) @ errors(v))(vector)
-    bends = chart.bend(vector, slope(vector))
+    bends = chart.curvature_rows(vector, slope(vector))
     gram = jacobian.T @ jacobian + bends.T @ bends
     np.testing.assert_allclose(gram, truth, atol=1e-3 * float(jnp.abs(truth).max()))
     assert float(jnp.abs(jacobian.T @ jacobian - truth).max()) > 0.005 * float(jnp.abs(truth).max())

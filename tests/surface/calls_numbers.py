@@ -153,8 +153,11 @@ row("body.parameters.pack", lambda: dict(body=s.body()))
 for name in ("pack_second_moment", "pack_shape"):
     row(f"body.parameters.{name}", dict(second_moment=SECOND))
 row(
-    "body.parameters.flat_bend",
-    dict(shape=np.array([0.5, 0.45, 0.0, 0.0, 0.0]), slope=np.array([-0.1, -0.1, 0.0, 0.2, 0.1])),
+    "body.parameters.curvature_rows_near_flat_body",
+    dict(
+        shape=np.array([0.5, 0.45, 0.0, 0.0, 0.0]),
+        misfit_gradient=np.array([-0.1, -0.1, 0.0, 0.2, 0.1]),
+    ),
 )
 row(
     "body.parameters.pack_moments", dict(moments=np.array([1.1, 2.2, 2.7])), says=("second moment",)

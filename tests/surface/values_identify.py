@@ -686,11 +686,11 @@ leave_out(
     "tumblers.LightCurve", "tumblers.LightCurve.rivals", "identify.Comparison",
 )  # fmt: skip
 leave_out(
-    "what a chart's bend adds to the normal equations, and where derivatives of a flat body are "
+    "what a chart's curvature rows add to the normal equations, and where derivatives of a flat body are "
     "taken: tests/identify/test_flat_limit.py",
-    *(f"identify.{name}.bend" for name in (
+    *(f"identify.{name}.curvature_rows" for name in (
         "AbstractBodyChart", "Mass", "Principal", "PrincipalRatios", "Ratios", "Tensor")),
-    "body.parameters.flat_bend", "identify.Fit.derivative_point", "identify.Limit", "identify.Limit.flatness_upper_bound",
+    "body.parameters.curvature_rows_near_flat_body", "identify.Fit.derivative_point", "identify.Limit", "identify.Limit.flatness_upper_bound",
     "identify.Limit.flatness_deviation", "identify.Limit.is_flat_within",
 )  # fmt: skip
 leave_out(

@@ -82,8 +82,9 @@ def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None)
 
 
 class _Bytes:
-    """Provide bytes one by one to the decoders of the library; `place` is the index of the next
-    byte.
+    """Provide bytes one by one to the decoders of the package orangebox.
+
+    `place` is the index of the next byte.
     """
 
     def __init__(self, data: bytes, place: int):

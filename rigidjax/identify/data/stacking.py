@@ -69,12 +69,12 @@ def pad_to_few_lengths(model: PyTree) -> PyTree:
 
 
 def _count_table_rows(recording: Recording, axis: int) -> int:
-    """Return the number of times of the longest table of time in the inputs and sensors of a
-    `recording`, or 0 without a table.
+    """Return the length of the longest table in the inputs and sensors of a `recording`, or 0 if
+    there is no table.
 
-    A table of time is a `Linear` or `Series`, which interpolates values between times. Inputs are
-    logged quantities such as a motor command. The times of a table are along `axis`: 0 for one
-    recording, 1 for several recordings with a leading axis.
+    A table is a `Linear` or a `Series`, which interpolates values between given times; its length
+    is the count of these times. Inputs are logged quantities such as a motor command. The times of
+    a table are along `axis`: 0 for one recording, 1 for several recordings with a leading axis.
     """
     parts = recording.inputs, recording.sensors
     tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))

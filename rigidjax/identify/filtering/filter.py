@@ -57,7 +57,9 @@ class Belief(eqx.Module):
 
     @property
     def state(self) -> Spin | Attitude | Rigid:
-        """Return the estimated `Spin`, `Attitude` or `Rigid`."""
+        """Return the estimated state at each time, of the type of the first state: a `Spin`, an
+        `Attitude` or a `Rigid`.
+        """
         return self.x.motion
 
     @property

@@ -75,16 +75,16 @@ class AbstractBodyChart(eqx.Module):
         these numbers.
         """
 
-    def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
+    def curvature_rows(self, vector: Numbers, misfit_gradient: Numbers) -> HessianRows:
         """Return j rows B (j, size), by which a fit allows for the curvature of the chart: the body
         is not a linear function of its numbers.
 
         The curvature adds BᵀB to the second derivative of a misfit. This matters if a body may be
-        flat (`rigidjax.body.parameters.flat_bend`). A chart that returns no rows (j = 0) leaves the
-        curvature out.
+        flat (see `rigidjax.body.parameters.curvature_rows_near_flat_body`). A chart that returns no
+        rows (j = 0) leaves the curvature out.
 
         - `vector`: (size,) the numbers of the body in the chart.
-        - `slope`: (size,) the derivative of the misfit with respect to these numbers.
+        - `misfit_gradient`: (size,) the derivative of the misfit with respect to these numbers.
         """
         return jnp.zeros((0, self.size), vector.dtype)
 
@@ -124,8 +124,8 @@ class Ratios(AbstractBodyChart):
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_shape(body.second_moment)
 
-    def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
-        return charts.flat_bend(vector, slope)
+    def curvature_rows(self, vector: Numbers, misfit_gradient: Numbers) -> HessianRows:
+        return charts.curvature_rows_near_flat_body(vector, misfit_gradient)
 
     def logs(self, body: Inertia) -> Float[Array, "2"]:
         moments = jnp.log(body.moments)
@@ -153,8 +153,10 @@ class PrincipalRatios(AbstractBodyChart):
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_moments(jnp.diagonal(body.tensor))[1:]
 
-    def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
-        return charts.flat_bend(_pad_with_zeros(vector, 0, 3), _pad_with_zeros(slope, 0, 3))[:, :2]
+    def curvature_rows(self, vector: Numbers, misfit_gradient: Numbers) -> HessianRows:
+        return charts.curvature_rows_near_flat_body(
+            _pad_with_zeros(vector, 0, 3), _pad_with_zeros(misfit_gradient, 0, 3)
+        )[:, :2]
 
     def logs(self, body: Inertia) -> Float[Array, "2"]:
         i = jnp.diagonal(body.tensor)
@@ -206,8 +208,8 @@ class Tensor(AbstractBodyChart):
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_second_moment(body.second_moment / (0.5 * self.typical))
 
-    def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
-        return _pad_with_zeros(Ratios().bend(vector[1:], slope[1:]), 1, 0)
+    def curvature_rows(self, vector: Numbers, misfit_gradient: Numbers) -> HessianRows:
+        return _pad_with_zeros(Ratios().curvature_rows(vector[1:], misfit_gradient[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(body.moments)
@@ -240,8 +242,10 @@ class Principal(AbstractBodyChart):
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_moments(jnp.diagonal(body.tensor) / (0.5 * self.typical))
 
-    def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
-        return _pad_with_zeros(PrincipalRatios().bend(vector[1:], slope[1:]), 1, 0)
+    def curvature_rows(self, vector: Numbers, misfit_gradient: Numbers) -> HessianRows:
+        return _pad_with_zeros(
+            PrincipalRatios().curvature_rows(vector[1:], misfit_gradient[1:]), 1, 0
+        )
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(jnp.diagonal(body.tensor))
@@ -326,12 +330,13 @@ class Mass(AbstractBodyChart):
         step = jnp.concatenate([step[:7], step[7:] / self._body_length])
         return step[np.array(self._free_indices)]
 
-    def bend(self, vector: Numbers, slope: Numbers) -> HessianRows:
+    def curvature_rows(self, vector: Numbers, misfit_gradient: Numbers) -> HessianRows:
         if "inertia" not in self.free:
             return jnp.zeros((0, self.size), vector.dtype)
         first = self._free_indices.index(2)
-        rows = charts.flat_bend(
-            charts.pack(self.guess)[2:7] + vector[first : first + 5], slope[first : first + 5]
+        rows = charts.curvature_rows_near_flat_body(
+            charts.pack(self.guess)[2:7] + vector[first : first + 5],
+            misfit_gradient[first : first + 5],
         )
         return _pad_with_zeros(rows, first, self.size - first - 5)
 

@@ -183,17 +183,19 @@ def least_squares_from(
 def _expected_cost_drop_from_noise(
     model: Model, evaluation: Evaluation, normal: NormalMatrix
 ) -> Float[Array, ""]:
-    """Return `½ tr(K G⁻¹)`, the mean amount by which a fit that follows only the noise lowers the
-    cost (half the sum of squared residuals) of windows.
+    """Return the mean amount by which a fit lowers the cost because it follows the noise of the
+    readings: `½ tr(K G⁻¹)`.
 
-    The amount is the cost at the true numbers minus the least cost. G is the normal matrix of the
-    numbers that the windows share, from which the initial states of the windows are eliminated. K
-    is the sum of g gᵀ over stretches (groups of neighbouring windows), where g is the gradient of
-    the cost of one stretch. Errors may be correlated within a stretch (Takeuchi 1976; Burnham and
-    Anderson 2002, doi:10.1007/b97636, section 7.2). The gradient with respect to the initial states
-    is left out: near the least cost each initial state is at its own optimum.
+    The cost is half the sum of the squared residuals of all windows, which are short parts of a
+    record of measured states. The amount is the cost at the true numbers minus the least cost. G is
+    the normal matrix of the numbers that all windows share; the initial states of the windows were
+    eliminated from it. K is the sum of g gᵀ over stretches (groups of neighbouring windows), where
+    g is the gradient of the cost of one stretch. Errors may be correlated within a stretch
+    (Takeuchi 1976; Burnham and Anderson 2002, doi:10.1007/b97636, section 7.2). The gradient with
+    respect to the initial states is left out: near the least cost each initial state is at its own
+    optimum.
 
-    - `model`: the model, whose recordings are windows (short parts of a record of measured states).
+    - `model`: the model, whose recordings are the windows.
     - `evaluation`: the errors, and the gradient of the cost of each window.
     - `normal`: the normal matrix of all free numbers.
     """
@@ -231,7 +233,8 @@ def _rows_for_chart_curvature(
     BᵀB is added to the normal matrix of the n free numbers of a `model`.
 
     A chart is a map from free numbers to a possible body, and this map is not linear. Its curvature
-    matters if a body may be flat. Each chart gives some of the m rows (`AbstractBodyChart.bend`).
+    matters if a body may be flat. Each chart gives some of the m rows
+    (`AbstractBodyChart.curvature_rows`).
 
     - `x`: (n,) the free numbers.
     - `slope`: (n,) the gradient of the cost at x.
@@ -241,7 +244,7 @@ def _rows_for_chart_curvature(
         chart_list(model.chart),
         *(numbers_of_each_body(model.chart, y[:count]) for y in (x, slope)),
     )
-    rows = block_diag(*(chart.bend(*mine) for chart, *mine in zip(*parts, strict=True)))
+    rows = block_diag(*(chart.curvature_rows(*mine) for chart, *mine in zip(*parts, strict=True)))
     return jnp.pad(rows, ((0, 0), (0, slope.size - rows.shape[1])))
 
 

@@ -233,8 +233,9 @@ class Marker(ClockedSensor):
     [0.25, 0.0, 0.0]
     """
 
-    # The position of the pivot is known, so that the sensor needs only the attitude of a body on a
-    # pivot.
+    # With an `origin`, the known position of the pivot about which the body turns, the attitude
+    # alone gives the position of the marker. Without an `origin` the sensor needs the position of
+    # the body, too.
     feels: ClassVar[Any] = property(lambda self: HasPose if self.origin is None else HasAttitude)
     unit: ClassVar[str] = "m"
     place: Vec3 = eqx.field(converter=base.array_field("place"), default=None)

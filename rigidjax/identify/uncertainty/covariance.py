@@ -635,7 +635,8 @@ def _sandwich_covariance(
             )
         )
     # Take the estimate with the largest variances on average. Scale it up for each number whose
-    # variance is larger in another estimate, or for white errors.
+    # variance is larger in one of the other estimates, of which the covariance for white errors is
+    # one.
     all_ = np.stack([np.diag(white.determined), *(np.diag(c) for c in estimates)])
     least = np.maximum(all_[0], 1e-300)
     out = estimates[int(np.argmax((all_[1:] / least).mean(axis=1)))]
