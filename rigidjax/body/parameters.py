@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax._names import define_dir_and_getattr
@@ -252,7 +252,9 @@ def _matrix_square_root(s: Mat3) -> Mat3:
 
 
 @_matrix_square_root.defjvp
-def _matrix_square_root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
+def _matrix_square_root_jvp(
+    primals: tuple[Mat3], tangents: tuple[PyTree, ...]
+) -> tuple[Mat3, Mat3]:
     # The change dA of the root A solves A dA + dA A = d𝔖, nine linear equations. This is right also
     # at equal moments, where the axes have no derivative.
     root, one = _matrix_square_root(*primals), jnp.eye(3, dtype=primals[0].dtype)

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3
@@ -95,7 +95,7 @@ def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
 
 @eigensystem.defjvp
 def _eigensystem_jvp(
-    primals: tuple[Mat3], tangents: tuple[Mat3]
+    primals: tuple[Mat3], tangents: tuple[PyTree, ...]
 ) -> tuple[tuple[Vec3, Mat3], tuple[Vec3, Mat3]]:
     """Return two pairs: the eigenvalues (3,) and eigenvectors (3, 3), as columns, of a symmetric
     matrix A; and their changes for a change dA of the matrix. By this rule JAX differentiates

@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from rigidjax._types import Mat3
 from rigidjax.rotation.linalg3 import (
@@ -30,7 +30,7 @@ def inverse(a: Mat3) -> Mat3:
 
 
 @inverse.defjvp
-def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
+def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[PyTree, ...]) -> tuple[Mat3, Mat3]:
     """Return the inverse (3, 3) of a symmetric matrix A, and its change −A⁻¹ dA A⁻¹ for a change dA
     of the matrix. By this rule JAX differentiates `inverse`.
 

@@ -17,7 +17,7 @@ F is Legendre's integral of the first kind, they would lose all digits as m1 →
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax.elliptic.arguments import RealOrArray
 from rigidjax.rotation.stumpff import power_of_minus_one
@@ -88,7 +88,7 @@ def _power_times_exp(base: Array, exponent: Array, power: Array) -> Array:
 
 @_power_times_exp.defjvp
 def _power_times_exp_jvp(
-    primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
+    primals: tuple[Array, Array, Array], tangents: tuple[PyTree, ...]
 ) -> tuple[Array, Array]:
     """Return p^n e^y and its tangent (its change) for changes of p and y: the rule by which JAX
     differentiates `_power_times_exp`.

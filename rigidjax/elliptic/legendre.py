@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax.elliptic.arguments import (
     Real,
@@ -248,7 +248,9 @@ def _complete_first_kind(m1: Array) -> Array:
 
 
 @_complete_first_kind.defjvp
-def _complete_first_kind_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+def _complete_first_kind_jvp(
+    primals: tuple[Array], tangents: tuple[PyTree, ...]
+) -> tuple[Array, Array]:
     """Return Legendre's complete integral of the first kind K(m) and its tangent (its change) for a
     change of 1 − m: the rule by which JAX differentiates K.
 

@@ -23,7 +23,7 @@ where the derivative comes from a Taylor series.
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -101,7 +101,7 @@ def free_momentum_and_rotation(
 @free_momentum_and_rotation.defjvp
 def _free_momentum_and_rotation_jvp(
     primals: tuple[SymmetricEntries, Triple, Scalar],
-    tangents: tuple[SymmetricEntries, Triple, Scalar],
+    tangents: tuple[PyTree, ...],
 ) -> tuple[tuple[Triple, QuaternionEntries], tuple[Triple, QuaternionEntries]]:
     """Return two pairs: the body momentum Π(t) of a free body and the quaternion of its rotation
     from time 0 to t, both along the principal axes, as `free_momentum_and_rotation` gives them; and
@@ -121,7 +121,7 @@ def _free_momentum_and_rotation_jvp(
 
 def _derivative_variables_and_changes(
     primals: tuple[SymmetricEntries, Triple, Scalar],
-    tangents: tuple[SymmetricEntries, Triple, Scalar],
+    tangents: tuple[PyTree, ...],
 ) -> tuple[
     InverseInertiaAndEnergy, InverseInertiaAndEnergy, Float[Array, "10"], Float[Array, "10"]
 ]:
@@ -219,7 +219,7 @@ def body_rate_and_rotation(
 @body_rate_and_rotation.defjvp
 def _rate_and_rotation_jvp(
     primals: tuple[Mat3, Vec3, FreeMotionConstants, Float[Array, "*n"]],
-    tangents: tuple[Mat3, Vec3, Any, Float[Array, "*n"]],
+    tangents: tuple[PyTree, ...],
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Return two pairs: the body rate Ω(t) of a free body and the quaternion of its rotation from
     time 0 to t, both in the body frame, as `body_rate_and_rotation` gives them; and the changes of
@@ -425,7 +425,7 @@ def motion_and_derivatives(
 @motion_and_derivatives.defjvp
 def _motion_and_derivatives_jvp(
     primals: tuple[SymmetricEntries, Triple, Scalar],
-    tangents: tuple[SymmetricEntries, Triple, Scalar],
+    tangents: tuple[PyTree, ...],
 ) -> tuple[MotionAndDerivatives, MotionAndDerivatives]:
     """Return two things: the result of `motion_and_derivatives` (the motion of a free body, its
     first derivatives, and the pair from which these derivatives are computed); and the changes of

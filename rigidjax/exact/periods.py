@@ -4,6 +4,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, Vec3, Vec3Like
@@ -147,7 +148,7 @@ def _precession_angle(inertia: SymmetricEntries, momentum: Triple, period: Scala
 @_precession_angle.defjvp
 def _precession_angle_jvp(
     primals: tuple[SymmetricEntries, Triple, Scalar],
-    tangents: tuple[SymmetricEntries, Triple, Scalar],
+    tangents: tuple[PyTree, ...],
 ) -> tuple[Scalar, Scalar]:
     """Return the angle, rad, by which a principal axis of a free body turns about the momentum in
     one period of the body rate, and the change of this angle for a change of the inputs. By this
@@ -201,7 +202,7 @@ def _momentum_integral_of_period(
 @_momentum_integral_of_period.defjvp
 def _momentum_integral_of_period_jvp(
     primals: tuple[SymmetricEntries, Triple, Scalar],
-    tangents: tuple[SymmetricEntries, Triple, Scalar],
+    tangents: tuple[PyTree, ...],
 ) -> tuple[SymmetricEntries, SymmetricEntries]:
     """Return two things: the six entries of the matrix G = ∫ Π Πᵀ dt over one period of the body
     rate, where Π is the body momentum; and the changes of these entries for a change of the inputs.

@@ -51,7 +51,7 @@ def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> SymmetricEntrie
 
 @tensor_in_axes.defjvp
 def _tensor_in_axes_jvp(
-    primals: tuple[Mat3, Mat3, Triple], tangents: tuple[Mat3, PyTree, PyTree]
+    primals: tuple[Mat3, Mat3, Triple], tangents: tuple[PyTree, ...]
 ) -> tuple[SymmetricEntries, SymmetricEntries]:
     """Return two things: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor I in
     principal axes, AᵀIA; and their change for a change of the tensor, with the axes A held fixed.

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3Like
@@ -350,7 +350,7 @@ def nearest_rotation(b: Mat3) -> Mat3:
 
 
 @nearest_rotation.defjvp
-def _nearest_rotation_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
+def _nearest_rotation_jvp(primals: tuple[Mat3], tangents: tuple[PyTree, ...]) -> tuple[Mat3, Mat3]:
     """Return the rotation matrix R (3, 3) nearest to a matrix b, and its change for a change db of
     b. By this rule JAX differentiates `nearest_rotation`.
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
 from rigidjax.rotation.barrier import prevent_recomputation
@@ -87,7 +87,7 @@ def _log_of_quaternion(q: Quat) -> Vec3:
 
 
 @_log_of_quaternion.defjvp
-def _log_of_quaternion_jvp(primals: tuple[Quat], tangents: tuple[Quat]) -> tuple[Vec3, Vec3]:
+def _log_of_quaternion_jvp(primals: tuple[Quat], tangents: tuple[PyTree, ...]) -> tuple[Vec3, Vec3]:
     """Return two things for a quaternion q of any length: its rotation vector (3,), rad; and the
     change of the rotation vector for a change dq of q. By this rule JAX differentiates
     `_log_of_quaternion`.

@@ -13,7 +13,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 # The largest argument of `arctan_ratio_of_square`, tan²(π/8).
 _REACH = math.tan(math.pi / 8) ** 2
@@ -48,7 +48,7 @@ def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
 
 @stumpff.defjvp
 def _stumpff_jvp(
-    k: int, primals: tuple[Float[Array, "..."]], tangents: tuple[Float[Array, "..."]]
+    k: int, primals: tuple[Float[Array, "..."]], tangents: tuple[PyTree, ...]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, a sum over n = 0, 1, 2, …, and its
     change for a change dt of t, from the derivative ½ (k c_{k+2} − c_{k+1}). By this rule JAX
