@@ -45,16 +45,16 @@ class LogDensity(eqx.Module):
     x.
 
     Call the object with x (n,), real numbers without bounds. The entries of x are the free numbers
-    of the fitted model and the logarithms of additional factors: one factor for each noise that the
-    fit estimates, and one for each number of the process. `unpack(x)` returns the body, the states
-    and the values that x represents.
+    of the fitted model and the logarithms of additional factors. One factor multiplies each noise
+    that the fit estimates, and one factor multiplies each number of the process (a random torque).
+    `unpack(x)` returns the body, the states and the values that x represents.
 
-    If there is a process (a random torque) or a `Walk` (a drift of a sensor), a Kalman filter
-    integrates the unknown torque and the drifts out. Otherwise the readings are taken as
-    independent and normal about the motion. Such a density is too narrow if the errors of the
-    readings are autocorrelated: keep fewer readings, or give a process. The jitter of a sensor has
-    the value of the fit. The priors are the priors of the model (of its `Free`s, or an `Entropic`
-    prior); the prior of all other numbers is flat in x.
+    If there is a process or a `Walk` (a drift of a sensor), a Kalman filter integrates the unknown
+    torque and the drifts out. Otherwise the readings are taken as independent and normal about the
+    motion. Such a density is too narrow if the errors of the readings are autocorrelated: keep
+    fewer readings, or give a process. The jitter of a sensor has the value of the fit. The priors
+    are the priors of the model (of its `Free`s, or an `Entropic` prior); the prior of all other
+    numbers is flat in x.
 
     **Arguments:**
 
@@ -67,8 +67,8 @@ class LogDensity(eqx.Module):
       logarithm of the number in `process`. `None` for a known process.
 
     If only ratios of moments are determined, as by a gyro alone, the spectral density of a torque
-    scales with the square of a moment: compare `density / moment**2`, and give the process in the
-    unit of inertia of the fit (`fit.body`).
+    scales with the square of a moment of inertia. Give the process in the unit in which the fit has
+    the inertia (`fit.body`), and compare only the ratio `density / moment**2` with other results.
 
     **Fields:**
 
@@ -144,14 +144,15 @@ class LogDensity(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return the number of entries of x."""
+        """Return n, the number of entries of the argument x of this density."""
         return self.x0.size
 
     def __call__(self, x: Float[Array, " n"]) -> Scalar:
         return log_posterior_density(self.model, _checks.array_of_shape(x, self.x0.shape, "x"))
 
     def unpack(self, x: Float[Array, " n"]) -> Unpacked:
-        """Return what the vector x (n,) represents, as an `Unpacked`.
+        """Return the quantities that the argument x (n,) of this density represents, as an
+        `Unpacked`.
 
         It holds the body, the initial states, the values of the `Free`s, the noise of each sensor
         (standard deviations (R, k) for R recordings and k components), and the process.
@@ -215,7 +216,9 @@ def _slots_of_random_torque(process: Process | None, prior: Array) -> list[Slot]
     scene, slots = Scene(None, None, process, (), None), []
     several, number = len(parts_of(process)) > 1, -1
     for path, leaf in jax.tree.leaves_with_path(scene):
-        # The first number of each torque in a process is its density: count the torques by it.
+        # If the process is a sum of torques, the names get the index of the torque. A new torque
+        # begins at each number with the name `density`, since it is the first number of each
+        # torque.
         number += path[-1].name == "density"
         name = f"{path[-1].name} {number}" if several else path[-1].name
         slots.append(
@@ -277,7 +280,8 @@ def _add_free_numbers_and_reindex(
     **Arguments:**
 
     - `model`: the old model with n free numbers.
-    - `noises`: for each sensor the standard deviations of its errors, which the new model gets.
+    - `noises`: for each sensor of the new model the standard deviations (R, k) of its noise, for R
+      recordings and k components.
     - `process`: the random torque of the new model, or `None`.
     - `slots`: a slot (the description of a `Free`, a number that a fit may move) for each
       additional number. None of these numbers is given separately for each recording.
@@ -327,7 +331,8 @@ def _covariance_for_white_errors(fit: Fit, has_deterministic_motion: bool) -> np
         covariance = white_covariance(fit.linear).covariance
     elif fit.covariance_kind.startswith("sandwich"):
         # The sandwich covariance of a fit is larger than the covariance of a density with white
-        # errors. For many recordings it may be singular as well, and is then no scale for a search.
+        # errors. For many recordings it may be singular as well; a sampler could then not scale its
+        # draws by the Cholesky factor of this covariance.
         size = np.sqrt(np.diagonal(covariance))
         definite = np.linalg.eigvalsh(covariance / np.outer(size, size)).min() > 1e-10
         if (has_deterministic_motion or not definite) and fit.linear is not None:

@@ -207,7 +207,8 @@ def _log_uncertainty_of_body(direction: Array, args: tuple[Model, PyTree, Array]
     length = jnp.sqrt(jnp.sum(direction**2))
     information = fisher(model, model.start(body, size * direction / length))
     n = model.index.bodies
-    # The information on the body, if the other numbers are free as well, is a Schur complement.
+    # The information on the body, if the other numbers are free as well, is the Schur complement of
+    # their block in the information matrix.
     mine, across, rest = information[:n, :n], information[:n, n:], information[n:, n:]
     scale = jnp.sqrt(jnp.diagonal(rest))
     rest = rest / (scale[:, None] * scale[None, :]) + 1e-12 * jnp.eye(rest.shape[0])

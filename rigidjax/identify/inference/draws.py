@@ -47,7 +47,7 @@ _FULL = 8
 
 
 class Nuts(eqx.Module):
-    """Draw by the no-U-turn sampler of blackjax.
+    """Draw from a posterior density by the no-U-turn sampler of blackjax.
 
     A warm-up adapts the step and the mass matrix of the sampler. The class needs blackjax:
     `pip install rigidjax[posterior]`. Source: Hoffman and Gelman 2014, JMLR 15:1593.
@@ -129,7 +129,8 @@ class Nuts(eqx.Module):
 
 
 class Posterior(eqx.Module):
-    """Hold the result of `posterior`.
+    """Hold draws from the posterior density of a fitted model, the result of the function
+    `posterior`.
 
     **Fields:**
 
@@ -147,20 +148,24 @@ class Posterior(eqx.Module):
 
     @property
     def rhat(self) -> Float[Array, " n"]:
-        """Return the potential scale reduction (n,) of the entries of x, by blackjax.
+        """Return the potential scale reduction R̂ (n,) of the draws of each entry of x, by
+        blackjax.
 
-        It is near 1 if the chains agree.
+        It is near 1 if the chains of these draws agree.
         """
         return _checks.import_library(*_BLACKJAX).diagnostics.potential_scale_reduction(self.x)
 
     @property
     def ess(self) -> Float[Array, " n"]:
-        """Return the effective number (n,) of independent draws of each entry of x, by blackjax."""
+        """Return how many independent draws the draws of each entry of x are worth, an array (n,),
+        by blackjax.
+        """
         return _checks.import_library(*_BLACKJAX).diagnostics.effective_sample_size(self.x)
 
     @property
     def points(self) -> Unpacked:
-        """Return the body, states and values of all draws, as one `Unpacked`.
+        """Return the body, the initial states and the values of the `Free`s of all these draws, as
+        one `Unpacked`.
 
         Its arrays have two leading axes, for the chains and the samples.
         """
@@ -180,7 +185,8 @@ class Posterior(eqx.Module):
         return jax.tree.map(lambda leaf: leaf.reshape(*self.x.shape[:2], *leaf.shape[1:]), rows)
 
     def to_arviz(self) -> Any:
-        """Return the draws as an object of ArviZ.
+        """Return the draws in the form that the library ArviZ reads: what `arviz.from_dict`
+        returns.
 
         Its variables are the inertia tensors, the values of the `Free`s, the initial body rates and
         the spectral densities of the process. **Raises** `ImportError` without arviz, which needs
@@ -211,8 +217,8 @@ def _identity(point: Unpacked) -> Unpacked:
 def posterior(
     density: LogDensity, key: PRNGKeyArray, *, sampler: Sampler | None = None, chains: int = 4
 ) -> Posterior:
-    """Draw from the posterior density of a body, its initial states, all `Free`s, the noise and the
-    process.
+    """Draw from the posterior density of a body, its initial states, all `Free`s (other numbers
+    that a fit may move), the noise, and the process (a random torque).
 
     **Arguments:**
 
@@ -275,7 +281,9 @@ def _draw_chains(
         start = 0.5 * jax.random.normal(first, density.x0.shape, density.x0.dtype)
         return jax.vmap(to_numbers)(sampler(later, lambda z: density(to_numbers(z)), start))
 
-    # Chains that run together wait, in each step, for the chain with the longest trajectory.
+    # Many recordings keep a core of the processor busy with one chain, and the chains run one after
+    # another: chains that run together wait, in each step, for the chain with the longest
+    # trajectory.
     if density.model.count >= _FULL:
         return lax.map(chain, keys)
     return jax.vmap(chain)(keys)
@@ -293,11 +301,12 @@ _LEAST = 100.0
 
 
 class Refit(eqx.Module):
-    """Hold the result of `refit`.
+    """Hold the maximum of a posterior density and weighted draws about it, the result of the
+    function `refit`.
 
     **Fields:**
 
-    - `density`: the `LogDensity`.
+    - `density`: the posterior density, a `LogDensity` (function of x that returns its logarithm).
     - `x`: (n,) the point at which the density is largest.
     - `log_density`: the logarithm of the density at x.
     - `covariance`: (n, n) the covariance of x, which is the inverse of Fisher's information at x.
@@ -318,12 +327,14 @@ class Refit(eqx.Module):
 
     @property
     def point(self) -> Unpacked:
-        """Return the body, initial states, values, noise and process that x represents."""
+        """Return the body, initial states, values, noise and process that the maximum x of the
+        density represents.
+        """
         return self.density.unpack(self.x)
 
     @property
     def effective_count(self) -> Scalar:
-        """Return the number of independent draws that the weighted draws are worth.
+        """Return how many independent draws the weighted `draws` of this result are worth.
 
         It is 1/Σw² for the weights w. Source: Kish, Survey Sampling (1965).
         """
@@ -384,7 +395,8 @@ class Refit(eqx.Module):
 def refit(
     density: LogDensity, *, max_steps: int = 200, draws: int = 1000, key: PRNGKeyArray | None = None
 ) -> Refit:
-    """Find the maximum of a posterior density, and draw around the maximum for intervals.
+    """Find the maximum of a posterior density, and draw about the maximum; intervals are computed
+    from the draws.
 
     The function is a fit that allows for an unknown torque (the process of the model):
     `refit(LogDensity(fit))` finds the body, the initial states, all `Free`s and the spectral

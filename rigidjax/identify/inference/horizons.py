@@ -26,9 +26,9 @@ from rigidjax.identify.model.terms import all_errors
 def predict_windows(fit: Fit, windows: Windows) -> Horizons:
     """Return the open-loop prediction errors of a fitted model, as functions of the horizon.
 
-    The horizon is the number of steps from the measured start of a window to the predicted state.
-    The model predicts from the measured start of each window, with the fitted body and the fitted
-    numbers that all windows share.
+    A window is a short part of a record of measured states, and the horizon is the number of steps
+    from its measured start to the predicted state. The model predicts from the measured start of
+    each window, with the fitted body and the fitted numbers that all windows share.
 
     **Arguments:**
 

@@ -90,8 +90,8 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
         @functools.cache
         def growth_and_value_at(steps: float, side: float = side) -> tuple[float, float]:
             # The pull is weak: after the fit the quantity lies between its best value and the
-            # target. This makes no error, because the fitted point has the least misfit of all
-            # points with the same value of the quantity.
+            # target. This makes no error in the profile, because the fitted point has the least
+            # misfit of all points with the same value of the quantity.
             nonlocal point
             size = middle + side * steps * deviation, PULL * deviation
             target, width = (jnp.asarray(x, kind) for x in size)

@@ -34,15 +34,17 @@ class AbstractBodyChart(eqx.Module):
     """Define a chart of bodies, which maps `size` unconstrained numbers to an `Inertia` or
     `MassProperties`, and back.
 
-    To make a chart of your own, write a subclass with the methods `body`, `vector` and `logs` and
-    these members:
+    To make a chart of your own, write a subclass with three methods: `body(vector)` returns the
+    body that the numbers represent, `vector(body)` the numbers of a body, and `logs(body)` the
+    logarithms of its positive quantities. The subclass also needs these members (the last two may
+    be left out):
 
     - `size`: how many numbers represent a body.
-    - `log_names`: the names of the positive quantities of a body that a fit reports; `logs(body)`
-      returns the logarithms of these quantities.
+    - `log_names`: the names of the positive quantities of a body that a fit reports, in the order
+      of `logs(body)`.
     - `plain_names`: the names of the quantities of either sign that a fit reports; `plain(body)`
       returns these quantities. By default there are no such quantities.
-    - `unit`: the unit of all reported quantities, by default an empty text.
+    - `unit`: the unit of these quantities, by default an empty text.
 
     >>> class Spheres(AbstractBodyChart):  # one number: the logarithm of the moment
     ...     size, unit, log_names = 1, "kg m²", ("I",)
@@ -79,9 +81,10 @@ class AbstractBodyChart(eqx.Module):
         """Return j rows B (j, size), by which a fit allows for the curvature of the chart: the body
         is not a linear function of its numbers.
 
-        The curvature adds BᵀB to the second derivative of a misfit. This matters if a body may be
-        flat (see `rigidjax.body.parameters.curvature_rows_near_flat_body`). A chart that returns no
-        rows (j = 0) leaves the curvature out.
+        A fit adds BᵀB to the matrix JᵀJ of its normal equations, since J holds first derivatives
+        only. This matters if a body may be flat (see
+        `rigidjax.body.parameters.curvature_rows_near_flat_body`). A chart that returns no rows (j =
+        0) leaves the curvature out.
 
         - `vector`: (size,) the numbers of the body in the chart.
         - `misfit_gradient`: (size,) the derivative of the misfit with respect to these numbers.
@@ -102,13 +105,13 @@ class AbstractBodyChart(eqx.Module):
 
 
 class Ratios(AbstractBodyChart):
-    """Map five numbers to the inertia tensor up to scale: two ratios of moments and the principal
-    axes.
+    """Map five numbers to the inertia tensor up to scale, which is the two ratios I1/I3 and I2/I3
+    of the principal moments, and the directions of the principal axes.
 
     The chart is for free motion, which does not show the scale of the inertia. The five numbers
-    describe a square root of the matrix of second moments 𝔖 = ∫ r rᵀ dm; the scale of 𝔖 is fixed
-    (`rigidjax.body.parameters.pack_shape`). In this way a flat body, whose 𝔖 is singular, is an
-    ordinary point of the chart.
+    describe a square root of the matrix of second moments 𝔖 = ∫ r rᵀ dm, where r is the position of
+    the mass element dm; the trace of 𝔖 is set to 1 (`rigidjax.body.parameters.pack_shape`). In this
+    way a flat body, whose 𝔖 is singular, is an ordinary point of the chart.
 
     >>> Ratios().logs(Ratios().body(jnp.zeros(5)))
     Array([0., 0.], dtype=float64)
@@ -135,11 +138,12 @@ class Ratios(AbstractBodyChart):
 class PrincipalRatios(AbstractBodyChart):
     """Map two numbers to two ratios of moments, if the body axes are known to be principal.
 
-    The two numbers describe the square roots of the second moments λ1, λ2, λ3 along the axes; the
-    scale of the second moments is fixed (notes, eqs 72, 76–78). In this way the moments of inertia
-    obey the triangle inequalities for every pair of numbers.
+    The two ratios are Ix/Iz and Iy/Iz. The two numbers describe the square roots of the second
+    moments λ1, λ2, λ3 along the axes; the sum of the second moments is set to 1 (notes, eqs 72,
+    76–78). In this way the moments of inertia obey the triangle inequalities for every pair of
+    numbers.
 
-    >>> PrincipalRatios().body(jnp.zeros(2)).moments.sum().round(12)  # Tr I = 2, as of `Ratios`
+    >>> PrincipalRatios().body(jnp.zeros(2)).moments.sum().round(12)  # the trace of I is 2
     Array(2., dtype=float64)
     """
 
@@ -164,11 +168,12 @@ class PrincipalRatios(AbstractBodyChart):
 
 
 def _checked_typical_moment(value: object) -> Array:
-    """Return the rough size of the moments of inertia, kg m², from which a fit starts, as an array
-    of shape ().
+    """Return the argument `typical` of a chart as an array of shape (): the rough size of the
+    moments of inertia, kg m², from which a fit starts.
 
     It raises `ValueError` unless the number `value` is positive. It raises `TypeError` if `value`
-    is a body: a known body is given as `Known(body)`, and a first guess by `model.start(body)`.
+    is a body, since a user gives a known body as `Known(body)`, and a first guess by
+    `model.start(body)`.
     """
     if isinstance(value, Inertia | MassProperties):
         raise TypeError(
@@ -184,8 +189,9 @@ class Tensor(AbstractBodyChart):
     """Map six numbers to the inertia tensor with its scale.
 
     The scale can be found if a torque or a momentum is known. The first of the six numbers is the
-    logarithm of the size of the matrix of second moments 𝔖 = ∫ r rᵀ dm, in units of `typical`. The
-    other five are the numbers of `Ratios`.
+    logarithm of the size of the matrix of second moments 𝔖 = ∫ r rᵀ dm, in units of `typical`; here
+    r is the position of the mass element dm. The other five are the numbers of `Ratios`, the chart
+    of a tensor without its scale.
 
     **Arguments:** `typical` kg m², the rough size of the moments of inertia, with which a fit
     starts. **Raises** `ValueError` if `typical` is not positive.
@@ -223,9 +229,10 @@ class Principal(AbstractBodyChart):
     principal.
 
     The first number is the logarithm of the size of the second moments, in units of `typical`. The
-    other two are the numbers of `PrincipalRatios`.
+    other two are the numbers of `PrincipalRatios`, the chart of the ratios of these moments.
 
-    **Arguments:** as for `Tensor`.
+    **Arguments:** `typical` kg m², the rough size of the moments of inertia, with which a fit
+    starts. **Raises** `ValueError` if `typical` is not positive.
 
     >>> Principal(2.0).body(jnp.zeros(3)).tensor[0, 0]
     Array(2., dtype=float64)
@@ -312,8 +319,9 @@ class Mass(AbstractBodyChart):
         """Return the size of the body of the guess (the roughly known body of this chart), m, as an
         array of shape ().
 
-        It is the square root of Tr 𝔖 / m, where 𝔖 is the matrix of second moments about the centre
-        of mass and m the mass. The free numbers of the centre of mass are in units of this size.
+        It is the square root of the trace of 𝔖 / M, where 𝔖 is the matrix of second moments about
+        the centre of mass and M the mass. The free numbers of the centre of mass are in units of
+        this size.
         """
         return jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
 
@@ -390,7 +398,8 @@ class Bodies(eqx.Module):
 
     The vector of the numbers of all bodies holds the numbers of one body after the other. Charts
     are of one form if they have the same structure and their arrays have the same shapes. All
-    charts of one form are stacked in one chart, so that one program serves all recordings.
+    charts of one form are stacked in one chart, so that one compiled program serves the recordings
+    of all bodies.
 
     **Fields:**
 
@@ -429,7 +438,7 @@ class Bodies(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return how many free numbers describe all bodies together."""
+        """Return how many free numbers describe the bodies of all charts together."""
         return sum(chart.size for chart in self.charts)
 
     def all_bodies_by_name(
@@ -456,8 +465,10 @@ class Bodies(eqx.Module):
             body = chart.body(vector[: chart.size])
             leaves, form = jax.tree.flatten(body)
             if chosen is not None:
-                # The choice is made leaf by leaf, since the tree structures may differ: the body of
-                # a `Known` may have a `scale`, which is static.
+                # The chart of each kind makes a body, and the body of the right kind is chosen. The
+                # choice is made array by array, since a choice between whole JAX trees needs trees
+                # of one structure: the body of a `Known` chart may have another `scale`, a static
+                # member, than the other bodies.
                 both = zip(leaves, jax.tree.leaves(chosen), strict=True)
                 body = jax.tree.unflatten(form, [jnp.where(kind == index, *pair) for pair in both])
             chosen = body
@@ -465,10 +476,11 @@ class Bodies(eqx.Module):
 
 
 def body_with_scale_mark(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
-    """Return the body that the numbers `vector` represent in a `chart`, with the mark that a user
-    needs: an `Inertia` that the chart finds only up to a factor is marked as of arbitrary scale.
+    """Return the body that the numbers `vector` represent in a `chart`. An `Inertia` that the chart
+    finds only up to a factor gets the mark `scale="arbitrary"`, with which a torque on this body is
+    refused.
 
-    The mark is `AbstractBodyChart.scale`. Inside a fit bodies have no such mark.
+    The mark comes from the member `scale` of the chart. Inside a fit bodies have no such mark.
     """
     body = chart.body(vector)
     if chart.scale is None or isinstance(body, MassProperties):

@@ -16,7 +16,7 @@ from rigidjax.identify.model.scene import Scene
 
 class Free(eqx.Module):
     """Define a free number, which a fit moves: a number or an array in the torque or in the sensors
-    of a `Scene`.
+    of a `Scene` (the body, torques, sensors and initial state of a recording).
 
     **Arguments:**
 
@@ -31,8 +31,9 @@ class Free(eqx.Module):
       recordings with the same label share a value.
     - `positive`: whether the fit moves the logarithm of the number, so that its sign is kept.
     - `prior`: the standard deviation of a normal prior about the starting value. It is in the unit
-      of the number, or relative to the number if `positive` is true. With `None` the prior is the
-      `Tolerance` that the sensor has for this number; there is no prior if the sensor has none.
+      of the number, or relative to the number if `positive` is true. With `None` it is the standard
+      deviation that the sensor's `Tolerance` (the size of its constant errors) states for this
+      number; there is no prior if the sensor states none.
     - `spread`: if the value of each recording deviates from the shared value, the standard
       deviation of these deviations; `None` for no deviations. It is in the unit of the number, or
       relative to the number if `positive` is true. With `"estimated"` the fit estimates it from
@@ -106,7 +107,11 @@ def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
 
 
 class Slot(eqx.Module):
-    """Hold a `Free` whose leaf in the scene (as a JAX tree) has been found.
+    """Hold a `Free` (a number or an array that a fit may move) together with its place in the
+    scene.
+
+    The scene is the body, torques, sensors and initial state of a recording. It is a JAX tree, and
+    the number or array is a leaf of this tree.
 
     A `Slot` contains no function: a `Free` contains the function `where`, and a new function in a
     second model would force a new compilation. A *step* is the change of the leaf (of its
@@ -125,7 +130,7 @@ class Slot(eqx.Module):
     - `prior`, `spread`: the standard deviations `prior` and `spread` of the `Free`, in units of
       `scale`, or `None`.
     - `estimated`: whether the fit estimates the `spread`.
-    - `column`: the index of the first step among the free numbers of one recording.
+    - `column`: the index of the first step among the free numbers on which one recording depends.
     - `shared`: (groups, *shape) the indices, among all free numbers, of the steps that recordings
       share; `None` if no recordings share a step.
     - `own`: (R, *shape) the indices, among all free numbers, of the steps that each recording has
@@ -153,7 +158,8 @@ class Slot(eqx.Module):
     def columns_in_row(self) -> slice:
         """Return a slice that picks the steps of this slot from the free numbers of one recording.
 
-        A step is the change of a number of the slot's leaf, in units of `scale`.
+        A slot describes an array of the scene that a fit may move. A step is the change of one
+        number of this array, in units of `scale`.
         """
         return slice(self.column, self.column + int(np.prod(self.shape, dtype=int)))
 
@@ -350,9 +356,9 @@ def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"
     """Return the `scene` of a recording after the changes of its free leaves (arrays of numbers).
 
     - `scene`: the scene with the starting value of each leaf.
-    - `slots`: for each free leaf its path, scale and columns.
-    - `row`: all free numbers of the recording; the columns of a slot hold the change of its leaf,
-      in units of the scale.
+    - `slots`: a `Slot` for each free leaf, with its path, scale and columns.
+    - `row`: all free numbers of the recording. The columns of a slot (the numbers of `row` at these
+      indices) are the change of its leaf, in units of its scale.
     """
     paths = [slot.path for slot in slots]
     values = []

@@ -28,7 +28,7 @@ class Index(eqx.Module):
     - `places`: (R, columns) the place in x of each column of the rows. A slot with deviations has
       further columns at the end, which hold the places of the deviations. A column that stands for
       no number, as in the row of a body whose chart has fewer numbers, has the place n.
-    - `start`: (R, k) the places of the initial states.
+    - `start`: (R, k) the places in x of the k free numbers of the initial state of each recording.
     - `columns`: for each column of `places`, the column of the row to which the number at this
       place is added.
     - `alone`: the columns of `places` whose numbers belong to one recording alone.

@@ -71,8 +71,8 @@ from rigidjax.motion.torques.base import AbstractForce, Torque, require_torque
 from rigidjax.motion.torques.composite import parts_of
 from rigidjax.motion.torques.inputs import delays_of, input_names_of
 
-# In one step of the filter the body turns by at most this angle, rad. For this angle the error of
-# the classical Runge–Kutta method of order 4 is 5e-8 of the angle.
+# In one integration step of a Kalman filter the body turns by at most this angle, rad. For this
+# angle the error of the classical Runge–Kutta method of order 4 is 5e-8 of the angle.
 TURN_OF_A_FILTER_STEP = 0.05
 # Times count as evenly spaced if no step differs from the first step by more than this fraction of
 # the first step.
@@ -94,16 +94,19 @@ class AbstractPull(eqx.Module):
 
 
 class Unpacked(eqx.Module):
-    """Hold the quantities that the free numbers of a model represent.
+    """Hold the quantities that the free numbers of a model represent, such as the body and the
+    initial state.
 
     **Fields:**
 
     - `x`: (n,) the free numbers.
     - `body`: the body; several bodies as a dict by name.
     - `state0`: the initial state; the initial states of several recordings have a leading axis.
-    - `values`: the values of the `Free`s by name, in their units.
-    - `noise`: if x belongs to a `LogDensity`, for each sensor the standard deviations (R, k) of its
-      noise, in its unit, for R recordings and k components; else `None`.
+    - `values`: the values of the `Free`s (other numbers that a fit may move) by name, in their
+      units.
+    - `noise`: if x belongs to a `LogDensity` (posterior density of a fitted model), for each sensor
+      the standard deviations (R, k) of its noise, in its unit, for R recordings and k components;
+      else `None`.
     - `process`: if x belongs to a `LogDensity` with a random torque, this torque; else `None`.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
@@ -261,25 +264,28 @@ class Model(eqx.Module):
         elif integrator is None and torque is not None:
             integrator = integrator_for(turn)
         self.integrator = integrator
-        # Without a filter the number of its steps is not needed. The number would only force a new
-        # compilation if another recording has a longer or shorter widest interval between times.
+        # A model without a random torque or drift needs no Kalman filter, and not the number of the
+        # filter's steps. The number would only force a new compilation for a recording whose
+        # longest interval between times is longer or shorter.
         filtered = process is not None or self.walks
         self.filter_steps = filter_steps_per_interval(self) if filtered else 1
 
     @property
     def size(self) -> int:
-        """Return the number n of the free numbers."""
+        """Return n, how many free numbers this model has."""
         return self.index.size
 
     @property
     def count(self) -> int:
-        """Return the number of recordings."""
+        """Return how many recordings this model has."""
         return int(self.records.t.shape[0])
 
     @property
     def recordings(self) -> tuple[Recording, ...]:
-        """Return the recordings as a tuple, each with its own number of times, without the masked
-        readings that fill up shorter recordings in `records`.
+        """Return the recordings of this model as a tuple.
+
+        The model stores them with equally many times, where masked readings fill up the shorter
+        recordings. These readings are left out here.
         """
         return tuple(
             stacking.take_rows(stacking.pick_records(self.records, index), count)
@@ -288,20 +294,21 @@ class Model(eqx.Module):
 
     @property
     def recording(self) -> Recording:
-        """Return the only recording, or the first one."""
+        """Return the only recording of this model, or the first one of several."""
         return self.recordings[0]
 
     @property
     def typical_rate(self) -> Scalar:
-        """Return the typical body rate of the first recording, rad/s.
+        """Return the typical body rate of the first recording of this model, rad/s, as its readings
+        show it (1 if they show no rate).
 
         The free numbers of the initial rate of this recording are in units of the typical rate.
         """
         return self.reference.rate[0]
 
     def start(self, body: PyTree = None, omega: NumbersLike | None = None) -> Float[Array, " n"]:
-        """Return free numbers (n,) with which a fit may start, or the free numbers of a planned
-        motion.
+        """Return free numbers (n,) with which a fit of this model may start, or which describe a
+        planned motion of a given body at a given rate.
 
         Each number of a `Free` has its starting value.
 
@@ -314,7 +321,7 @@ class Model(eqx.Module):
           first reading of a gyro, or the rate between measured attitudes (0 if the readings are
           traced).
 
-        **Raises:** `ValueError` for a body that the chart does not hold, or a wrong shape.
+        **Raises:** `ValueError` for a body that the chart cannot represent, or a wrong shape.
         """
         require_single_model(self)
         if isinstance(self.chart, Bodies):
@@ -416,7 +423,7 @@ class _RecordedData(NamedTuple):
     **Fields:**
 
     - `records`: all R recordings as one `Recording`, whose arrays have a leading axis (R,).
-    - `counts`: (R,) the number of times of each recording without padding.
+    - `counts`: (R,) how many sample times each recording has, without padding.
     - `sensors`: the sensors of one recording.
     - `state_kind`: the type of the states: `Spin`, `Attitude` or `Rigid`.
     - `reference`: the state of each recording from which its initial state is measured: the free
@@ -629,7 +636,8 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
     """Return the values of all `Free`s of a `model` at the free numbers x (n,), as a dict of name →
     array, without a check of x.
 
-    The shapes are those of `Model.values`.
+    The shapes are (R, …) for a `Free` that has a value for each of R recordings, (groups, …) for a
+    value for each group of recordings, else that of a single value.
     """
     rows, out = model.index.rows_of_recordings(x), {}
     starts = starting_values_of_free_numbers(model)
@@ -664,11 +672,11 @@ def starting_values_of_free_numbers(model: Model) -> list[Float[Array, "records 
 
 
 def filter_steps_per_interval(model: Model) -> int:
-    """Return the number of integration steps that a filter takes between two successive times of
-    the recordings of a `model`.
+    """Return how many integration steps a Kalman filter takes between two successive times of the
+    recordings of a `model`.
 
     The number is so large that a body at 1.5 times its typical rate turns by at most
-    `TURN_OF_A_FILTER_STEP` in a step, even in the longest interval.
+    `TURN_OF_A_FILTER_STEP` radians in a step, even in the longest interval.
     """
     widest = np.max(np.diff(np.asarray(model.records.t), axis=1), initial=0.0)
     turn = 1.5 * float(widest) * float(np.max(np.asarray(model.reference.rate)))

@@ -31,7 +31,8 @@ class OwnBlocks(eqx.Module):
 
 
 class NormalMatrix(eqx.Module):
-    """Hold a normal matrix of n numbers.
+    """Hold the normal matrix of a least-squares problem of n numbers, such as JᵀJ with the Jacobian
+    J of the residuals.
 
     **Fields:**
 
@@ -45,12 +46,12 @@ class NormalMatrix(eqx.Module):
 
     @property
     def diagonal(self) -> Float[Array, " n"]:
-        """Return the diagonal (n,) of the matrix."""
+        """Return the diagonal (n,) of this normal matrix."""
         own = self.own_blocks and jnp.diagonal(self.own_blocks.own, axis1=1, axis2=2)
         return self._join_shared_and_own(jnp.diagonal(self.core), own)
 
     def add_diagonal(self, diagonal: Float[Array, " n"]) -> "NormalMatrix":
-        """Return the matrix with `diagonal` (n,) added to its diagonal."""
+        """Return this normal matrix with `diagonal` (n,) added to its diagonal."""
         shared, own = self._split_shared_and_own(diagonal)
         core, alone = self.core + jnp.diag(shared), self.own_blocks
         if alone is None:
@@ -60,7 +61,8 @@ class NormalMatrix(eqx.Module):
         )
 
     def add_residual_rows(self, rows: Float[Array, "m n"]) -> "NormalMatrix":
-        """Return the normal matrix of a larger problem, which has m residuals more.
+        """Return the normal matrix of a larger least-squares problem, which has m residuals more
+        than the problem of this matrix.
 
         The `rows` (m, n) are the derivatives of the m further residuals with respect to the n
         numbers. These residuals may depend only on numbers of the core, which are the numbers
@@ -70,7 +72,8 @@ class NormalMatrix(eqx.Module):
         return NormalMatrix(self.core + rows.T @ rows, self.own_blocks)
 
     def scale_rows_and_columns(self, unit: Float[Array, " n"]) -> "NormalMatrix":
-        """Return the matrix D M D, where M is this matrix and D the diagonal matrix of `unit` (n,).
+        """Return the matrix D M D, where M is this normal matrix and D the diagonal matrix of
+        `unit` (n,).
 
         It is the normal matrix with respect to x / `unit` instead of the numbers x.
         """

@@ -50,9 +50,10 @@ State = Spin | Attitude | Rigid
 class AbstractIntegrator(eqx.Module):
     """Integrate a forced motion inside a fit, with derivatives in forward mode.
 
-    At its end a fit compares its predictions with the predictions of an integrator of shorter steps
-    (`refine`). If a prediction changes by more than a twentieth of its noise, the fit goes on with
-    the shorter steps.
+    To make an integrator of your own, write a subclass with the method `states`, which returns the
+    states at the times `ts`. At its end a fit compares its predictions with the predictions of an
+    integrator of shorter steps (`refine`). If a prediction changes by more than a twentieth of its
+    noise, the fit goes on with the shorter steps.
 
     >>> class Halves(AbstractIntegrator):  # two equal steps from one sample to the next
     ...     def states(self, body, state0, ts, torque):
@@ -76,8 +77,10 @@ class AbstractIntegrator(eqx.Module):
         """
 
     def refine(self) -> "AbstractIntegrator | None":
-        """Return an integrator of shorter steps for comparison, or `None` if shorter steps are not
-        possible.
+        """Return an integrator of shorter steps, or `None` if shorter steps are not possible.
+
+        A fit compares the predictions of both integrators to see whether its steps are short
+        enough.
         """
         return None
 
@@ -134,8 +137,9 @@ def _tolerance_converter(name: str) -> Callable[[ScalarLike], Array]:
 class Adaptive(AbstractIntegrator):
     """Integrate with steps that are chosen by tolerances, through `rigidjax.simulate`.
 
-    **Arguments:** `rtol`, `atol` as for `rigidjax.simulate`. In float32 `rtol` is at least 1.2e-5.
-    A fit with another tolerance is not compiled again.
+    **Arguments:** `rtol`, `atol` the relative and the absolute tolerance of each step, as for
+    `rigidjax.simulate`. In float32 a relative tolerance of at least 1.2e-5 is used. A fit with
+    other tolerances is not compiled again.
 
     >>> float(Adaptive().rtol)
     1e-09
@@ -262,7 +266,8 @@ class HeldSteps(AbstractIntegrator):
             return y, stepper.state_of_numbers(y)
 
         def warm_up(y: PyTree, i: Array) -> tuple[PyTree, None]:
-            # The torque's own states follow the inputs, while the body keeps its initial state.
+            # Before the first time of the record the torque's own states (such as the speed of a
+            # motor) follow the inputs, while the body keeps its initial state.
             y, _ = take_step(y, i)
             return split_into_scalars(Coupled(start.motion, stepper.state_of_numbers(y).own)), None
 

@@ -17,7 +17,9 @@ class AbstractLoss(eqx.Module):
     """Define a robust loss ρ(s), which gives outliers less weight.
 
     Here s is the squared length of the error vector of a reading, in units of its noise. Since the
-    loss is a function of this length alone, it does not depend on the frame of the vector.
+    loss is a function of this length alone, it does not depend on the frame of the vector. To make
+    a loss of your own, write a subclass with two methods of the error: `shrink` returns the error
+    shortened to the squared length ρ(s), and `weight` the derivative dρ/ds.
 
     >>> class Squares(AbstractLoss):  # no outliers: ρ(s) = s
     ...     def shrink(self, error):

@@ -36,7 +36,7 @@ Row = Float[Array, " columns"]
 BodyIndex = Array | None
 # `Blocks` are two tuples with one array for each sensor, for R recordings, T times and k
 # components: the errors (R, T, k); and the derivatives (R, T, k, m) of these errors with respect to
-# the m numbers of a row.
+# the m free numbers on which a recording depends (its row).
 Blocks = tuple[tuple[Array, ...], tuple[Array, ...]]
 # `SensorErrors` holds one array for each sensor, such as its errors (R, T, k).
 SensorErrors = tuple[Array | np.ndarray, ...]
@@ -168,7 +168,8 @@ def map_over_recordings(function: Callable[..., PyTree], model: "Model", *argume
         return function(*eqx.combine(part, rest))
 
     if model.count == 1:
-        # One recording needs no loop, and the program is smaller without it.
+        # For a single recording the function is called directly: a loop over recordings would only
+        # make the compiled program larger.
         return jax.tree.map(
             lambda leaf: leaf[None], function_of_recording(stacking.pick_records(arrays, 0))
         )
@@ -447,8 +448,9 @@ def residuals_and_jacobians(
     - `slopes`: for each sensor the derivatives (R, T, k, n) of its errors with respect to the n
       numbers.
     """
-    # Each residual depends only on the errors of the same reading, so that this product with the
-    # derivative is cheap.
+    # The product of the derivative of `function` with the slopes is cheap, since each residual
+    # depends only on the errors of the same reading: no matrix of all residuals by all errors is
+    # made.
     value, push = jax.linearize(function, errors)
     return value, jax.vmap(push, in_axes=-1, out_axes=-1)(slopes)
 

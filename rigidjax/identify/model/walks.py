@@ -46,7 +46,10 @@ class Walk(eqx.Module):
 
 
 class Drift(eqx.Module):
-    """Hold a `Walk` whose leaf in the scene (as a JAX tree) has been found.
+    """Hold a `Walk` (a sensor error that drifts) together with its place in the scene.
+
+    The scene is the body, torques, sensors and initial state of a recording. It is a JAX tree, and
+    the error is a leaf of this tree.
 
     A `Drift` contains no function: a `Walk` contains the function `where`, and a new function in a
     second model would force a new compilation.

@@ -106,7 +106,8 @@ class Checkpoint:
         if self.path is None:
             return
         head = dict(print_of=self.print_of, done=len(attempts))
-        # The temporary file has a unique name: another program may write to the same checkpoint.
+        # The new checkpoint is written to a temporary file, which then replaces the old one. The
+        # temporary file has a unique name, since another program may write to the same checkpoint.
         part = self.path.with_name(f"{self.path.name}.{uuid.uuid4().hex}.part")
         try:
             with part.open("xb") as file:

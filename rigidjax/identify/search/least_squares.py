@@ -20,7 +20,8 @@ from rigidjax.identify.model.normal import NormalMatrix
 CAREFUL, BOLD = 1.0, 1e-3
 # One step changes a number of order one by no more than this.
 LONGEST = 2.0
-# A step with at most this damping counts as a Gauss–Newton step.
+# A step of the search with at most this damping counts as a Gauss–Newton step, which has no
+# damping.
 FREE = 1e-2
 # The gain of a step is the fall of the cost. A step supports the quadratic model of the cost if its
 # actual gain is more than this fraction of its predicted gain.
@@ -35,11 +36,12 @@ LINEAR = 0.05
 PATIENCE, FIRST_PACE = 25.0, 4.0
 # A search with more damping than this is stuck: its steps are too short to change the point.
 STUCK = 1e12
-# A cost computed by adaptive integration, for instance, is noisy. Take the ratio of the rise of the
-# cost in a refused step to the predicted gain of this step. A cost counts as noisy if three things
-# are true. Two steps in succession are refused. The ratio of the second step is larger than NOISY,
-# and larger than the ratio of the first step. The predicted gain of the second step is less than
-# the fraction LITTLE of the cost. For a smooth cost the ratio becomes smaller as steps get shorter.
+# A search ends at a noisy cost, such as a cost computed by adaptive integration, since no step can
+# be judged by it. A refused step is one that raises the cost; its ratio is this rise divided by the
+# predicted gain (fall of the cost). For a smooth cost the ratio becomes smaller as steps get
+# shorter. A cost therefore counts as noisy if two steps in succession are refused, if the ratio of
+# the second step is larger than NOISY and larger than the ratio of the first step, and if the
+# predicted gain of the second step is less than the fraction LITTLE of the cost.
 NOISY, LITTLE = 10.0, 1e-4
 # If the noise is unknown, the length of the step that ends a search is in proportion to the root
 # mean square of the errors. This root mean square is taken to be at least this number, because
@@ -64,7 +66,8 @@ class Settings(eqx.Module):
     `aim`, `near`, `count` and `level`:
 
     - `tolerance`: the search has converged if the next step changes each number by less than this
-      many standard deviations of the number, computed with all other numbers fixed.
+      many standard deviations of the number. Here the standard deviation of a number is computed
+      with all other numbers fixed.
     - `damping`: the damping of the first step.
     - `steps`: the largest number of steps.
     - `aim`: a cost that another search reached; this search ends if it would need more than
@@ -74,7 +77,7 @@ class Settings(eqx.Module):
       then estimated by the root mean square of all errors. With zero this standard deviation is
       one.
     - `level`: the search ends after a step whose gain is about the predicted gain, but less than
-      this fraction of the gain of a fit from noise alone.
+      this fraction of the mean gain of a fit that follows only the noise of the readings.
     """
 
     tolerance: Any = eqx.field(converter=_setting_as_array)
@@ -153,8 +156,9 @@ def minimise(
     - `zeros`: a tree of zeros with the shapes of the values to keep.
     - `zero_normal`: zeros with the shapes of the normal matrix, if it is not one dense matrix
       (`NormalMatrix.own_blocks`).
-    - `gain_of_noise`: given the kept values and the normal matrix, this function returns the gain
-      of a fit from noise alone (see `Settings.level`); or `None`.
+    - `gain_of_noise`: given the kept values and the normal matrix, this function returns the mean
+      gain (fall of the cost) of a fit that follows only the noise of the readings (see
+      `Settings.level`); or `None`.
     """
     number, kind = start.size, start.dtype
     begun = LMState(

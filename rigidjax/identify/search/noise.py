@@ -13,7 +13,7 @@ from rigidjax.identify.model.terms import Blocks, Noise, error_derivatives_by_de
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 from rigidjax.identify.uncertainty.degrees_of_freedom import counts_of_determined_numbers
 
-# The joint estimate of noise and jitter takes at most this many iterations.
+# The joint estimate of the noise and the jitter of a sensor takes at most this many iterations.
 ROUNDS = 500
 
 
@@ -91,7 +91,8 @@ def initial_noise(model: Model) -> Noise:
         if reading.has_known_noise:
             out.append(sensor.noise)
         else:
-            # The size of this noise matters little, as long as no sensor outweighs another.
+            # The noise of this sensor is not known, and its first value is a tenth of the signal.
+            # Its size matters little, as long as no sensor outweighs another.
             values = reading.values.reshape(*reading.mask.shape, -1)
             size = jnp.sqrt(jnp.mean(jnp.sum(values**2, axis=-1)) + 1e-300)
             out.append(jnp.full((model.count, sensor.components), 0.1) * size)
@@ -155,8 +156,8 @@ def _shares_of_squared_error_left_by_fit(
     sizes = [np.bincount(groups, one.usable_channel_mask.sum(axis=(1, 2))) for one in readings]
     held = model.prior, model.pull, *((slot.prior, slot.spread) for slot in model.slots)
     if len(readings) * sizes[0].size == 1 and not jax.tree.leaves(held):
-        # Without priors, and with a single noise, the sum of all leverages is the number of fitted
-        # numbers.
+        # Without priors, and if all readings share one noise, the leverages of the readings are not
+        # needed one by one: their sum is the number of fitted numbers.
         taken = [np.array([x.size])]
     else:
         linear = linearise(model, x, noise, blocks)

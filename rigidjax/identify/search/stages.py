@@ -36,8 +36,10 @@ STRIDE = 25
 # A search has reached the minimum if one run of STRIDE steps lowers the misfit by less than this
 # fraction of the misfit.
 SETTLED = 1e-7
-# A fit to the beginning of a record may raise the misfit of the whole record by at most this
-# factor.
+# The result of a fit to the beginning of a record is used only if it raises the misfit of the whole
+# record by less than this factor. A start is given up if its fit to the beginning does not
+# converge, and its misfit there exceeds, by more than this factor, the share of the beginning in
+# the misfit of another start.
 WILD = 100.0
 # A search over windows ends at a distance of about TOLERANCES times the tolerance from the minimum.
 # By default this distance is 0.05 standard deviations. The search ends when the gain of a step
@@ -105,8 +107,8 @@ class Task(NamedTuple):
 
     @property
     def steps_per_run(self) -> int:
-        """Return the number of steps of one compiled run, after which an interrupt (Ctrl-C) is
-        noticed.
+        """Return how many steps the search for this task takes in one compiled run. An interrupt
+        (Ctrl-C) is noticed after the run.
         """
         return min(STRIDE, self.max_steps)
 
@@ -469,17 +471,19 @@ def fit_in_stages(
         return at_once
     level = float(end.first)
     for part in HORIZONS[:-1]:
-        # The fit to the beginning of the record need not converge.
+        # This fit to the beginning of the record need not converge, since its result is only the
+        # start of the next fit.
         weights = weights_of_beginning(model, part)
         end = _take_marquardt_steps(x, task, weights, CAREFUL, aim * part, aim * part)
-        # A point that explains the beginning of the record may be far off later in the record, for
-        # instance if its drag has the wrong sign.
+        # Free numbers that explain the beginning of the record may be far off later in the record,
+        # for instance if the drag has the wrong sign. They are used only if the misfit of the whole
+        # record does not grow too much.
         after = cost_of(model, end.point, noise)
         if after < WILD * max(level, 1e-300):
             x, level = end.point, after
         if aim * part > 0 and not bool(end.converged) and float(end.cost) > WILD * aim * part:
-            # Another start explains the beginning of the record, and this start does not. This
-            # start is given up.
+            # The search from another start explains the whole record, and the search from this
+            # start does not even explain the beginning of the record. This start is given up.
             attempt = Attempt(x, level)
             watch(attempt)
             return attempt
@@ -487,7 +491,8 @@ def fit_in_stages(
     if not float(at_once.cost) < (1.0 - SETTLED) * float(attempt.cost):
         return attempt
     # The fits to the beginning of the record may have led away from the minimum of the whole
-    # record's misfit.
+    # record's misfit. The first fit to the whole record, which has a lower misfit, is then the
+    # result, after further steps if it has not converged.
     return (
         at_once
         if bool(at_once.converged)

@@ -199,8 +199,8 @@ def _descent_steps(
 def misfit_of(
     x: Float[Array, " n"], model: Model, noise: Noise, recording_indices: Array
 ) -> Float[Array, ""]:
-    """Return the misfit of some recordings, scaled up to the number of all recordings, plus the
-    misfit of the priors.
+    """Return the misfit of some recordings (half the sum of their squared residuals), scaled up to
+    the number of all recordings, plus the misfit of the priors.
 
     The mean of this sum over random batches is the misfit of the whole model.
 
