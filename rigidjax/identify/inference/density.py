@@ -32,8 +32,8 @@ from rigidjax.identify.model.terms import Noise, scene_at_starting_values
 from rigidjax.identify.uncertainty.covariance import white_covariance
 from rigidjax.motion.torques.composite import parts_of
 
-# This advice is added to an error if the density has a process (an unknown random torque): a fit
-# without this torque may end far from the true body.
+# This advice is added to the error that x is not determined, if the density has a process (an
+# unknown random torque): a fit without this torque may end far from the true body.
 _GUESS = (
     ", or begin from a first guess, fit(model, starts=1, max_steps=1): the torque may be too "
     "strong for a fit without it"

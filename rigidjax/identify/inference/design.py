@@ -144,7 +144,8 @@ def best_first_rate(
 
     **Arguments:**
 
-    - `model`, `body`: the planned recordings and the expected body, as for `Model.start`.
+    - `model`, `body`: a model with the planned recordings, and the expected body; several bodies as
+      a dict by name, as for `Model.start`.
     - `omega`: (3,) rad/s, body frame. Its direction is the start of the search, and its length is
       the length of the result: how fast the body can be thrown.
     - `max_steps`: the largest number of steps of the search.

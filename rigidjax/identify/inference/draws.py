@@ -37,7 +37,7 @@ Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 _BLACKJAX = ("blackjax", "posterior", "posterior")
 
 # The first mass matrix of a sampler counts like an estimate from this number of draws, because it
-# comes from Laplace's method, which gives a good one.
+# comes from Laplace's method, which gives a good first matrix.
 _FIRST_WEIGHT = 50.0
 
 # With at least this number of recordings, one gradient keeps a core of the processor busy. The
@@ -82,8 +82,9 @@ class Nuts(eqx.Module):
         """
         blackjax = _checks.import_library(*_BLACKJAX)
         adaptation = blackjax.adaptation
-        # Do the warm-up of `blackjax.window_adaptation` and the draws in one loop. A separate loop
-        # for the warm-up would compile the density once more, which takes longer than the draws.
+        # The warm-up is that of `blackjax.window_adaptation`, but here one loop does the warm-up
+        # and the draws. A separate loop for the warm-up would compile the density once more, which
+        # takes longer than the draws.
         begin, tune, settle = adaptation.step_size.dual_averaging_adaptation(self.acceptance)
         metric = adaptation.mass_matrix.mass_matrix_adaptation(True, _FIRST_WEIGHT)
         metric_begin, metric_add, metric_end = metric

@@ -298,8 +298,8 @@ def leaf_at(
         raise ValueError(
             f"{name}: wanted one array, got {type(index).__name__}; give one {kind} for each array"
         )
-    # For a traced leaf `equinox.is_inexact_array_like` raises an error, because the leaf has a
-    # `__jax_array__` of `None`.
+    # This is not `equinox.is_inexact_array_like`, which raises an error for a leaf that JAX traces,
+    # because this leaf has a `__jax_array__` of `None`.
     if not (eqx.is_inexact_array(leaves[index]) or isinstance(leaves[index], float)):
         raise ValueError(f"{name}: wanted numbers, got {type(leaves[index]).__name__}")
     return paths[index], leaves[index]

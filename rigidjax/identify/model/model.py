@@ -80,8 +80,10 @@ EVEN = 1e-3
 
 
 class AbstractPull(eqx.Module):
-    """Compute residuals that pull the free numbers x of a fit towards chosen values, in addition to
-    the residuals of readings and priors.
+    """Compute residuals that pull the free numbers x of a fit, or quantities that depend on x,
+    towards chosen values.
+
+    A fit adds these residuals to the residuals of the readings and priors.
     """
 
     @abc.abstractmethod
@@ -166,8 +168,9 @@ class Model(eqx.Module):
     that the true value is at least this large, as with a sensor's `limit`.
 
     The motion starts at the first time of each recording. The state of the motion is the smallest
-    type of state that sensors and torque need: `Spin`, `Attitude` or `Rigid`. **Raises:**
-    `TypeError` for arguments of another type; `ValueError` if they do not fit together.
+    type of state that sensors and torque need: a `Spin` (body rate), an `Attitude` (attitude and
+    rate), or a `Rigid` (with position and velocity as well). **Raises:** `TypeError` for arguments
+    of another type; `ValueError` if they do not fit together.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> model = rj.identify.Model(record, rj.identify.Ratios())
@@ -351,9 +354,9 @@ class Model(eqx.Module):
         rest = self.size - vector.size - spin.size
         own = sum(s.own.size for s in self.slots if s.own is not None)
         zeros = xp.zeros(rest - own, kind), xp.zeros(own, kind)
-        # The order of the free numbers is the order that `Index` describes: bodies and shared
-        # steps, then initial states, in which the rates come last, then the steps of one recording
-        # alone.
+        # `Index` describes the order of the free numbers: first the numbers of the bodies, and of
+        # the `Free`s that recordings share; then the initial states, whose rates come last; then
+        # the numbers of the `Free`s that one recording has alone.
         parts = [xp.asarray(vector, kind), zeros[0], spin.reshape(-1), zeros[1]]
         return jnp.asarray(xp.concatenate(parts))
 

@@ -170,12 +170,13 @@ def normal_matrix_of_jacobians(
     rest = np.setdiff1d(np.arange(columns), alone)
     squares = jnp.zeros((count, columns, columns), jacobians[0].dtype)
     for rows in jacobians:
-        # On a CPU this product of matrices takes a fifth of the time of an `einsum` that sums over
-        # the axes of times and residuals.
+        # The axes of times and residuals are joined to one axis, so that JᵀJ is a product of
+        # matrices. On a CPU it takes a fifth of the time of an `einsum` that sums over both axes.
         flat = rows.reshape(count, -1, columns)
         squares = squares + flat.swapaxes(1, 2) @ flat
-    # The core gets an additional last row and column. Columns of J that stand for no number are
-    # added to them, and they are dropped below.
+    # The core, which is the dense block of the shared numbers, gets an additional last row and
+    # column. The columns of J that stand for no number are added to this row and column, which are
+    # dropped below.
     last = size - count * alone.size
     at = jnp.minimum(places[:, rest], last)
     core = jnp.zeros((last + 1, last + 1), squares.dtype)

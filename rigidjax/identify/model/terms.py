@@ -59,8 +59,8 @@ def scene_from_row(
     """Return the scene (body, torques, sensors, initial state) of one recording at given free
     numbers.
 
-    - `row`: the free numbers of the recording: those of its body, of the `Free`s, and of its
-      initial state, as `Index` describes.
+    - `row`: the free numbers of the recording: those of its body, of the `Free`s (other numbers
+      that a fit may move), and of its initial state, as `Index` describes.
     - `record`: the recording.
     - `reference`: a known state of the recording; the free numbers of its initial state are changes
       of this state.
@@ -401,15 +401,16 @@ def standardised_errors_and_saturation(
     if jitter_error is not None:
         v = jitter_error / sigma[None]
         # The reading of a channel at full scale carries no information about the error of its time
-        # stamp.
+        # stamp. Its part of the jitter error is therefore set to zero.
         white, wider = white_errors_and_log_variances(scaled, jnp.where(full, 0.0, v))
         scaled = jnp.where(full, scaled / jnp.sqrt(1.0 + v * v), white)
     if limit is None:
         return scaled, full, wider
     side = jnp.sign(values)
     z = jnp.where(full, -side * scaled, 0.0)
-    # For a large z the root underflows to zero, where a square root has no derivative. The error is
-    # therefore set to zero beyond z = 5.
+    # Here z is the excess of the prediction over the limit in standard deviations. For a large z
+    # the argument of the root underflows to zero, where a square root has no derivative. The error
+    # is therefore set to zero beyond z = 5.
     root = jnp.sqrt(-2.0 * jax.scipy.special.log_ndtr(jnp.minimum(z, 5.0)))
     return jnp.where(full, -side * jnp.where(z < 5.0, root, 0.0), scaled), full, wider
 

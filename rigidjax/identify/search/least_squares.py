@@ -292,8 +292,8 @@ def _damped_step_and_scale(
     """
     diagonal = normal.diagonal
     diagonal = jnp.maximum(diagonal, jnp.maximum(1e-12 * jnp.max(diagonal), 1e-300))
-    # Columns are scaled to length one, so that the Cholesky factorisation loses no digits if units
-    # are very different.
+    # The normal matrix is scaled to ones on its diagonal, so that the Cholesky factorisation loses
+    # no digits if the units of the numbers are very different.
     root = jnp.sqrt(diagonal)
     damped = damping * jnp.maximum(diagonal, order_one) / root**2
     scaled = normal.scale_rows_and_columns(1.0 / root)

@@ -44,7 +44,8 @@ WILD = 100.0
 # A search over windows ends at a distance of about TOLERANCES times the tolerance from the minimum.
 # By default this distance is 0.05 standard deviations. The search ends when the gain of a step
 # (fall of the cost), divided by the gain of a fit from noise alone, is less than the square of this
-# distance. A rough search ends when this ratio of gains is less than ROUGH.
+# distance. A short search, which uses only a part of each window, ends when this ratio of gains is
+# less than ROUGH.
 TOLERANCES, ROUGH = 500.0, 1.0
 # Two short searches come before the search over whole windows. As PARTS says, the first one uses
 # one ninth of each window, and the second one a third. Each of them takes at most FEW steps of
@@ -202,8 +203,9 @@ def _expected_cost_drop_from_noise(
     - `normal`: the normal matrix of all free numbers.
     """
     assert model.clusters is not None
-    # The array has a row for each window, although there are fewer stretches than windows: the
-    # number of stretches is not known when this function is compiled.
+    # The rows of this array are the gradients of the stretches. It has as many rows as there are
+    # windows, although there are fewer stretches: their number is not known when this function is
+    # compiled. The other rows stay zero.
     slopes = jnp.zeros((model.count, model.size), normal.core.dtype)
     slopes = slopes.at[model.clusters[:, None], model.index.places].add(
         evaluation.pulls, mode="drop"

@@ -222,7 +222,8 @@ def chosen_recordings(model: Model, recording_indices: Array) -> Model:
     """Return the model with only the recordings of indices `recording_indices`, and with all free
     numbers.
 
-    The indices may be traced; the recordings keep their padding.
+    The indices may be traced by JAX; the recordings keep the masked readings that fill up shorter
+    recordings.
     """
     parts = lambda m: (m.records, m.reference, m.body_indices, m.index.places, m.index.start)  # noqa: E731
     return eqx.tree_at(
