@@ -168,8 +168,8 @@ class LogDensity(eqx.Module):
 def map_draws(
     function: Callable[[Unpacked], Any], density: LogDensity, x: Float[Array, "m n"]
 ) -> PyTree:
-    """Return `function(point)` for each of m draws x (m, n), where `point` is what the draw
-    represents.
+    """Return `function(point)` for each of m draws x (m, n) from a posterior density, where `point`
+    is an `Unpacked` with the body, the states and the values that the draw represents.
 
     The results are stacked: each array has a leading axis of length m. The program is compiled once
     for all densities with the same structure and shapes.

@@ -493,11 +493,11 @@ def indices_of_body_numbers(
     body_indices: Int[Array, " records"] | None,
     recording_count: int,
 ) -> Int[np.ndarray, "records numbers"]:
-    """Return, for each of R recordings, the indices of the numbers of its body among the numbers of
-    all bodies, as an array (R, K).
+    """Return, for each of R recordings, the indices of the numbers that describe its body among the
+    numbers of all bodies, as an array (R, K).
 
-    Here K is how many numbers the largest chart has. The row of a body with fewer numbers is filled
-    up with −1.
+    A chart is a map from numbers to a possible body, and K is how many numbers the largest chart
+    has. The row of a body with fewer numbers is filled up with −1.
 
     - `chart`: the chart of one body, or the charts of several bodies.
     - `body_indices`: (R,) the index of the body of each of R recordings, or `None` for one body.
@@ -516,6 +516,8 @@ def body_of_recording(
 ) -> Inertia | MassProperties:
     """Return the body of one recording, from the free numbers of this recording.
 
+    A chart is a map from free numbers to a possible body.
+
     - `chart`: the chart of one body, or the charts of several bodies.
     - `vector`: the free numbers of the recording; the numbers of its body come first.
     - `body_index`: the index of the body among several bodies, or `None` for one body.
@@ -527,8 +529,9 @@ def body_of_recording(
 
 
 def chart_list(chart: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...]:
-    """Return a tuple of the charts of all bodies: of the one body that `chart` describes, or of
-    each of several `Bodies`.
+    """Return a tuple of the charts of all bodies, where a chart is a map from free numbers to a
+    possible body: the `chart` itself if there is one body, or the charts in a `Bodies` of several
+    bodies.
     """
     return chart.charts if isinstance(chart, Bodies) else (chart,)
 
@@ -536,11 +539,11 @@ def chart_list(chart: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ..
 def numbers_of_each_body(
     chart: AbstractBodyChart | Bodies, vector: Array | np.ndarray
 ) -> list[Any]:
-    """Return a list with the numbers of each body. They are parts of `vector`, which holds the
-    numbers of one body after the other.
+    """Return a list with the free numbers that describe each body. They are parts of `vector`,
+    which holds the numbers of one body after the other.
 
-    `chart` is the chart of one body, or the charts of several bodies; it says how many numbers each
-    body has.
+    `chart` is the chart of one body, or the charts of several bodies; it says how many numbers
+    describe each body. A chart is a map from free numbers to a possible body.
     """
     sizes = [one.size for one in chart_list(chart)]
     return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
@@ -554,8 +557,8 @@ def bodies_as_list(bodies: Inertia | MassProperties | dict[str, Any]) -> list[An
 
 
 def has_mass(chart: AbstractBodyChart) -> bool:
-    """Return whether a `chart` describes bodies with a mass (`MassProperties`), not only an
-    `Inertia`.
+    """Return whether a `chart` (a map from free numbers to a possible body) makes bodies with a
+    mass, `MassProperties`, not only an `Inertia`.
     """
     sample: Any = eqx.filter_eval_shape(chart.body, jnp.zeros(chart.size))
     return isinstance(sample, MassProperties)

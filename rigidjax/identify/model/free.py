@@ -213,7 +213,8 @@ def group_of_each_recording(
 
 def find_slots(free: Sequence[Free], scene: Scene, body_names: Sequence[str]) -> list[Slot]:
     """Return a `Slot` for each `Free` (number that a fit may move): the `Free` together with the
-    path of its array in a `scene`.
+    path of its array in a `scene`, which is the body, torques, sensors and initial state of a
+    recording.
 
     `body_names` (R,) holds the name of the body of each of R recordings. An error is raised if a
     `Free` picks no numbers, if it picks the numbers of another `Free`, or if it has the name of
@@ -371,6 +372,8 @@ def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"
 def leaves_at(scene: Scene, paths: Sequence[tuple[Any, ...]]) -> tuple[Array, ...]:
     """Return the leaves (arrays of numbers) of a `scene` at the `paths`, which are tuples of keys
     of JAX, as JAX arrays.
+
+    A scene is the body, torques, sensors and initial state of a recording, as a tree of JAX.
     """
     leaves = dict(jax.tree.leaves_with_path(scene))
     return tuple(jnp.asarray(leaves[path]) for path in paths)
@@ -379,6 +382,8 @@ def leaves_at(scene: Scene, paths: Sequence[tuple[Any, ...]]) -> tuple[Array, ..
 def with_leaves(scene: Scene, paths: Sequence[tuple[Any, ...]], values: Sequence[Array]) -> Scene:
     """Return the `scene` with other leaves (arrays of numbers): the leaf at each of the `paths`,
     which are tuples of keys of JAX, is replaced by the array in `values` with the same index.
+
+    A scene is the body, torques, sensors and initial state of a recording, as a tree of JAX.
     """
     pairs, structure = jax.tree.flatten_with_path(scene)
     leaves = dict(pairs) | dict(zip(paths, values, strict=True))

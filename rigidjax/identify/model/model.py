@@ -576,8 +576,8 @@ def _require_unused_names(slots: Sequence[Slot], charts: AbstractBodyChart | Bod
 
 
 def unpack_numbers(model: Model, x: Float[Array, " n"]) -> Unpacked:
-    """Return the body, the initial state and the values of the `Free`s that the free numbers x (n,)
-    of a `model` represent, without a check of x.
+    """Return the body, the initial state and the values of the `Free`s (other numbers that a fit
+    may move) that the free numbers x (n,) of a `model` represent, without a check of x.
 
     For several recordings the initial states have a leading axis.
     """
@@ -587,9 +587,11 @@ def unpack_numbers(model: Model, x: Float[Array, " n"]) -> Unpacked:
 
 
 def unpack_with_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
-    """Return two things: the quantities (body, initial state, values of the `Free`s) that the free
-    numbers x (n,) represent; and the derivatives of these quantities with respect to x, along a new
-    last axis of each array.
+    """Return two things: the quantities that the free numbers x (n,) of a `model` represent; and
+    the derivatives of these quantities with respect to x, along a new last axis of each array.
+
+    The quantities are the body, the initial state, and the values of the `Free`s, which are the
+    other numbers that a fit may move.
     """
     slopes, point = _compiled_jacobian_and_quantities(with_first_times_only(model), x)
     return point, slopes
@@ -636,8 +638,8 @@ def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
 
 
 def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
-    """Return the values of all `Free`s of a `model` at the free numbers x (n,), as a dict of name →
-    array, without a check of x.
+    """Return the values of all `Free`s (numbers of torque and sensors that a fit may move) of a
+    `model` at the free numbers x (n,), as a dict of name → array, without a check of x.
 
     The shapes are (R, …) for a `Free` that has a value for each of R recordings, (groups, …) for a
     value for each group of recordings, else that of a single value.

@@ -474,11 +474,13 @@ def prior_weights(model: "Model") -> Float[Array, " n"]:
 
 
 def body_prior_and_pull_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-    """Return the residuals (j,) of a `model` at its free numbers x (n,) that may depend on several
-    of these numbers: the residuals of the prior of the body and of an `AbstractPull`.
+    """Return the residuals (j,) of the prior of the body and of the `AbstractPull` of a `model`, at
+    the free numbers x (n,) of the model.
 
-    An `AbstractPull` is an addition to the misfit that pulls free numbers towards chosen values. A
-    `model` need not have a prior of the body or a pull, so that j may be zero.
+    Such a residual may depend on several free numbers; the priors of single numbers are not
+    included. An `AbstractPull` is an addition to the misfit that pulls free numbers, or quantities
+    that depend on them, towards chosen values. A `model` need not have a prior of the body or a
+    pull, so that j may be zero.
     """
     out = [jnp.zeros(0, x.dtype)]
     if model.prior is not None:

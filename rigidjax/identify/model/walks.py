@@ -96,8 +96,9 @@ def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]
 
 
 def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
-    """Return the values of the drifting sensor errors in a `scene`, one array for each of the
-    `drifts`. A `Drift` holds the path of its error in the scene.
+    """Return the values of the drifting sensor errors in a `scene` (the body, torques, sensors and
+    initial state of a recording), one array for each of the `drifts`. A `Drift` holds the path of
+    its error in the scene.
     """
     return leaves_at(scene, [drift.path for drift in drifts])
 

@@ -173,7 +173,8 @@ def least_squares_from(
     by_noise = partial(_expected_cost_drop_from_noise, model) if windows else None
     order_one = order_one_indicator(model, kind)
     end = minimise(evaluate, x, order_one, settings, zeros, zero_normal, by_noise)
-    # If the cost is finite at no point, not even at the start, the start stays the best point.
+    # If the cost is finite at none of the evaluated points, not even at x, the result is x with an
+    # infinite cost.
     lost = ~jnp.isfinite(end.cost)
     return dataclasses.replace(
         end,
@@ -220,11 +221,11 @@ def _expected_cost_drop_from_noise(
 
 
 def order_one_indicator(model: Model, dtype: DTypeLike) -> Float[Array, " n"]:
-    """Return an array (n,) with one for each free number of a `model` that is of order one, and
-    zero for each number of a `Free`.
+    """Return an array (n,) with one for each free number of a `model` that describes a body or an
+    initial state, and zero for each number of a `Free` (other number that a fit may move).
 
-    The user chooses the unit of a `Free`, so that its numbers may have any size. `dtype` is the
-    dtype of the result.
+    The numbers of bodies and initial states are of order one. The user chooses the unit of a
+    `Free`, so that its numbers may have any size. `dtype` is the dtype of the result.
     """
     ones = jnp.zeros(model.size, dtype).at[: model.index.bodies].set(1.0)
     return ones.at[model.index.start].set(1.0)
@@ -431,8 +432,9 @@ def search_whole_records(
         stands = before - float(attempt.cost) < SETTLED * (1.0 + abs(before))
         stands = stands and task.steps_per_run == STRIDE
         settled = bool(attempt.converged) or stands
-        # The search is hopeless if the misfit would still be above the aim after another run
-        # that lowers the misfit by the same factor as this run.
+        # The search is hopeless if the misfit would still be above `aim`, the cost that the search
+        # from another start reached, after another run that lowers the misfit by the same factor as
+        # this run.
         hopeless = aim > 0 and not settled and float(attempt.cost) ** 2 > aim * before
         attempt = dataclasses.replace(attempt, converged=settled)
         watch(attempt)
