@@ -21,7 +21,8 @@ from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 Numbers = TypeVar("Numbers", bound=Any)
 
-# The units of arguments whose names mean one kind of quantity everywhere in the library.
+# The SI unit of each argument whose name means one kind of quantity everywhere in the library, such
+# as `mass`.
 _UNITS = {
     "omega": "rad/s", "angle": "rad", "angles": "rad", "latitude": "rad",
     "t": "s", "ts": "s", "dt": "s", "delay": "s", "mass": "kg", "com": "m", "gravity": "m/s²",
@@ -196,7 +197,9 @@ def _convert_to_si(value: Any, name: str, si_unit: str = "") -> Any:
 
 
 def is_rotation(value: object) -> bool:
-    """Return whether `value` is a `Rotation` of `scipy.spatial.transform`, one or many."""
+    """Return whether `value` is a `Rotation` of `scipy.spatial.transform`, which may hold one
+    rotation or many.
+    """
     return hasattr(value, "as_quat")
 
 
@@ -204,10 +207,10 @@ def _powers_of_si_units(value: Any, unit: Any) -> dict[str, Any] | None:
     """Return the dimension of a quantity as powers of SI units, such as {"m": 1, "s": -2}; angles
     are left out.
 
-    The result is `None` for a quantity of another package than astropy or pint.
+    The result is `None` if the quantity is neither of the package astropy nor of pint.
 
     - `value`: the quantity.
-    - `unit`: the unit of the quantity, an object of the same library.
+    - `unit`: the unit of the quantity, an object of the same package as the quantity.
     """
     if hasattr(value, "dimensionality"):
         return {_PINT.get(name, str(name)): power for name, power in value.dimensionality.items()}
@@ -240,7 +243,7 @@ def _warn_of_float64_as_float32() -> None:
     """Warn, once in a process, that float64 numbers become float32 because JAX computes with 32
     bits (`jax_enable_x64` is off).
     """
-    # The cache makes this warning appear once in a process.
+    # `functools.cache` runs this function once in a process: the warning appears only once.
     warnings.warn(
         "rigidjax: float64 numbers become float32, seven digits, because JAX's 64 bits are off; "
         "set jax.config.update('jax_enable_x64', True), or pass float32 if that is meant",
@@ -435,8 +438,8 @@ def require_instance(
     if not requirement:
         several = kinds if isinstance(kinds, tuple) else (kinds,)
         requirement = " or ".join(kind.__name__ for kind in several)
-    # Common mistakes are a whole solution instead of its states, or a body with mass instead of its
-    # inertia.
+    # The hint names a common mistake: a whole solution was given in the place of its states `ys`,
+    # or a body with mass in the place of its `inertia`.
     own = [name for name in ("ys", "inertia") if isinstance(getattr(value, name, None), kinds)]
     hint = hint or (f"give its .{own[0]}" if own else "")
     raise TypeError(
@@ -500,7 +503,8 @@ def _accepts_arguments(value: Callable[..., Any], count: int) -> bool:
     try:
         inspect.signature(value).bind(*[None] * count)
     except (TypeError, ValueError) as error:
-        # Some functions written in C have no signature.
+        # A `ValueError` says that the function has no signature, as some functions written in C: it
+        # is accepted. A `TypeError` says that the number of arguments is wrong.
         return isinstance(error, ValueError)
     return True
 

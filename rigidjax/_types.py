@@ -21,27 +21,30 @@ Quat = Float[Array, "4"]
 
 @runtime_checkable
 class Rotation(Protocol):
-    """Describe the `Rotation` of SciPy: an active rotation, with scalar-last quaternions."""
+    """Describe an object like the `Rotation` of SciPy: an active rotation, whose method `as_quat`
+    returns a quaternion with the scalar part last.
+    """
 
     def as_quat(self) -> Any: ...
 
 
 ScalarLike = Float[ArrayLike, ""]
-# The types that a real number may have where diffrax gives it to a solver.
+# The types in which diffrax passes a real number, such as a time, to a solver.
 RealLike = Scalar | np.ndarray | float | int
 Vec3Like = Float[ArrayLike, "3"]
 Mat3Like = Float[ArrayLike, "3 3"]
 QuatLike = Float[ArrayLike, "4"] | Rotation
 
 if not typing.TYPE_CHECKING and sys.version_info >= (3, 12):
-    # The names are given so that `help` and editors show a name in place of a long union of types.
-    # (beartype does not read such a type on Python 3.11.)
+    # Each of these types gets a name, which `help` and editors show in the place of a long union of
+    # types. (On Python 3.11 beartype does not read a type with a name.)
     ScalarLike = typing.TypeAliasType("ScalarLike", ScalarLike)
     Vec3Like = typing.TypeAliasType("Vec3Like", Vec3Like)
     Mat3Like = typing.TypeAliasType("Mat3Like", Mat3Like)
     QuatLike = typing.TypeAliasType("QuatLike", QuatLike)
 
-# Constructors take an array, or nested lists of numbers.
+# Where an argument may be `Numbers`, it may be a list of numbers, also of nested lists, in the
+# place of an array.
 Numbers = Sequence[Any]
 NumbersLike = ArrayLike | Numbers
 Vector = Vec3Like | Numbers

@@ -37,8 +37,9 @@ def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> S
 
     **Arguments:** `body`, an `Inertia` about the point that the body turns about, or
     `MassProperties`; `state` anything with `.omega` (Ω, rad/s, body frame), or Ω (3,) itself. The
-    first term is added for `MassProperties` and a state with a velocity (`.v`, m/s, of the centre
-    of mass, world frame). Source: notes, eqs 75 and 79, in any body axes.
+    first term, with the mass m and the velocity v of the centre of mass, is added only for
+    `MassProperties` and a state with a velocity (`.v`, m/s, world frame). Source: notes, eqs 75 and
+    79, in any body axes.
 
     >>> kinetic_energy(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array(3., dtype=float64)

@@ -43,9 +43,9 @@ class Inertia(eqx.Module):
 
     **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor checks shape and dtype only;
     `from_tensor`, `from_principal`, `from_second_moment`, and every function that takes a body,
-    check that some mass has this inertia. `scale` is `None`, or "arbitrary" if only the ratios of
-    the components are known, as after a fit of free motion: `simulate` then warns of a torque in N
-    m, and `shift` raises `ValueError`.
+    check that some distribution of mass has this inertia. `scale` is `None`, or "arbitrary" if only
+    the ratios of the components are known, as after a fit of free motion: `simulate` then warns if
+    a torque in N m acts, which needs an inertia in kg m²; and `shift` raises `ValueError`.
 
     The object stores I, not 𝔖: `from_tensor` changes no digit, and the small moment of a rod keeps
     all its digits. Source: notes, eqs 76–78.
@@ -70,13 +70,13 @@ class Inertia(eqx.Module):
 
     @staticmethod
     def from_tensor(tensor: Matrix) -> "Inertia":
-        """Return the body with this inertia tensor.
+        """Return the body with a given inertia tensor.
 
         **Arguments:** `tensor` (3, 3), kg m², body frame, about the point that the body turns
-        about. Plates, rods and points (zero second moments) are bodies. **Raises:** `ValueError`
-        (`equinox` error under `jit`) if the tensor is not symmetric to a few units of round-off, or
-        if its principal moments I1 ≤ I2 ≤ I3 are negative or break the triangle inequality `I1 + I2
-        ≥ I3`.
+        about. Plates, rods and points, for which principal second moments are zero, are allowed.
+        **Raises:** `ValueError` (`equinox` error under `jit`) if the tensor is not symmetric to a
+        few units of round-off, or if its principal moments I1 ≤ I2 ≤ I3 are negative or break the
+        triangle inequality `I1 + I2 ≥ I3`.
 
         >>> Inertia.from_tensor([[2.0, 0.1, 0], [0.1, 2, 0], [0, 0, 3]]).tensor.shape
         (3, 3)
@@ -113,12 +113,14 @@ class Inertia(eqx.Module):
 
     @property
     def second_moment(self) -> Float[Array, "*batch 3 3"]:
-        """Return 𝔖 = ½ Tr(I) 1 − I, (3, 3), kg m², body frame (notes, eqs 76–78 solved)."""
+        """Return the second moment 𝔖 = ∫ r rᵀ dm of this body, (3, 3), kg m², body frame, from its
+        inertia tensor I: 𝔖 = ½ Tr(I) 1 − I (notes, eqs 76–78 solved).
+        """
         return second_moment_from_inertia(self.tensor)
 
     @property
     def moments(self) -> Vec3:
-        """Return the principal moments I1 ≤ I2 ≤ I3, (3,), kg m²."""
+        """Return the principal moments I1 ≤ I2 ≤ I3 of this inertia, (3,), kg m²."""
         return eigensystem(validation.require_symmetric_or_nan(self.tensor, "inertia tensor"))[0]
 
     def principal(self) -> tuple[Vec3, Quat]:
@@ -136,9 +138,9 @@ class Inertia(eqx.Module):
     def shift(self, r: Vector, mass: ScalarLike) -> "Inertia":
         """Return the inertia about a point away from the centre of mass: `I + m (|r|² 1 − r rᵀ)`.
 
-        **Arguments:** `self`, the inertia I about the centre of mass; `r` (3,) from the centre of
-        mass to the new point, or back, in metres, body frame; `mass` m, kg; a negative mass undoes
-        a shift. Source: Steiner; Landau and Lifshitz, eq 32.12.
+        **Arguments:** `self`, the inertia I about the centre of mass; `r` (3,) the vector between
+        the centre of mass and the new point, in either direction, in metres, body frame; `mass` m,
+        kg; a negative mass undoes a shift. Source: Steiner; Landau and Lifshitz, eq 32.12.
 
         >>> Inertia.from_principal(1.0, 1.0, 1.0).shift([0.0, 0.0, 2.0], 3.0).moments
         Array([ 1., 13., 13.], dtype=float64)
@@ -165,8 +167,8 @@ class Inertia(eqx.Module):
         return Inertia(product(m, product(self.tensor, m.T)), self.scale)
 
     def require_invertible(self) -> "Inertia":
-        """Return `self`. **Raises:** `ValueError` (`equinox` error under `jit`) if a moment is
-        zero: Euler's equations divide by the moments.
+        """Return `self` unchanged. **Raises:** `ValueError` (`equinox` error under `jit`) if a
+        principal moment is zero: Euler's equations divide by the moments.
         """
         return validation.require_physical_body(self, self.tensor, None, throw=True)
 
@@ -225,12 +227,13 @@ class MassProperties(eqx.Module):
 
     @property
     def inertia(self) -> Inertia:
-        """Return the inertia about the centre of mass, body axes."""
+        """Return the inertia of this body about its centre of mass, in body axes."""
         return Inertia(inertia_from_second_moment(self.second_moment))
 
     def check(self) -> "MassProperties":
-        """Return an equal body whose values are checked, also under `jit`. **Raises:** as the
-        constructor.
+        """Return an equal body whose mass, centre of mass and second moment are checked, also under
+        `jit`. **Raises:** `ValueError` (`equinox` error under `jit`) in the cases in which the
+        constructor of `MassProperties` raises it.
         """
         return MassProperties(
             validation.require_physical_mass(self.mass),
@@ -239,8 +242,8 @@ class MassProperties(eqx.Module):
         )
 
     def require_invertible(self) -> "MassProperties":
-        """Return `self`. **Raises:** `ValueError` (`equinox` error under `jit`) if a moment about
-        the centre of mass is zero.
+        """Return `self` unchanged. **Raises:** `ValueError` (`equinox` error under `jit`) if a
+        principal moment about the centre of mass is zero: Euler's equations divide by the moments.
         """
         return validation.require_physical_body(self, self.inertia.tensor, self.mass, throw=True)
 
@@ -304,7 +307,9 @@ class MassProperties(eqx.Module):
         return _add_mass(self, other.mass, other.com, other.second_moment)
 
     def __radd__(self, other: int) -> "MassProperties":
-        """Return `self` for 0, with which `sum(parts)` starts."""
+        """Return `self` if `other` is 0: Python's `sum(parts)` begins with 0 and adds the parts to
+        it.
+        """
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
     def __sub__(self, other: "MassProperties") -> "MassProperties":
@@ -321,7 +326,7 @@ class MassProperties(eqx.Module):
         return _add_mass(self, -other.mass, other.com, -other.second_moment)
 
 
-# A body that turns: its inertia alone, or its mass, centre of mass and second moment.
+# A body that turns is given by its inertia alone, or by its mass, centre of mass and second moment.
 Body = Inertia | MassProperties
 
 
@@ -361,8 +366,8 @@ def _add_mass(
     """
     total = body.mass + mass
     d = com - body.com
-    # Start at the centre of the heavier part: a light and distant part moves this centre little, so
-    # that no digit is lost.
+    # The centre of mass of the sum is computed from that of the heavier part: a light and distant
+    # part moves it little, so that no digit is lost.
     heavy = body.mass >= mass
     moved = jnp.where(heavy, mass, -body.mass) / total * d
     both = body.second_moment + second_moment + (body.mass * (mass / total)) * outer(d, d)

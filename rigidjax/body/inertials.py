@@ -177,7 +177,8 @@ def _body_from_urdf(inertial: Tree.Element) -> MassProperties:
         missing = "<mass>" if mass is None else "<inertia>"
         raise ValueError(f"wanted a <mass> and an <inertia> in <inertial>, got no {missing}")
     com = _read_numbers(origin, "xyz", 3, [0.0] * 3)
-    # The turns are about fixed axes: roll about x, then pitch about y, then yaw about z.
+    # The three angles in the attribute `rpy` of URDF are turns about fixed axes: roll about x, then
+    # pitch about y, then yaw about z.
     rotation = euler.to_matrix(_read_numbers(origin, "rpy", 3, [0.0] * 3), "xyz")
     diagonal = [_read_numbers(inertia, key, 1)[0] for key in _KEYS[:3]]
     others = [_read_numbers(inertia, key, 1, [0.0])[0] for key in _KEYS[3:]]

@@ -122,7 +122,8 @@ def _require_positive_volume(volume: Array, vertices: Array, faces: Array) -> Ar
     - `vertices`: (n, 3), in metres
     - `faces`: (m, 3) integers, the three vertex numbers of each face
     """
-    # A mesh is flat to round-off if the thickness is as small as the last digit of the length.
+    # The volume counts as zero if it is below the area of the mesh times a few units of round-off
+    # of its longest extent: the mesh is then as thin as the last digit of its length.
     a, b, c = (jax.lax.stop_gradient(vertices[faces[:, k]]) for k in range(3))
     longest = jnp.ptp(vertices, axis=0).max()
     area = 0.5 * jnp.sqrt((jnp.cross(b - a, c - a) ** 2).sum(axis=1)).sum()

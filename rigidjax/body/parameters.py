@@ -31,10 +31,10 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     """Return ten unconstrained numbers that describe a body.
 
     **Arguments:** `body`, also a plate or a rod. **Returns** (10,) `(α, ρ, d1, d2, s12, s23, s13,
-    t1, t2, t3)`: `mass = e^{2α}`, `com = t` (m, body frame), and `𝔖 / mass` as in
-    `pack_second_moment`, where 𝔖 is the second moment about the centre of mass, and ρ the logarithm
-    of a length in metres. **Raises:** `ValueError` (`equinox` error under `jit`) for a point mass,
-    whose 𝔖 is zero.
+    t1, t2, t3)`: `mass = e^{2α}`, and `com = t` (m, body frame). The six numbers from ρ to s13
+    describe `𝔖 / mass`, in m², as `pack_second_moment` does for a second moment; 𝔖 is the second
+    moment about the centre of mass, and ρ is the logarithm of a length in metres. **Raises:**
+    `ValueError` (`equinox` error under `jit`) for a point mass, whose 𝔖 is zero.
 
     >>> vector = pack(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
     >>> round(float(unpack(vector).mass), 12)
@@ -153,15 +153,17 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
 def curvature_rows_near_flat_body(
     shape: Float[ArrayLike, "5"] | Numbers, misfit_gradient: Float[ArrayLike, "5"] | Numbers
 ) -> Float[Array, "3 5"]:
-    """Return three rows b of five numbers, (3, 5). The sum of the matrices b bᵀ is what products of
-    first derivatives (Gauss–Newton) lack in the second derivative of a misfit near a flat body.
+    """Return three rows b of five numbers, (3, 5), for a fit of a body that is nearly flat. The
+    Gauss–Newton method approximates the second derivative of the misfit by products of first
+    derivatives; the sum of the matrices b bᵀ is what this approximation leaves out near a flat
+    body.
 
     Let A = 1 + V be the root of the second moment, where V is the matrix of `pack_shape`, a the
-    least eigenvalue of A, and n the unit eigenvector of a. The least second moment is the square λ
-    = a². Its second derivative `d²λ = 2 |dA n|²` is multiplied by the derivative of the misfit with
-    respect to λ, which follows from the component along n nᵀ of the derivative with respect to A.
-    The rows are zero for a body that is not flat, and for a misfit that does not decrease as λ
-    decreases.
+    least eigenvalue of A, and n its unit eigenvector. The least second moment is the square λ = a².
+    The sum of b bᵀ is its second derivative, `d²λ = 2 |dA n|²`, multiplied by the derivative of the
+    misfit with respect to λ, which follows from the component along n nᵀ of the derivative with
+    respect to A. The rows are zero for a body that is not flat, and for a misfit that does not
+    decrease as λ decreases.
 
     **Arguments:** `shape` (5,) as in `pack_shape`; `misfit_gradient` (5,) the derivative of
     the misfit with respect to `shape`.
@@ -173,22 +175,26 @@ def curvature_rows_near_flat_body(
     shape = _checks.array_of_shape(shape, (5,), "shape")
     misfit_gradient = _checks.array_of_shape(misfit_gradient, (5,), "misfit_gradient")
     root = _second_moment_root_from_shape(shape)
-    # For a flat body the columns of the adjugate of A are along n. A fit needs n in every step, and
-    # the adjugate is cheaper than eigenvectors.
+    # The eigenvector n is computed from the adjugate of A, the matrix `root`: for a flat body all
+    # columns of the adjugate are along n. A fit needs n in every step, and the adjugate is cheaper
+    # than eigenvectors.
     rows = root[0], root[1], root[2]
     adjugate = jnp.stack([cross(rows[k - 2], rows[k - 1]) for k in range(3)])
     longest = adjugate[jnp.argmax(jnp.abs(jnp.diagonal(adjugate)))]
     n = longest / jnp.sqrt(jnp.sum(longest * longest) + jnp.finfo(root.dtype).tiny)
     a = n @ apply(root, n)
     d1, d2, s12, s23, s13 = misfit_gradient
-    # The misfit does not depend on the size of A: the derivative of the misfit along A is zero.
+    # `misfit_gradient` does not contain the trace of `pull`, the derivative of the misfit with
+    # respect to A. The misfit does not depend on the size of A: its derivative along A = 1 + V is
+    # zero, which gives the trace.
     trace = -(shape @ misfit_gradient)
     d3 = (trace - d1 - d2) / 3.0
     pull = from_components(d1 + d3, d2 + d3, d3, 0.5 * s12, 0.5 * s13, 0.5 * s23)
     square = jnp.sum(root * root)
     gained = a * (n @ apply(pull, n)) / 2.0
-    # For NaN, `gained > 0` would be false and the rows zero. `~(gained <= 0)` is true: the rows are
-    # then NaN, and the caller sees it.
+    # `gained` is the least second moment λ times the derivative of the misfit with respect to λ. If
+    # `gained` is NaN, `gained > 0` would be false and the rows zero; `~(gained <= 0)` is true, so
+    # that the rows are NaN and the caller sees it.
     flat = (a * a < FLAT * square) & ~(gained <= 0)
     size = jnp.where(flat, jnp.sqrt(2.0 * jnp.where(flat, gained, 1.0)), 0.0)
     size = size / jnp.where(flat, jnp.abs(a), 1.0)
@@ -255,8 +261,9 @@ def _matrix_square_root(s: Mat3) -> Mat3:
 def _matrix_square_root_jvp(
     primals: tuple[Mat3], tangents: tuple[PyTree, ...]
 ) -> tuple[Mat3, Mat3]:
-    # The change dA of the root A solves A dA + dA A = d𝔖, nine linear equations. This is right also
-    # at equal moments, where the axes have no derivative.
+    # For a change d𝔖 of the second moment 𝔖, the change dA of its root A solves A dA + dA A = d𝔖,
+    # nine linear equations. They are right also at equal moments, where the principal axes have no
+    # derivative.
     root, one = _matrix_square_root(*primals), jnp.eye(3, dtype=primals[0].dtype)
     sums = jnp.kron(root, one) + jnp.kron(one, root)
     change = 0.5 * (tangents[0] + tangents[0].T)

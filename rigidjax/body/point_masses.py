@@ -124,7 +124,8 @@ def sum_masses(masses: Float[Array, "n"], positions: Float[Array, "n 3"]) -> Mas
     - `masses`: (n,) kg
     - `positions`: (n, 3) m, body frame
     """
-    # Positions are taken from the first point: far from the origin the sums would lose digits.
+    # Positions are measured from the first point: measured from a distant origin, they would make
+    # the sums lose digits.
     start = jax.lax.stop_gradient(positions[0])
     from_start = positions - start[None, :]
     mass = masses.sum()

@@ -31,8 +31,9 @@ _CLOSE = 1.0 / 32.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 # Divided differences do not depend on the order of their arguments: they are computed only for
-# sorted pairs (i, j) and sorted triples (i, k, j) of eigenvalues. `_PAIR` and `_TRIPLE` give the
-# place of any pair or triple in these lists.
+# sorted pairs (i, j) and sorted triples (i, k, j) of indices of eigenvalues, which `_PAIRS` and
+# `_TRIPLES` list. The arrays `_PAIR` and `_TRIPLE` give the place of any pair or triple in these
+# two lists.
 _PAIRS = list(itertools.combinations_with_replacement(range(3), 2))
 _TRIPLES = list(itertools.combinations_with_replacement(range(3), 3))
 _PAIR = np.array([_PAIRS.index(tuple(sorted(t))) for t in np.ndindex(3, 3)]).reshape(3, 3)
@@ -218,7 +219,8 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     def function_of_scaled_eigenvalue(scaled: Scalar) -> Scalar:
         """Return f(λ), where f is the user's function of one eigenvalue λ of the matrix.
 
-        - `scaled`: λ divided by the number `unit`, by which the whole matrix was divided
+        - `scaled`: λ divided by the number `unit`, a power of two by which the whole matrix was
+          divided
         """
         return _checks.array_of_shape(function(unit * scaled), (), "function(λ)", hint="one number")
 

@@ -22,8 +22,8 @@ def times_power_of_two(x: Float[Array, "..."], n: Int[Array, ""]) -> Float[Array
     and its derivatives are exact if the product is a normal number.
     """
     half = n // 2
-    # Without the barrier, XLA would first multiply the two powers where it knows n, and the product
-    # would overflow.
+    # 2ⁿ itself may overflow: `x` is multiplied by two smaller powers, one after the other. Without
+    # the barrier XLA, where it knows n, would first multiply the two powers.
     both = _power_of_two(half, x.dtype), _power_of_two(n - half, x.dtype)
     first, second = jax.lax.optimization_barrier(both)
     return x * first * second

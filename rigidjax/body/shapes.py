@@ -64,8 +64,8 @@ def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> Mas
     Array([2., 2., 2.], dtype=float64)
     """
     r, R = _checked_radii(inner, outer)
-    # The formula is homogeneous of degree 2: written in u = r/R nothing overflows, and thin shells
-    # lose no digit.
+    # The formula for λ is written as m R²/5 times a ratio that depends on u = r/R only, so that no
+    # fifth power of a radius overflows; thin shells lose no digit.
     u = r / R
     ratio = (1.0 + u * (1.0 + u * (1.0 + u * (1.0 + u)))) / (1.0 + u * (1.0 + u))
     return _body_at_centre(mass, _axisymmetric_diagonal(R * R * ratio / 5.0, R * R * ratio / 5.0))

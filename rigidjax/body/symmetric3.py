@@ -22,7 +22,8 @@ def inverse(a: Mat3) -> Mat3:
     kg m² neither underflow nor overflow. If an eigenvalue is zero, the result is infinite;
     `Inertia.require_invertible` raises an error for such an inertia tensor.
     """
-    # All entries come from one split: an entry taken by an index would be a kernel of its own.
+    # All entries come from one `lax.split`: an entry taken by an index would be compiled as a
+    # kernel of its own.
     xx, _, _, _, yy, _, _, _, zz = entries(a)
     scale = xx + yy + zz
     unit = a / scale
@@ -66,8 +67,8 @@ def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
     return a[:, None] * b[None, :]
 
 
-# The function is compiled as one program: outside of a trace, each operation would be a program of
-# its own.
+# `inertia_from_second_moment` is compiled as one program: outside of `jit`, JAX would otherwise
+# compile each of its operations as a program of its own.
 @jax.jit
 def inertia_from_second_moment(
     second_moment: Float[Array, "*batch 3 3"],

@@ -164,8 +164,8 @@ def index_of_first_impossible_inertia(
     """Return the index of the first of n matrices that cannot be the inertia tensor of a body, or
     that has a principal moment of zero. The index is a scalar, and −1 if there is no such matrix.
 
-    A matrix with a NaN is skipped, since one such body must not stop a batch: its result is
-    reported as `nonfinite_input`, and the other bodies are computed.
+    A matrix with a NaN is skipped, since one such body must not stop a batch: the simulation of the
+    batch gives this body the result `nonfinite_input`, and computes the other bodies.
 
     - `tensors`: (n, 3, 3) inertia tensors, kg m², that are not traced.
     """
@@ -233,12 +233,14 @@ def _zero_impossible_asymmetric_flags(
     whole = sx * minors[2] - sy * squares[1] - sz * squares[0] - product
     broken = trace < 0
     for minor in (sx, sy, sz, *minors, whole):
-        # If an entry is NaN, the other entries are not scaled, so that the minors mean nothing.
+        # The minors count only if the trace is positive (`some`): for any other trace, also NaN,
+        # the entries are not divided by the trace, so that the minors mean nothing.
         broken = broken | (some & (minor < -slack))
     if allow_zero_moment:
         return broken & False, broken, skew
     # The least moment is the determinant divided by the product of the two larger moments. This
-    # product is 1/9 to 1/4 of the squared trace, which is 1 here; 1/8 is taken for every body.
+    # product is between 1/9 and 1/4 of the squared trace, which is 1 here; 1/8 is taken for every
+    # body.
     determinant = xx * (yy * zz - squares[2]) - yy * squares[1] - zz * squares[0] + product
     return ~some | ~(determinant > 0.125 * slack), broken, skew
 

@@ -31,8 +31,8 @@ from rigidjax.plot.style import (
 # its four corners, counter-clockwise as seen from outside; the order is −x, +x, −y, +y, −z, +z.
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-# SHADES (6, 3) are the colours of the faces, as red, green and blue from 0 to 1: pale on the
-# negative side of an axis.
+# _FULL (3, 3) are the full colours of the axes x, y and z, as red, green and blue from 0 to 1.
+# SHADES (6, 3) are the colours of the faces: pale on the negative side of an axis.
 _FULL = np.array([[int(c[k : k + 2], 16) / 255 for k in (1, 3, 5)] for c in COLOURS[:3]])
 SHADES = np.stack([0.4 * _FULL + 0.6, _FULL], axis=1).reshape(6, 3)
 
@@ -207,10 +207,10 @@ def player(
     """Return a page that plays the motion in 3-D; you can turn and zoom the view while it plays.
 
     The picture is as in `tumble`: a box that moves as the body does, and the path of the end of its
-    longest axis. The page contains everything, also viser's program (0.8 MB): a notebook shows it
-    without a network or a running kernel, and `.save("tumble.html")` writes it to a file.
-    **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises** as
-    `tumble`.
+    longest axis. The page contains everything, also the program of the 3-D viewer viser (0.8 MB): a
+    notebook shows it without a network or a running kernel, and `.save("tumble.html")` writes it to
+    a file. **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises**
+    as `tumble`.
     """
     seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
     _, q = evenly_spaced_times_and_attitudes(ts, states, pictures)
@@ -222,7 +222,9 @@ def player(
         raise ModuleNotFoundError(words) from error
     import rich
 
-    # Viser records the commands that a server gets; no browser has to connect to the server.
+    # The server of viser only records the commands that it gets; no browser has to connect to it.
+    # The console of the package rich is quiet meanwhile, so that nothing about the server is
+    # printed.
     console = rich.get_console()
     was_quiet, console.quiet = console.quiet, True
     try:

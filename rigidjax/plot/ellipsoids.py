@@ -51,7 +51,8 @@ def inertia_ellipsoid(
         shapes["cloud"] = np.asarray(jax.vmap(_ellipsoid_matrix)(drawn)) / size
     if truth is not None:
         other = np.asarray(_ellipsoid_matrix(truth))
-        # If one of the two bodies has no size, only the shapes are compared.
+        # An `Inertia` has no size: unless both bodies are `MassProperties`, only the shapes are
+        # compared, and the matrix of `truth` is scaled to trace 1.
         own = solid and isinstance(truth, MassProperties)
         shapes["truth"] = other[None] / (1.0 if own else float(np.trace(other)))
     ax = axes_of_shape(ax, (3,), ncols=3, figsize=(10.5, 3.9))
@@ -141,10 +142,11 @@ def _ellipsoid_outline(matrix: np.ndarray, i: int, j: int) -> np.ndarray:
     """Return 121 points (2, 121) on the outline of the ellipsoid r·A⁻¹r = 1, as it is seen along a
     coordinate axis.
 
-    It is the ellipse of the 2 × 2 block of A for the two other axes.
+    The outline is the ellipse of the 2 × 2 block of A with the rows and columns `i` and `j`.
 
     - `matrix`: (3, 3) the matrix A.
-    - `i`, `j`: the indices, 0 to 2, of the two axes of the picture.
+    - `i`, `j`: the indices, 0 to 2, of the two axes of the picture; the ellipsoid is seen along the
+      third axis.
     """
     values, vectors = np.linalg.eigh(matrix[np.ix_((i, j), (i, j))])
     angle = np.linspace(0, 2 * np.pi, 121)

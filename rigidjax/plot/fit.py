@@ -73,7 +73,8 @@ def _dense_times_and_states(
     """Return two things: 800 evenly spaced times, s; and the fitted states at these times, for a
     smooth line between the readings.
 
-    The result is `None` for a body under a torque, and for a recording with more than 300 times.
+    The result is `None` for a body under a torque, and for a recording with more than 300 times:
+    the line then joins the predictions at the times of the readings.
 
     - `fit_result`: a `Fit`, the result of a fit.
     - `record`: one of the recordings of the fit; the evenly spaced times are between its first and

@@ -33,11 +33,12 @@ def frames(
 ) -> Any:
     """Draw a path in the moving frame on the left, and in the inertial frame on the right.
 
-    **Arguments:** `frame` the `MovingFrame`, or a scene that has one as its `frame`; `ts` (T,) s;
-    `inside` the path in the moving frame, a `Point` with a leading time axis (`frame.from_inertial`
-    makes it from a path in the inertial frame); `plane` the two axes that are drawn, such as `xy`;
-    `unit` of length, for the labels; `marks` positions (3,) at rest in the moving frame, by name;
-    `title`; `ax` two axes. **Returns** the axes (2,).
+    **Arguments:** `frame` the `MovingFrame`, or a scene (the equations of motion of a particle)
+    that has one as its `frame`; `ts` (T,) s; `inside` the path in the moving frame, a `Point`
+    (position and velocity) with a leading time axis (`frame.from_inertial` makes it from a path in
+    the inertial frame); `plane` the two axes that are drawn, such as `xy`; `unit` of length, for
+    the labels; `marks` positions (3,) at rest in the moving frame, by name; `title`; `ax` two axes.
+    **Returns** the axes (2,).
 
     >>> turntable = rj.scenes.turntable(1.0)
     >>> ts = jnp.linspace(0.0, 3.0, 20)

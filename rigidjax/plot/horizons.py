@@ -28,16 +28,16 @@ def horizons(
     """Draw open-loop errors against the prediction horizon, in one panel for each part of the
     state.
 
-    **Arguments:** `results` a `Horizons`, as `identify.predict_windows` and `Windows.held_horizons`
-    return it, or several `Horizons` by name, to compare models or windows, for example with the
-    prediction that the state stays as it is at the start; `step` the time between samples, in
-    seconds: if it is given, the horizon is shown as a time instead of a number of steps; `measure`
-    `mean_absolute` (of a component), `mean_norm` or `rms` (of the vector); `title`; `ax` your axes,
-    one for each part of the state. Both scales are linear, since errors start at zero. **Returns**
-    the axes, one for each of position, velocity, attitude and body rate that the state has.
-    **Raises** `TypeError` for something that is no `Horizons`; `ValueError` for an empty
-    dictionary, for `Horizons` with different parts of the state, and for a `step` that is not
-    positive.
+    **Arguments:** `results` a `Horizons`, which holds the errors of predictions for each number of
+    steps from the start, as `identify.predict_windows` and `Windows.held_horizons` return it, or
+    several `Horizons` by name, to compare models or windows, for example with the prediction that
+    the state stays as it is at the start; `step` the time between samples, in seconds: if it is
+    given, the horizon is shown as a time instead of a number of steps; `measure` `mean_absolute`
+    (of a component), `mean_norm` or `rms` (of the vector); `title`; `ax` your axes, one for each
+    part of the state. Both scales are linear, since errors start at zero. **Returns** the axes, one
+    for each of position, velocity, attitude and body rate that the state has. **Raises**
+    `TypeError` for something that is no `Horizons`; `ValueError` for an empty dictionary, for
+    `Horizons` with different parts of the state, and for a `step` that is not positive.
 
     >>> t = np.arange(8.0)
     >>> cut = rj.identify.windows(t, rj.Spin(np.ones((8, 3)) * t[:, None]), length=3)

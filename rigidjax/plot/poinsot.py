@@ -180,8 +180,8 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
         raise ValueError(words + "a torque acts, and there is no invariable plane")
     first = omega[0] - (omega[0] @ up) * up
     if np.linalg.norm(first) < 1e-9 * np.linalg.norm(omega[0]):
-        # The body spins about a principal axis: any direction perpendicular to the momentum serves
-        # as e₁.
+        # Here ω is parallel to the angular momentum: the body spins about a principal axis, and any
+        # direction perpendicular to the momentum serves as the axis e₁ of the picture.
         first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first = first / np.linalg.norm(first)
     path = np.stack([omega @ first, omega @ np.cross(up, first)], axis=-1)

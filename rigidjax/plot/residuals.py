@@ -13,7 +13,7 @@ from rigidjax.plot.style import (
     unit_factor,
 )
 
-# The largest number of frequencies for unevenly spaced times.
+# The largest number of frequencies in the power spectrum of residuals at unevenly spaced times.
 _MOST = 2000
 
 
@@ -88,20 +88,20 @@ def _draw_sensor_residuals(
         ):
             for side, mark in ((1, "^"), (-1, "v")):
                 where = t[mask][side * values > reach]
-                # The triangles of each axis have a height of their own, since an outlier often
-                # concerns all three axes at the same time.
+                # The triangles that stand for outliers have a height of their own for each axis of
+                # the sensor, since an outlier often concerns all three axes at the same time.
                 at = np.full(where.size, side * reach * (0.95 - 0.09 * axis))
                 over_time.plot(where, at, color=colour, marker=mark, ms=5, ls="")
         name = f"beyond ±{reach:.0f}"
         over_time.plot([], [], color="0.4", marker="^", ms=2.5, ls="", label=name)
     over_time.axhspan(-2, 2, color="0.9", zorder=0)
-    # A legend of four names in one row is wider than the panel: it gets two rows, and space above
-    # the data.
+    # With outliers the legend has four names and would be wider than the panel in one row: it gets
+    # two rows, and space above the data.
     columns, room = (2, 1.65) if beyond else (3, 1.35)
     over_time.legend(loc="upper right", ncols=columns, fontsize=8, markerscale=2, columnspacing=1)
     over_time.set_ylim(-reach, room * reach)
-    # The histogram is as wide as the data: errors far smaller than their noise would otherwise all
-    # lie in two or three bins.
+    # The histogram is as wide as the data: residuals far smaller than their standard deviation
+    # would otherwise all lie in two or three bins.
     inside = everything[np.abs(everything) <= reach]
     low, high = (inside.min(), inside.max()) if inside.size else (-1.0, 1.0)
     middle, half = 0.5 * (low + high), max(0.5 * (high - low), 1e-3 * reach)
@@ -145,7 +145,8 @@ def power_spectrum(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
         return np.zeros(0), np.zeros(0)
     gap = float(np.median(gaps))
     if (np.abs(gaps - gap) <= 1e-3 * gap).all():
-        # The mean over several segments has less noise than the spectrum of the whole.
+        # Welch's estimate is the mean of the spectra of several segments, which has less noise than
+        # the spectrum of the whole series.
         segment = min(t.size, max(64, min(t.size // 4, 512)))
         frequencies, density = welch(values, 1 / gap, nperseg=segment)
         return frequencies[1:], density[1:] / (2 * gap)

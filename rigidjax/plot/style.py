@@ -148,7 +148,8 @@ def time_series_on_host(values: object, column_count: int, name: str) -> np.ndar
 
 
 def attitudes_on_host(states: Any) -> np.ndarray:
-    """Return the quaternions (T, 4) of `states` as NumPy float64.
+    """Return the quaternions (T, 4), body → world, of `states`, the states of one body at T times,
+    as NumPy float64.
 
     **Raises:** `TypeError` for states without an attitude.
     """

@@ -15,14 +15,15 @@ from jaxtyping import Array, PyTree
 Tree = TypeVar("Tree")
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Whether XLA on CPU drops barriers before it fuses operations, as it does before JAX 0.11. A value
-# that is used twice is then computed twice, and so is each value that it depends on: a run with a
-# solver of order 8 and 900 output times took minutes, not milliseconds.
+# Whether XLA on CPU drops the barriers of `lax.optimization_barrier` before it fuses operations, as
+# it does before JAX 0.11. A value that is used twice is then computed twice, and so is each value
+# that it depends on: a run with a solver of order 8 and 900 output times took minutes, not
+# milliseconds.
 _DROPPED = jax.__version_info__ < (0, 11)
 
 
 def platform() -> str:
-    """Return the kind of device that computes, such as "cpu".
+    """Return the kind of device on which JAX computes, such as "cpu".
 
     This is the kind of `jax.default_device`, if it is set: `jax.default_backend` ignores this
     setting.
@@ -95,8 +96,8 @@ def compiled_as_one_kernel(function: Function) -> Function:
     def _call_under_vmap(size: int, batched: PyTree, *args: PyTree) -> Any:
         del size
         axes = jax.tree.map(lambda b: 0 if b else None, tuple(batched))
-        # JAX before 0.12 calls this rule also where only tangents are batched; no argument is
-        # batched then.
+        # JAX before 0.12 calls this rule for `vmap` also if only the tangents of the arguments are
+        # batched; no argument itself is batched then.
         is_batched = any(jax.tree.leaves(batched))
         out = jax.vmap(plain, axes)(*args) if is_batched else plain(*args)
         return out, jax.tree.map(lambda _: is_batched, out)

@@ -34,8 +34,9 @@ _MANY_TURNS = 8 * np.pi
 def to_quaternion(angles: Vec3Like, sequence: str = "ZXZ") -> Quat:
     """Return the unit quaternion, body → world, of three Euler angles.
 
-    **Arguments:** `angles` (3,), rad, in the order of `sequence`. **Warns** if a known angle is
-    beyond four turns: it may be in degrees.
+    **Arguments:** `angles` (3,), rad, in the order of `sequence`: three letters in capitals for
+    turns about the moved axes, such as "ZXZ", or in lower case for turns about fixed axes.
+    **Warns** if a known angle is beyond four turns: it may be in degrees.
 
     >>> to_quaternion(jnp.array([0.0, jnp.pi, 0.0])).round(12).tolist()
     [0.0, 1.0, 0.0, 0.0]
@@ -51,7 +52,8 @@ def to_matrix(angles: Vec3Like, sequence: str = "ZXZ") -> Mat3:
     """Return the rotation matrix, body → world, of three Euler angles (notes, eqs 31, 33 for
     "ZXZ").
 
-    **Arguments:** `angles` (3,), rad, in the order of `sequence`: (φ, θ, ψ) for "ZXZ".
+    **Arguments:** `angles` (3,), rad, in the order of `sequence`: (φ, θ, ψ) for "ZXZ"; capitals are
+    turns about the moved axes, lower case turns about fixed axes.
 
     >>> to_matrix(jnp.array([0.0, jnp.pi / 2, 0.0]), "ZXZ").round(12)[1].tolist()
     [0.0, 0.0, -1.0]
@@ -63,9 +65,9 @@ def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
     """Return the Euler angles of a rotation matrix, rad, in the order of `sequence`.
 
     **Arguments:** `matrix` (3, 3) rotation, body → world. **Returns:** (3,): outer angles in (−π,
-    π], the middle one in [0, π] if the first and the last letter agree, else in [−π/2, π/2]. The
-    last is 0 in the singular case. **Raises:** as `so3.check` for known values; traced values are
-    not checked.
+    π], the middle one in [0, π] if the first and the last letter agree, else in [−π/2, π/2]. In the
+    singular case, in which the first and the last turn are about one axis, the last angle is 0.
+    **Raises:** as `so3.check` for known values; traced values are not checked.
 
     >>> angles = jnp.array([0.3, 0.2, 0.1])
     >>> bool(abs(from_matrix(to_matrix(angles, "xyz"), "xyz") - angles).max() < 1e-15)
@@ -76,7 +78,7 @@ def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
 
 def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     """Return the Euler angles of a quaternion, rad, in the order of `sequence`; q and −q give the
-    same bits.
+    same angles to the last bit.
 
     **Arguments:** `q` (4,) of any length, body → world. **Raises:** `ValueError` for zero or NaN.
     Half the sum and half the difference of the outer angles come from two calls of atan2, so that
@@ -96,8 +98,9 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     if symmetric:
         z = handed * z
     else:
-        # A quarter turn about the middle axis takes the last axis into the first, so that the
-        # formulas for equal outer axes apply. All four numbers are multiplied by √2.
+        # The three axes differ. A quarter turn about the middle axis takes the last axis into the
+        # first, so that the formulas for equal outer axes apply. All four numbers are then √2 times
+        # too large, which changes no angle.
         w, x, y, z = w + handed * y, x + z, w - handed * y, x - z
     flat, up = y * y + z * z, w * w + x * x
     tiny = (2 * jnp.finfo(q.dtype).eps) ** 2 * (flat + up)
@@ -141,8 +144,8 @@ def rates_to_omega(
     *,
     frame: Literal["body", "world"] = "body",
 ) -> Vec3:
-    """Return the angular velocity of Euler angles and their rates (notes, eqs 80–83 for "ZXZ" and
-    "body").
+    """Return the angular velocity that belongs to Euler angles and their rates (notes, eqs 80–83
+    for "ZXZ" and "body").
 
     **Arguments:** `angles` (3,), rad, and `rates` (3,), rad/s, in the order of `sequence`; `frame`
     of the result, (3,), rad/s.

@@ -37,14 +37,14 @@ from rigidjax.rotation.validation import (
     require_unit_quaternion,
 )
 
-# In the first estimate for Wahba's problem, a smaller positive weight is raised to this fraction of
-# the largest weight.
+# `wahba` raises each positive weight to at least this fraction of the largest weight, in its first
+# estimate only.
 _LIGHT = 1e-3
 
 
 def project(matrix: Mat3Like) -> Mat3:
-    """Return the rotation nearest to a matrix (Frobenius norm); its derivative is correct also on
-    SO(3).
+    """Return the rotation nearest to a matrix (Frobenius norm); its derivative is correct also if
+    the matrix is a rotation already.
 
     **Arguments:** `matrix` (3, 3), det > 0. **Returns:** (3, 3) with RᵀR = 1 to round-off.
     **Raises:** `ValueError` if a known matrix is left-handed (no rotation is nearest to a mirror
@@ -78,7 +78,7 @@ def wahba(
     **Arguments:** `body`, `world` (n, 3), n ≥ 2: the same directions in both frames, any units;
     `weights` (n,), not negative, 1 if not given; the ratio of two weights may be up to 1e13 (1e5 in
     float32). The method solves the quartic of Markley 1993 (FOAM, J. Astronaut. Sci. 41, 261), then
-    takes Newton steps on the group.
+    takes steps of Newton's method on the rotation group.
 
     **Raises:** an error, also under `jit`, if the directions do not determine the rotation: if
     there are fewer than two, or if all are parallel to within 5e-4 rad (float32: 4°), where half
@@ -102,18 +102,20 @@ def wahba(
         best = nearest_rotation(_weighted_outer_products(closer, those, these))
         for _ in range(4):
             best = _newton_step_of_wahba(best, heavy, those, these)
-        # Each Newton step from the solution doubles the order to which derivatives are right.
+        # Only these last two Newton steps are differentiated: after one step the first derivatives
+        # are right, after two steps the second derivatives, too.
         for _ in range(2):
             best = _newton_step_of_wahba(best, w, world, body)
     except ValueError:
         raise ValueError(words) from None
-    # The determinant `firmness` is (σ1 + σ2)(σ2 + σ3)(σ3 + σ1) with the singular values σ of b,
-    # where σ3 has the sign of det b. It is 0 where the directions leave one turn free.
+    # The determinant `firmness` in the loop below is (σ1 + σ2)(σ2 + σ3)(σ3 + σ1) with the singular
+    # values σ of b, a sum of products of directions; σ3 has the sign of det b. The determinant is 0
+    # if the directions leave the turn about some axis free.
     eps = float(jnp.finfo(w.dtype).eps)
     loose, seen, one = jnp.zeros((), bool), jnp.sign(heavy), jnp.eye(3, dtype=w.dtype)
-    # The first two rows test the directions of each frame by themselves, without weights. The best
-    # rotation from these directions to themselves is the identity; `best` fits the weighted pairs
-    # only.
+    # The first two rows of this loop test the directions of each frame by themselves, without
+    # weights. They use the identity, the best rotation from these directions to themselves; the
+    # third row tests the weighted pairs, which `best` fits.
     for turn, b, least in (
         (one, _weighted_outer_products(seen, those, those), 4 * np.sqrt(eps)),
         (one, _weighted_outer_products(seen, these, these), 4 * np.sqrt(eps)),
@@ -188,8 +190,8 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
     middle = a + b
     n2, normal = dot(middle, middle), cross(a, middle)
-    # The lengths of a and b are 1 only to round-off: if a and b are opposite, what is left of m may
-    # lie along a.
+    # The lengths of a and b are 1 only to round-off: if a and b are opposite, their sum `middle` is
+    # round-off that may lie along a.
     least = 2 * float(jnp.finfo(a.dtype).eps)
     opposite = (n2 < 1) & (dot(normal, normal) <= least * least)
     length = jnp.sqrt(jnp.where(opposite, 1, n2))
@@ -255,7 +257,8 @@ def _karcher_mean(quaternions: Float[Array, "n 4"], weights: Float[Array, "n"]) 
     chord = (fixed_w[:, None, None] * jax.vmap(quaternion.to_matrix)(fixed_q)).sum(0)
     start = matrix_to_quaternion(nearest_rotation(chord))
     start = lax.fori_loop(0, 6, lambda i, s: newton(i, s, fixed_q, fixed_w), start)
-    # Each Newton step from the solution doubles the order to which derivatives are right.
+    # Only these last two Newton steps are differentiated: after one step the first derivatives
+    # are right, after two steps the second derivatives, too.
     for i in range(2):
         start = newton(i, lax.stop_gradient(start) if i == 0 else start, quaternions, weights)
     return quaternion.canonical(quaternion.normalise(start))
@@ -309,7 +312,8 @@ def _signed_singular_value_sum_and_zeta(b: Mat3) -> tuple[Scalar, Scalar]:
         slope = 4 * root * excess - 8 * det
         return root - (excess * excess - 8 * det * root - flat) / jnp.where(slope > 0, slope, 1)
 
-    # Newton's method starts above the largest root and comes down to it without overshooting.
+    # Newton's method for the quartic equation starts at √3, which is not below the largest root,
+    # and comes down to this root without overshooting.
     root = lax.fori_loop(0, 24, newton, jnp.full_like(det, np.sqrt(3)))
     return root, 0.5 * (root * root - 1) * root - det
 
@@ -363,7 +367,8 @@ def _nearest_rotation_jvp(primals: tuple[Mat3], tangents: tuple[PyTree, ...]) ->
     """
     (b,), (db,) = primals, tangents
     r = nearest_rotation(b)
-    # `b` may have any size: a common factor for `b` and `db` leaves the derivative unchanged.
+    # The entries of `b` may have any size: `b` and `db` are multiplied by a common factor, which
+    # does not change the rotation or its derivative.
     scale = power_of_two_scale(jnp.max(jnp.abs(b)))
     b, db = scale * b, scale * db
     return r, product(r, hat(solve(_curvature_of_rotation_fit(r, b), 2 * vee(product(r.T, db)))))

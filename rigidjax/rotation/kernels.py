@@ -22,8 +22,8 @@ from rigidjax.rotation.linalg3 import (
 )
 from rigidjax.rotation.stumpff import arctan_ratio_of_square, inverse_jacobian_coefficient, stumpff
 
-# The compiled functions are inlined in whatever is being traced, so that XLA and `jax.grad` see no
-# boundary.
+# Each function below that `_compiled` wraps is inlined where another function that is being traced
+# calls it, so that XLA and `jax.grad` see no boundary between the two.
 _compiled = partial(jax.jit, inline=True)
 
 
@@ -77,8 +77,9 @@ def _log_of_quaternion(q: Quat) -> Vec3:
     """
     w, x, y, z = parts = components(power_of_two_scale(*components(q)) * q)
     n2 = x * x + y * y + z * z
-    # With n² = x² + y² + z², the tangent of θ/2 is n/|w|, of θ/4 n/a, of θ/8 n times `inverse`:
-    # all terms of the sums are positive, so nothing cancels.
+    # Let n² = x² + y² + z², and let θ be the angle of the rotation. The tangent of θ/2 is n/|w|,
+    # that of θ/4 is n/a, and that of θ/8 is n times `inverse`: all terms of the sums are positive,
+    # so nothing cancels.
     a = jnp.abs(w) + jnp.sqrt(n2 + w * w)
     inverse = 1 / (a + jnp.sqrt(n2 + a * a))
     scale = 8 * inverse * arctan_ratio_of_square(n2 * inverse * inverse)
@@ -100,11 +101,13 @@ def _log_of_quaternion_jvp(primals: tuple[Quat], tangents: tuple[PyTree, ...]) -
     """
     (q,), (dq,) = primals, tangents
     v = _log_of_quaternion(q)
-    # q may have any length: a common factor for q and dq leaves the derivative unchanged.
+    # q may have any length: q and dq are multiplied by a common factor, which does not change the
+    # derivative.
     scale = power_of_two_scale(*components(q))
     w, *u = parts = components(scale * q)
     dw, *du = components(scale * dq)
-    # First the small turn in the body frame, 2 vec(q̄ dq)/|q|², then the inverse right Jacobian.
+    # `turn` is the small turn in the body frame, 2 vec(q̄ dq)/|q|², with the conjugate q̄ of q and
+    # the vector part vec. The inverse right Jacobian is applied to it below.
     scale, aside = 2 / squared_quaternion_length(parts), cross_components(u, du)
     turn = [scale * (w * du[i] - dw * u[i] - aside[i]) for i in range(3)]
     vs = components(v)

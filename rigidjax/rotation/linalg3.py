@@ -114,8 +114,8 @@ def basis(dtype: DTypeLike = float) -> Float[Array, "3 3 3"]:
 
 
 def product(a: Mat3Like, b: Mat3Like) -> Mat3:
-    """Return the matrix product of `a`, `b` (3, 3) on components, in full precision on every
-    device.
+    """Return the matrix product of `a` and `b`, both (3, 3), computed as sums of products of
+    entries: unlike `@`, in full precision on every device.
 
     >>> product(jnp.eye(3), 2.0 * jnp.eye(3)).tolist()
     [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]
@@ -125,7 +125,8 @@ def product(a: Mat3Like, b: Mat3Like) -> Mat3:
 
 
 def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
-    """Return the matrix `a` (3, 3) times the vector `y` (3,), on components.
+    """Return the matrix `a` (3, 3) times the vector `y` (3,), computed as sums of products of
+    entries, as in `product`.
 
     >>> apply(2.0 * jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [2.0, 4.0, 6.0]

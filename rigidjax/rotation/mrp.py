@@ -18,9 +18,9 @@ from rigidjax.rotation.validation import require_nonzero_and_finite
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
-    """Return the parameters σ = q_v/(1 + q_w) (3,), |σ| ≤ 1, of a unit quaternion `q` (4,), where
-    q_w ≥ 0 and q_v are the scalar and vector part of its canonical form; q and −q give the same
-    bits.
+    """Return the modified Rodrigues parameters σ = q_v/(1 + q_w) (3,), |σ| ≤ 1, of a unit
+    quaternion `q` (4,), where q_w ≥ 0 and q_v are the scalar and vector part of `q` or −q, the one
+    whose first nonzero component is positive. Both give the same parameters to the last bit.
 
     >>> from_quaternion(jnp.array([-1.0, 0.0, 0.0, 0.0])).tolist()
     [-0.0, -0.0, -0.0]
@@ -30,8 +30,9 @@ def from_quaternion(q: QuatLike) -> Vec3:
 
 
 def to_quaternion(sigma: Vec3Like) -> Quat:
-    """Return the unit quaternion q = ((1 − s), 2σ)/(1 + s), s = |σ|², of `sigma` (3,); the shadow
-    −σ/|σ|² gives −q.
+    """Return the unit quaternion q = ((1 − s), 2σ)/(1 + s), s = |σ|², of modified Rodrigues
+    parameters `sigma` σ (3,). Their shadow −σ/|σ|², the other parameters of the same rotation,
+    gives −q.
 
     >>> to_quaternion(jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -46,8 +47,8 @@ def to_quaternion(sigma: Vec3Like) -> Quat:
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
-    """Return the parameters, |σ| ≤ 1, of a rotation `matrix` (3, 3), body → world. **Raises:** as
-    `so3.check` for known values; traced values are not checked.
+    """Return the modified Rodrigues parameters σ (3,), |σ| ≤ 1, of a rotation `matrix` (3, 3), body
+    → world. **Raises:** as `so3.check` for known values; traced values are not checked.
 
     >>> from_matrix(jnp.eye(3)).tolist()
     [0.0, 0.0, 0.0]
@@ -56,8 +57,8 @@ def from_matrix(matrix: Mat3Like) -> Vec3:
 
 
 def to_matrix(sigma: Vec3Like) -> Mat3:
-    """Return the rotation matrix, body → world, of `sigma` (3,); the shadow −σ/|σ|² gives the same
-    matrix.
+    """Return the rotation matrix (3, 3), body → world, of modified Rodrigues parameters `sigma` σ
+    (3,); their shadow −σ/|σ|² gives the same matrix.
 
     >>> to_matrix(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -66,8 +67,9 @@ def to_matrix(sigma: Vec3Like) -> Mat3:
 
 
 def shadow(sigma: Vec3Like) -> Vec3:
-    """Return the shadow −σ/|σ|² of `sigma` (3,): the other parameters of the same rotation (eq
-    3.145). **Raises:** `ValueError` for zero or NaN.
+    """Return the shadow −σ/|σ|² of modified Rodrigues parameters `sigma` σ (3,): the other
+    parameters of the same rotation (Schaub & Junkins, eq 3.145). **Raises:** `ValueError` for zero
+    or NaN.
 
     >>> shadow(jnp.array([0.0, 0.5, 0.0])).tolist()
     [-0.0, -2.0, -0.0]
@@ -78,9 +80,9 @@ def shadow(sigma: Vec3Like) -> Vec3:
 
 
 def switch(sigma: Vec3Like) -> Vec3:
-    """Return `sigma` (3,) if |σ| ≤ 1, else its shadow −σ/|σ|², which describes the same rotation by
-    the shorter turn. Call this function only between two steps of a solver: within a step a solver
-    needs parameters that do not jump.
+    """Return the modified Rodrigues parameters `sigma` σ (3,) if |σ| ≤ 1, else their shadow
+    −σ/|σ|², which describes the same rotation by the shorter turn. Call this function only between
+    two steps of a solver: within a step a solver needs parameters that do not jump.
 
     >>> switch(jnp.array([0.0, 2.0, 0.0])).tolist()
     [-0.0, -0.5, -0.0]
@@ -100,9 +102,9 @@ def _shadow_unchecked(sigma: Vec3) -> Vec3:
 
 
 def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
-    """Return the rates of the parameters σ at the angular velocity Ω, dσ/dt = ¼ [(1 − s) Ω + 2 σ ×
-    Ω + 2 σ (σ·Ω)], per second, with s = |σ|²; the rates are finite for every finite σ (Schaub &
-    Junkins, eq 3.160).
+    """Return the rates of modified Rodrigues parameters σ at the angular velocity Ω, dσ/dt = ¼ [(1
+    − s) Ω + 2 σ × Ω + 2 σ (σ·Ω)], per second, with s = |σ|²; the rates are finite for every finite
+    σ (Schaub & Junkins, eq 3.160).
 
     **Arguments:** `sigma` (3,) dimensionless; `omega` (3,) Ω, in radians per second, body frame.
 
@@ -116,8 +118,9 @@ def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
 
 
 def rates_to_omega(sigma: Vec3Like, rates: Vec3Like) -> Vec3:
-    """Return the angular velocity, body frame, of the parameters σ and their rates σ̇ = dσ/dt: Ω =
-    4/(1 + s)² [(1 − s) σ̇ − 2 σ × σ̇ + 2 σ (σ·σ̇)], with s = |σ|² (Schaub & Junkins, eq 3.164).
+    """Return the angular velocity, body frame, of modified Rodrigues parameters σ and their rates
+    σ̇ = dσ/dt: Ω = 4/(1 + s)² [(1 − s) σ̇ − 2 σ × σ̇ + 2 σ (σ·σ̇)], with s = |σ|² (Schaub &
+    Junkins, eq 3.164).
 
     **Arguments:** `sigma` (3,) dimensionless; `rates` (3,) σ̇, per second. **Returns:** (3,) in
     radians per second.

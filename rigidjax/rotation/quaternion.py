@@ -144,7 +144,7 @@ def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
 def check(
     q: Float[ArrayLike, "*batch 4"] | Rotation, *, name: str = "q"
 ) -> Float[Array, "*batch 4"]:
-    """Normalise a quaternion from outside, or refuse it.
+    """Normalise a quaternion that a user gives, or refuse it if its length is not near 1.
 
     **Arguments:** `q` (..., 4), scalar first, or a `Rotation` of SciPy; `name` the name of the
     argument in messages. **Returns:** the quaternion, with length 1 to round-off. **Raises:**
@@ -162,7 +162,8 @@ def check(
 def from_xyzw(xyzw: Float[ArrayLike, "4"]) -> Quat:
     """Return (w, x, y, z) of scalar-last components `xyzw` (4,) (SciPy, ROS, glTF).
 
-    **Raises:** `TypeError` for a `Rotation` of SciPy: every function takes it as it is.
+    **Raises:** `TypeError` for a `Rotation` of SciPy, which every function takes as it is in the
+    place of a quaternion.
 
     >>> from_xyzw(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [1.0, 0.0, 0.0, 0.0]
@@ -187,7 +188,8 @@ def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
     """Return the rotation by an angle about an axis (notes, eqs 17, 18).
 
     **Arguments:** `axis` (3,) of any length; `angle` rad, right-handed about `axis`. **Raises:**
-    `ValueError` for an axis of zero, for NaN, and for an angle as `exp`.
+    `ValueError` for an axis of zero, for NaN, and, as `exp`, for an angle beyond 1/ε with the unit
+    of round-off ε, which has no correct digit.
 
     >>> about_axis(jnp.array([0.0, 0.0, 2.0]), jnp.pi).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -284,11 +286,11 @@ def canonical(q: QuatLike) -> Quat:
 
 
 def angle(q: QuatLike) -> Scalar:
-    """Return the angle of a rotation, rad, in [0, π]; q and −q give the same bits.
+    """Return the angle of a rotation, rad, in [0, π]; q and −q give the same angle to the last bit.
 
     **Arguments:** `q` (4,) of any length. The angle is 2 atan2(|q_v|, |q_w|), with the scalar part
-    q_w and the vector part q_v. At the identity the angle has no derivative: the derivative 0 is
-    returned, the shortest subgradient. **Raises:** `ValueError` for zero or NaN.
+    q_w and the vector part q_v. At the identity the angle has no derivative: zero is taken in its
+    place, the subgradient of least length. **Raises:** `ValueError` for zero or NaN.
 
     >>> round(float(angle(exp(jnp.array([0.0, 1e-9, 0.0]))) * 1e9), 9)
     1.0
@@ -305,7 +307,7 @@ def angle(q: QuatLike) -> Scalar:
 
 def to_matrix(q: QuatLike) -> Mat3:
     """Return the rotation matrix M (3, 3), body → world, of `q` (4,) unit; q and −q give the same
-    bits.
+    matrix to the last bit.
 
     >>> to_matrix(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -337,8 +339,8 @@ def _rotate_components(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> V
     """
     across = cross_components(u, y)
     again = cross_components(u, across)
-    # Each component is computed once: otherwise XLA would compute all three again for each
-    # component of a torque.
+    # The barrier makes XLA compute each component once: otherwise a torque that uses the turned
+    # vector would compute all three again for each of its own components.
     return jnp.stack(barrier([y[i] + 2 * (w * across[i] + again[i]) for i in range(3)]))
 
 

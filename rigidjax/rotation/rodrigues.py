@@ -19,8 +19,8 @@ from rigidjax.rotation.validation import require_nonzero_and_finite
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
-    """Return the parameters g = q_v/q_w of a quaternion with the scalar part q_w and the vector
-    part q_v; g is infinite at a half turn, and q and −q give the same bits.
+    """Return the Rodrigues parameters g = q_v/q_w of a quaternion with the scalar part q_w and the
+    vector part q_v; g is infinite at a half turn, and q and −q give the same g to the last bit.
 
     **Arguments:** `q` (4,), not zero, body → world. **Returns:** (3,) dimensionless. **Raises:**
     `ValueError` for zero or NaN.
@@ -29,14 +29,15 @@ def from_quaternion(q: QuatLike) -> Vec3:
     [0.0, 0.0, 1.0]
     """
     q = require_nonzero_and_finite(quaternion.canonical(q), "q")
-    # The derivative squares the denominator: a q of any length is scaled first, so that nothing
-    # overflows.
+    # The derivative of g = q_v/q_w divides by q_w²: q, which may have any length, is scaled first,
+    # so that nothing overflows.
     q = power_of_two_scale(*components(q)) * q
     return q[1:] / q[0]
 
 
 def to_quaternion(g: Vec3Like) -> Quat:
-    """Return the unit quaternion (1, g)/√(1 + |g|²), with w > 0, of `g` (3,) dimensionless, finite.
+    """Return the unit quaternion (1, g)/√(1 + |g|²), with w > 0, of finite Rodrigues parameters `g`
+    (3,), dimensionless.
 
     >>> to_quaternion(jnp.zeros(3)).tolist()
     [1.0, 0.0, 0.0, 0.0]
@@ -46,8 +47,9 @@ def to_quaternion(g: Vec3Like) -> Quat:
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
-    """Return the parameters g (3,) of a rotation `matrix` (3, 3), body → world; g is infinite at a
-    half turn. **Raises:** as `so3.check` for known values; traced values are not checked.
+    """Return the Rodrigues parameters g (3,) of a rotation `matrix` (3, 3), body → world; g is
+    infinite at a half turn. **Raises:** as `so3.check` for known values; traced values are not
+    checked.
 
     >>> from_matrix(jnp.eye(3)).tolist()
     [0.0, 0.0, 0.0]
@@ -57,7 +59,7 @@ def from_matrix(matrix: Mat3Like) -> Vec3:
 
 def to_matrix(g: Vec3Like) -> Mat3:
     """Return the rotation matrix (1 + hat g)(1 − hat g)⁻¹ (Cayley's transform), body → world, of
-    `g` (3,), finite.
+    finite Rodrigues parameters `g` (3,); hat g is the matrix of the cross product with g.
 
     >>> to_matrix(jnp.array([0.0, 0.0, 1.0])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
@@ -78,8 +80,8 @@ def is_singular(q: QuatLike) -> Bool[Array, ""]:
 
 
 def omega_to_rates(g: Vec3Like, omega: Vec3Like) -> Vec3:
-    """Return the rates dg/dt = ½ [Ω + g × Ω + g (g·Ω)], 1/s, of the parameters `g` (3,) at the
-    angular velocity `omega` (3,) Ω, rad/s, body frame (Schaub & Junkins, eq 3.130).
+    """Return the rates dg/dt = ½ [Ω + g × Ω + g (g·Ω)], 1/s, of Rodrigues parameters `g` (3,) at
+    the angular velocity `omega` (3,) Ω, rad/s, body frame (Schaub & Junkins, eq 3.130).
 
     >>> omega_to_rates(jnp.zeros(3), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 1.0]
@@ -89,7 +91,7 @@ def omega_to_rates(g: Vec3Like, omega: Vec3Like) -> Vec3:
 
 
 def rates_to_omega(g: Vec3Like, rates: Vec3Like) -> Vec3:
-    """Return the angular velocity Ω = 2/(1 + |g|²) [ġ − g × ġ], rad/s, body frame, of the
+    """Return the angular velocity Ω = 2/(1 + |g|²) [ġ − g × ġ], rad/s, body frame, of Rodrigues
     parameters `g` (3,) and their `rates` (3,) ġ = dg/dt, 1/s (Schaub & Junkins, eq 3.132).
 
     >>> rates_to_omega(jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])).tolist()

@@ -120,8 +120,8 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
 
     **Arguments:** `a`, `b` (3, 3) rotations. The angle is computed by atan2 of the quaternion of
     aᵀb, and is right from 1e-12 to π (arccos of the trace is useless below 1e-8). At a = b the
-    angle has no derivative: the derivative 0 is returned, the shortest subgradient. For a loss take
-    |log(aᵀb)|², which is smooth. **Raises:** `ValueError` for NaN, and for matrices far from a
+    angle has no derivative: zero is taken in its place, the subgradient of least length. For a loss
+    take |log(aᵀb)|², which is smooth. **Raises:** `ValueError` for NaN, and for matrices far from a
     rotation.
 
     >>> round(float(distance(jnp.eye(3), exp(jnp.array([0.0, 3e-9, 0.0]))) * 1e9), 9)
@@ -270,7 +270,7 @@ def uniform(key: PRNGKeyArray, dtype: DTypeLike = float) -> Mat3:
 def check(
     matrix: Float[ArrayLike, "*batch 3 3"], *, name: str = "matrix"
 ) -> Float[Array, "*batch 3 3"]:
-    """Return a matrix from outside unchanged if it is a rotation; refuse any other matrix.
+    """Return a matrix that a user gives unchanged if it is a rotation; refuse any other matrix.
 
     **Arguments:** `matrix` (..., 3, 3); `name` the name of the matrix in messages. **Raises:**
     `ValueError` (under `jit` `equinox.error_if`) for NaN, for a left-handed frame (det < 0), and if

@@ -35,7 +35,8 @@ def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
     """
     if k < 2:
         return _cosine_or_sinc_of_square(k, t)
-    # From t = π² on, the recurrence c_{j+2} = (1/j! − c_j)/t loses no digit that matters.
+    # For t > π² the recurrence c_{j+2} = (1/j! − c_j)/t is used, which loses no digit that matters
+    # there; for a smaller t it would, and the series of c_k is summed.
     limit = math.pi**2
     far = t > limit
     divisor = jnp.where(far, t, 1)
@@ -97,7 +98,8 @@ def _cosine_or_sinc_of_square(k: int, t: Float[Array, "..."]) -> Float[Array, ".
     far = t > limit
     theta = jnp.sqrt(jnp.where(far, t, 1))
     turns, remainder = split_half_turns(theta)
-    # A θ beyond 1/ε has no correct digit; its remainder must stay in the range of the polynomials.
+    # An angle θ beyond 1/ε, where ε is the unit of round-off, has no correct digit; its remainder
+    # must still stay in the range of the polynomials.
     remainder = jnp.clip(remainder, -2.0, 2.0)
     value = _stumpff_series(k, jnp.where(far, remainder * remainder, t), limit)
     value = value * jnp.where(far, remainder, 1) if k else value

@@ -110,8 +110,8 @@ def require_unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Arr
     message.
     """
     q = _checks.require_finite(q, name)
-    # Use NumPy for known numbers: under `jit`, JAX would trace what is computed from known numbers,
-    # too.
+    # Known numbers are checked by NumPy: under `jit`, JAX would trace also what is computed from
+    # known numbers, and the check could not be made at once.
     xp = _checks.array_module(q)
     with np.errstate(over="ignore"):
         length = xp.sqrt((xp.asarray(q) ** 2).sum(-1, keepdims=True))
