@@ -294,8 +294,8 @@ def error_without_equinox_text(error: RuntimeError) -> RuntimeError:
     return type(error)(match[1]) if match else error
 
 
-# For more rows than this number, one compiled pass is quicker than NumPy, and the rows stay on
-# their device.
+# A check of more rows than this number is quicker as one compiled program than by NumPy, and the
+# rows stay on their device.
 _MANY = 4096
 
 
@@ -312,7 +312,8 @@ def index_of_first_bad_row(
     """
     with np.errstate(invalid="ignore", over="ignore"):
         if rows.shape[0] > _MANY:
-            # Compute the index at once also within a trace, where it would otherwise not be known.
+            # The index is computed at once, also while JAX traces the function that makes this
+            # check: it would otherwise not be known there.
             with jax.ensure_compile_time_eval():
                 return _compiled_index_of_first_bad_row(are_bad, rows)
         return _index_of_first_true(np, are_bad(np, np.asarray(rows)))

@@ -63,5 +63,6 @@ def _public_paths_by_name() -> dict[str, str]:
             ours = isinstance(value, ModuleType) and value.__name__.startswith("rigidjax")
             if ours and all(value is not known for _, known in modules):
                 modules.append((f"{path}.{name}", value))
-    # Where two names differ in capitals only, each keeps its own path.
+    # Two names that differ in capitals only, such as `fit` and `Fit`, each keep their own path: a
+    # name as it is written has precedence over another name in lower case.
     return {name.lower(): path for name, path in reversed(paths.items())} | paths

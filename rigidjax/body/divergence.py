@@ -35,7 +35,8 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     _checks.require_unbatched_instance(body, MassProperties, "body")
     _checks.require_unbatched_instance(reference, MassProperties, "reference")
     ratio = body.mass / reference.mass
-    # Cholesky factors are used, since cofactors lose twice as many digits for a long, thin body.
+    # The inverse of the second moment of `reference` is applied by its Cholesky factor: an inverse
+    # from cofactors would lose twice as many digits for a long, thin body.
     root = jnp.linalg.cholesky(reference.second_moment / reference.mass)
     whiten = partial(solve_triangular, root, lower=True)
     overlap = whiten(whiten(body.second_moment / body.mass).T)

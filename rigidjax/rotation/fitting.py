@@ -237,7 +237,7 @@ def mean_quaternion(
     return _karcher_mean(q, scale_to_order_one(checked_weights(weights, q[:, 0], "quaternions")))
 
 
-# Compiled once: outside of `jit` the loop would be compiled again at each call.
+# `_karcher_mean` is compiled once: outside of `jit` its loop would be compiled again at each call.
 @partial(jax.jit, inline=True)
 def _karcher_mean(quaternions: Float[Array, "n 4"], weights: Float[Array, "n"]) -> Quat:
     """Return the Karcher mean of n rotations, by Newton's method: the unit quaternion (4,) with the

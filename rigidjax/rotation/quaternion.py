@@ -162,8 +162,8 @@ def check(
 def from_xyzw(xyzw: Float[ArrayLike, "4"]) -> Quat:
     """Return (w, x, y, z) of scalar-last components `xyzw` (4,) (SciPy, ROS, glTF).
 
-    **Raises:** `TypeError` for a `Rotation` of SciPy, which every function takes as it is in the
-    place of a quaternion.
+    **Raises:** `TypeError` for a `Rotation` of SciPy, which every other function takes as it is in
+    the place of a quaternion.
 
     >>> from_xyzw(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [1.0, 0.0, 0.0, 0.0]

@@ -114,7 +114,8 @@ def split_half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], F
     π/2; in derivatives n is constant.
     """
     turns = jax.lax.stop_gradient(jnp.round(angle * (1 / math.pi)))
-    # Cody & Waite 1980: n × head and n × middle are exact, so that r keeps the digits of the angle.
+    # π is the sum of three parts. The number n of half turns (`turns`) times `head`, and times
+    # `middle`, is exact, so that the remainder r keeps the digits of the angle (Cody & Waite 1980).
     head, middle, tail = _PI_PARTS[np.dtype(angle.dtype)]
     return turns, ((angle - turns * head) - turns * middle) - turns * tail
 
