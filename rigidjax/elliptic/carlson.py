@@ -23,8 +23,9 @@ from rigidjax.elliptic.carlson_r import (
     r_integral_derivative,
 )
 
-# After this number of duplication steps the Taylor series is exact to round-off, for arguments of
-# any ratio in the range of the dtype.
+# The number of duplication steps. Each step brings the three arguments of a Carlson integral closer
+# together; after this number the Taylor series about equal arguments is exact to round-off, for any
+# ratio of the arguments in the range of the dtype.
 _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}
 
 
@@ -88,7 +89,8 @@ def rc(x: Real, y: Real) -> RealOrArray:
     x, y = to_common_dtype(x=x, y=y)
     below = y < 0
     length = jnp.where(below, x - y, 1)
-    # The root √0 has no derivative: keep it out of the branch that is not taken.
+    # For y > 0 the factor is 1. Take the root of 1, not of x, in this case: for x = 0 the infinite
+    # derivative of √x would make the gradient NaN, although `where` discards the root.
     factor = jnp.sqrt(jnp.where(below, x / length, 1))
     positive = jnp.where(below, -y, y)
     return factor * _rf_by_duplication((jnp.where(below, x - y, x), positive, positive))
@@ -113,7 +115,8 @@ def _rf_by_duplication(arguments: tuple[Array, ...]) -> Array:
     X, Y = 1 - x / mean, 1 - y / mean
     Z = -X - Y
     e2, e3 = X * Y - Z * Z, X * Y * Z
-    # The series is DLMF 19.36.1.
+    # Once the three arguments are nearly equal, R_F is a Taylor series in their relative
+    # differences X, Y, Z from the mean, by the symmetric functions e2 and e3 (DLMF 19.36.1).
     series = 1 - e2 / 10 + e3 / 14 + e2**2 / 24 - 3 * e2 * e3 / 44
     series = series - 5 * e2**3 / 208 + 3 * e3**2 / 104 + e2**2 * e3 / 16
     return _with_infinity_and_nan_outside_domain(series / jnp.sqrt(mean * scale), arguments)
@@ -161,7 +164,8 @@ def _rd_by_duplication(arguments: tuple[Array, ...]) -> Array:
     mean = (x + y + 3 * z) / 5
     X, Y = 1 - x / mean, 1 - y / mean
     Z = -(X + Y) / 3
-    # The series is DLMF 19.36.2.
+    # Once the three arguments are nearly equal, R_D is a Taylor series in their relative
+    # differences X, Y, Z from a weighted mean, by the symmetric functions e2 to e5 (DLMF 19.36.2).
     e2 = X * Y - 6 * Z**2
     e3 = (3 * X * Y - 8 * Z**2) * Z
     e4 = 3 * (X * Y - Z**2) * Z**2

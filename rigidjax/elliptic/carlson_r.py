@@ -79,8 +79,8 @@ def _r_integral_jvp(
     tangents: tuple[tuple[Tangent, ...]],
 ) -> tuple[Array, Array]:
     """Return the integral H = ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt and its tangent (its change for a change of
-    the arguments aᵢ), from ∂H/∂aᵢ = −bᵢ H, with bᵢ + 1 in place of bᵢ on the right. By this rule
-    JAX differentiates `r_integral`.
+    the arguments aᵢ). By this rule JAX differentiates `r_integral`. The derivative ∂H/∂aᵢ is
+    −bᵢ H⁺, where H⁺ is the integral H with bᵢ + 1 in place of bᵢ.
 
     - `powers`: the numbers bᵢ, multiples of ½.
     - `primals`: a tuple of one item, the arguments aᵢ, arrays of one shape.

@@ -35,9 +35,9 @@ from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, sncndn_near_one
 from rigidjax.elliptic.legendre import agm_iterates, complete_integral, incomplete_integral
 from rigidjax.rotation.stumpff import power_of_minus_one, split_half_turns
 
-# If cn and dn are below this number, the integral of sd² = (sn/dn)² depends, except for a factor,
-# on the ratio of cn and dn only. The relative error of this rule is about the square of this
-# number.
+# If cn and dn are below this number, the integral of sd² = (sn/dn)², from which the derivatives
+# with respect to m follow, is 1/dn² times a function of the ratio of cn and dn. The relative error
+# of this rule is about the square of this number.
 _FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
 
 
@@ -92,7 +92,7 @@ def _sncndn_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Array, Array,
 
     For m > 1, where the amplitude oscillates about 0, n is 0.
     """
-    # By DLMF 22.17.2–4, m > 1 becomes 1/m, and cn and dn change places.
+    # By DLMF 22.17.2–4, a parameter m > 1 is replaced by 1/m and u by u√m; cn and dn change places.
     above = m1 < 0
     divisor = jnp.where(above, m, 1)
     root = jnp.sqrt(divisor)
@@ -118,7 +118,9 @@ def _sncndn_for_m_up_to_one(u: Array, m: Array, m1: Array) -> tuple[Array, Array
     turns, angle, rows = _reduce_to_half_period(u, m1)
     sign = power_of_minus_one(turns)
     theta = jnp.abs(angle)
-    # Bulirsch's recursion carries cot²φ, which must not overflow near 0 or near a half period.
+    # Bulirsch's recursion squares the cotangent of the angle, which must not overflow if u is near
+    # 0 or near a multiple of the half period. The angle is therefore kept above a tiny number, and
+    # for tiny u a Taylor series is used.
     tiny = jnp.abs(u) * jnp.maximum(1, jnp.sqrt(m1)) < float(jnp.finfo(u.dtype).eps) ** (1 / 3)
     safe = jnp.maximum(theta, float(jnp.finfo(u.dtype).tiny) ** 0.4)
     a = jnp.cos(safe) / jnp.sin(safe)
@@ -136,8 +138,8 @@ def _sncndn_for_m_up_to_one(u: Array, m: Array, m1: Array) -> tuple[Array, Array
     c = jnp.where(tiny, 1 - square / 2, c)
     d = jnp.where(tiny, 1 - m * square / 2, d)
 
-    # This is the case m = 1. Beyond the clip, sech would underflow, and quotients with sech would
-    # be wrong.
+    # For m = 1 the three functions are tanh, sech and sech. Clip |u| to `largest` in sech: for a
+    # larger |u| sech would underflow, and quotients such as sn/dn would be wrong or infinite.
     largest = 0.97 * math.log(float(jnp.finfo(u.dtype).max))
     e = jnp.exp(-jnp.minimum(jnp.abs(u), largest))
     sech = 2 * e / (1 + e * e)
@@ -202,8 +204,9 @@ def _derivatives_by_m_jvp(
         ds, dc = (cm * d + c * dm) * du, -(sm * d + s * dm) * du
         dd = -(s * c + m * (sm * c + s * cm)) * du
     if not isinstance(dm1, SymbolicZero):
-        # Use the sum over images for large u only: for small u the terms of the sum cancel to leave
-        # u³, while the integral has no large terms.
+        # Near m = 1 the second derivatives come from a sum of hyperbolic functions, one for each
+        # half period (`sncndn_near_one`), but only for |u| > 1. For small u they are of the order
+        # u⁴ or higher: the terms of the sum then cancel, while the integral has no large terms.
         near = (m1 < LARGEST_M1) & (jnp.abs(u) > 1)
         middle, one = jnp.full_like(m1, 0.5), jnp.ones_like(m1)
         far_m, far_m1 = jnp.where(near, middle, m), jnp.where(near, middle, m1)
@@ -234,9 +237,9 @@ def _derivatives_by_m_from_integral(u: Array, m: Array, m1: Array) -> tuple[Arra
     s, c, d = _sncndn_for_m_up_to_one(u, m, m1)
     turns = _reduce_to_half_period(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = power_of_minus_one(turns)
-    # X grows as 1/dn² and must not overflow. If cn and dn are tiny, X depends, except for a factor,
-    # only on the ratio of cn and dn, with a relative error of the square of `_FLOOR`. Therefore
-    # multiply cn and dn by the same large number.
+    # The integral X grows as 1/dn² and must not overflow. If cn and dn are tiny, X is 1/dn² times a
+    # function of their ratio alone, with a relative error of the square of `_FLOOR`. Therefore
+    # multiply cn and dn by the same large number `up`, and correct the result by powers of `up`.
     up = jnp.maximum(1, _FLOOR[np.dtype(u.dtype)] / jax.lax.stop_gradient(d))
     c, d, raised = c * up, d * up, m1 * up * up
     near = turns == 0

@@ -22,10 +22,10 @@ from jaxtyping import Array, PyTree
 from rigidjax.elliptic.arguments import RealOrArray
 from rigidjax.rotation.stumpff import power_of_minus_one
 
-# For m1 up to this number the nome is below 0.0066: a few images, and two terms of the series of
-# the nome in m1, are enough.
+# The sums are used for m1 = 1 − m up to this number. The complementary nome p is then below 0.0066:
+# a few terms of the sums, and a few terms of the series for p, are enough.
 LARGEST_M1 = 0.1
-# The number of images that are summed on either side of the image nearest to u.
+# The number of images (terms of the sums) on either side of the image whose centre is nearest to u.
 _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 
 
@@ -42,11 +42,13 @@ def sncndn_near_one(
     """
     root = jnp.sqrt(m)
     fourth = jnp.sqrt(root)
-    # The nome is DLMF 19.5.5–6, with the difference 1 − m^(1/4) written as a quotient.
+    # The complementary nome p is DLMF 19.5.5–6, with the difference 1 − m^(1/4) written as a
+    # quotient, which loses no digit.
     x = 0.5 * m1 / ((1 + fourth) * (1 + fourth) * (1 + root))
     x4 = (x * x) * (x * x)
     nome = x * (1 + x4 * (2 + 15 * x4))
-    # By DLMF 20.9.2, K' = (π/2) θ₃².
+    # The complete integral K' for m1 is (π/2) θ₃², where θ₃ is Jacobi's theta function at 0 with
+    # the nome p (DLMF 20.9.2).
     theta3 = 1 + 2 * nome * (1 + nome * nome * nome)
     rate = 1 / (theta3 * theta3)
 
@@ -56,15 +58,17 @@ def sncndn_near_one(
     reach = _IMAGES[np.dtype(u.dtype)]
     offset = jnp.arange(-reach, reach + 1, dtype=u.dtype).reshape((1,) * u.ndim + (-1,))
     image = turns[..., None] + offset
-    # Compute e^(−distance to the image) as a power of the nome times e^(±y).
+    # With y = B|u|, the centre of image i is at y = 2iBK = −i ln p. Compute e^(−d), where d is the
+    # distance of y from the centre, as a power of p times e^(±y), because p, unlike d, has
+    # derivatives at m1 = 0.
     beyond = jax.lax.stop_gradient(y) >= jnp.where(turns == 0, 0, turns * length)
     side = jnp.where(
         jnp.where(offset == 0, beyond[..., None], jnp.broadcast_to(offset < 0, image.shape)), -1, 1
     ).astype(u.dtype)
     z = _power_times_exp(nome[..., None], side * y[..., None], side * image)
     hyperbolic = 2 * z / (1 + z * z)
-    # Sum tanh minus its limit 1 or −1 far from the image: the limits of the images on both sides
-    # cancel in pairs.
+    # For sn, sum for each image, except the nearest one, tanh minus its limit 1 or −1 far from the
+    # image: the limits of the images on the two sides cancel in pairs.
     tangent = jnp.where(offset == 0, -side * (1 - z * z), side * 2 * z * z) / (1 + z * z)
 
     sine = rate / root * (power_of_minus_one(image) * tangent).sum(-1)

@@ -275,7 +275,7 @@ def _incomplete_second_kind(
     term is positive.
     """
     m, one = 1 - m1, jnp.ones_like(sine)
-    # E(φ|1) is sin φ; at φ = π/2 the terms below are not defined.
+    # For m = 1 and |φ| = π/2 Carlson's integrals below are not finite; E(φ|1) is sin φ.
     end = delta_squared == 0
     cosine_squared, delta_squared = (
         jnp.where(end, one, cosine_squared),
@@ -309,7 +309,8 @@ def _integral_at_any_amplitude(
     turns, remainder = split_half_turns(phi)
     n1 = jnp.ones_like(m1) if n1 is None else n1
     part = incomplete_integral(orders, jnp.sin(remainder), jnp.cos(remainder), m1, n1)
-    # Within the first half turn the complete integral is not needed, and it may be infinite.
+    # For |φ| ≤ π/2 the complete integral is not needed, and it may be infinite: replace it by the
+    # one for m = n = 0.
     near = turns == 0
     one = jnp.ones_like(m1)
     safe_m1, safe_n1 = jnp.where(near, one, m1), jnp.where(near, one, n1)

@@ -24,8 +24,8 @@ from rigidjax.rotation.barrier import barrier, compiled_as_one_kernel
 
 
 class ClosedFormConstants(NamedTuple):
-    """Hold the constants of a free motion, in principal axes that are labelled 1, 2, 3 in ascending
-    or descending order of their moments I₁, I₂, I₃.
+    """Hold the constants of the motion of a free rigid body, in principal axes that are labelled
+    1, 2, 3 in ascending or descending order of their moments I₁, I₂, I₃.
     """
 
     a: Scalar  # 1/I₁, the reciprocal of the moment of axis 1
@@ -56,8 +56,8 @@ def closed_form_constants(moments: Triple, momentum: Triple) -> ClosedFormConsta
     A3 = d13 * p1 * p1 + d23 * p2 * p2
     A2 = d23 * p3 * p3 - d12 * p1 * p1
     p, q, gap = d23 * A1, d12 * A3, d13 * A2
-    # Label the axes such that the phase ξ, a correction to the rotation about the momentum, stays
-    # small.
+    # Exchange the labels of axes 1 and 3 if the phase ξ is then smaller: ξ is the correction to the
+    # steady turn |Π| t/I₁ of the body about its momentum Π, and keeps more digits if it is small.
     swap = d12 * A1 > d23 * A3
     p, q, gap = jnp.where(swap, q, p), jnp.where(swap, p, q), jnp.where(swap, -gap, gap)
     a = jnp.where(swap, r3, r1)
@@ -73,8 +73,8 @@ def closed_form_constants(moments: Triple, momentum: Triple) -> ClosedFormConsta
 
 
 class ReducedTime(NamedTuple):
-    """Hold a time from which a whole number of half periods of the elliptic functions was
-    subtracted.
+    """Hold a time from which a whole number of half periods was subtracted: of the half periods of
+    the elliptic functions S, C, D in which a free motion is written.
     """
 
     halves: Scalar  # the number of half periods that were subtracted
@@ -83,12 +83,14 @@ class ReducedTime(NamedTuple):
 
 
 def reduce_time(u: Scalar, half_period: Scalar, modulus: Modulus) -> ReducedTime:
-    """Return the time u reduced by a whole number of half periods of the elliptic functions.
+    """Return the time u less a whole number of half periods of the elliptic functions S, C, D in
+    which a free motion is written.
 
+    - `u`: the time.
     - `half_period`: the length of one half period, which is infinite on the separatrix.
-    - `modulus`: the parameters of the functions, which tell whether the motion is on the
-      separatrix. There the body ends in a steady spin about its middle axis, and the time is
-      clipped to the beginning of this spin.
+    - `modulus`: the parameters of the elliptic functions, which tell whether the motion is on the
+      separatrix. There the body ends in a steady spin about its middle axis, and a time within this
+      spin is replaced by the time at which the spin begins.
     """
     count = jnp.round(u / half_period)
     rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half_period)
@@ -98,12 +100,14 @@ def reduce_time(u: Scalar, half_period: Scalar, modulus: Modulus) -> ReducedTime
 def restore_half_periods(
     constants: ClosedFormConstants, functions: Elliptic, half_time: ReducedTime
 ) -> tuple[Elliptic, Scalar]:
-    """Return two things: the elliptic functions S, C, D at the time t/2, from their values at a
-    reduced time; and the angle by which the phase ξ at t/2 is larger than the phase at the reduced
-    time.
+    """Return two things: the elliptic functions S, C, D of a free motion at the time t/2, from
+    their values at a reduced time; and the angle by which the phase ξ at t/2 is larger than the
+    phase at the reduced time.
 
     - `constants`: the constants of the motion.
-    - `functions`: S, C, D and ξ at the reduced time `half_time.near`.
+    - `functions`: S, C, D and ξ at the reduced time `half_time.near`. S solves dS/du = CD with
+      S(0) = 0, where C² = 1 − pS² and D² = 1 − qS²; ξ is the angle κ ∫ S²/(1 + μS²) du from 0. The
+      numbers p, q, κ and μ are among the `constants`.
     - `half_time`: the reduced time, and the number of half periods that were subtracted from t/2.
 
     The angle belongs to the half periods that were subtracted and, on the separatrix, to the time
@@ -111,8 +115,9 @@ def restore_half_periods(
     """
     big = jnp.maximum(constants.modulus.p, constants.modulus.q)
     whole = jnp.where(half_time.halves == 0, 0.0, half_time.halves)
-    # After the time `half_time.near` on the separatrix the momentum rests on the middle axis, where
-    # S² = 1/max(p, q): the body spins steadily.
+    # On the separatrix, from `half_time.near` on, the momentum rests on the middle axis and the
+    # body spins steadily. There S² = 1/max(p, q), with the parameters p and q of S, so that the
+    # phase grows at the constant rate κ S²/(1 + μS²) = κ/(max(p, q) + μ).
     spin = (
         (half_time.rest - half_time.near)
         * constants.phase_factor
@@ -135,13 +140,13 @@ def restore_elliptic_identity(functions: Elliptic, modulus: Modulus) -> Elliptic
     """Return the elliptic functions S, C, D with the larger of C² and D² computed again from the
     smaller, by D² − C² = (p − q)S².
 
-    - `functions`: S, C and D, with errors of round-off from the doublings.
-    - `modulus`: the parameters p and q of the functions.
+    - `functions`: S, C and D, with the errors of round-off from their computation, in which the
+      time is doubled many times.
+    - `modulus`: the numbers p and q, where C² = 1 − pS² and D² = 1 − qS².
 
     If the momentum is near the middle axis, its first component is a small difference of two terms,
-    one with the factor C and one with the factor SD. An equal error of C and D, from the doublings,
-    cancels in this difference; an error of C alone or of D alone does not cancel, and the identity
-    removes this error.
+    one with the factor C and one with the factor SD. If C and D have equal errors, these cancel in
+    the difference; an error of C alone or of D alone does not cancel, and the identity removes it.
     """
     gs = modulus.gap * functions.S * functions.S
     other = jnp.sqrt(
@@ -159,7 +164,9 @@ def momentum_from_elliptic_functions(constants: ClosedFormConstants, functions: 
 
     - `constants`: the constants of the motion, which also fix the labels 1, 2, 3 of the principal
       axes.
-    - `functions`: the elliptic functions S, C and D at the time for which the momentum is computed.
+    - `functions`: the elliptic functions S, C and D at the time for which the momentum is computed:
+      S solves dS/du = CD with S(0) = 0, where C² = 1 − pS² and D² = 1 − qS² for two numbers p and q
+      of the motion.
     """
     p1, p2, p3 = constants.P
     functions = restore_elliptic_identity(functions, constants.modulus)
@@ -169,8 +176,9 @@ def momentum_from_elliptic_functions(constants: ClosedFormConstants, functions: 
     size = jnp.maximum(jnp.maximum(jnp.abs(y1), jnp.abs(y2)), jnp.abs(y3))
     still = size <= 0
     size = jnp.where(still, 1.0, size)
-    # For a steady spin the quotient of the only component by the size is exactly ±1, so that the
-    # momentum stays the same to the last digit.
+    # Divide by the largest component before the length is computed: in a steady spin about a
+    # principal axis the only component becomes exactly ±1, and the momentum then stays the same to
+    # the last digit.
     y1, y2, y3 = y1 / size, y2 / size, y3 / size
     r = constants.h / jnp.sqrt(jnp.where(still, 1.0, y1 * y1 + y2 * y2 + y3 * y3))
     return y1 * r, y2 * r, y3 * r
@@ -213,8 +221,9 @@ def momentum_and_rotation_from_elliptic_functions(
     _, k2, k3 = barrier(momentum_from_elliptic_functions(constants, functions))
     m1, m2, m3 = barrier(momentum_from_elliptic_functions(constants, full))
 
-    # The turn is the product (c, s Π(0)) ⊗ b of two quaternions: the first turns about the initial
-    # momentum, and b = (b0, 0, b2, b3) turns about an axis in the plane of axes 2 and 3.
+    # The rotation of the body from time 0 to t is the product (c, s Π(0)) ⊗ b of two quaternions.
+    # The first, with two numbers c and s, turns about the initial momentum Π(0); the second,
+    # b = (b0, 0, b2, b3), turns about an axis in the plane of axes 2 and 3.
     b0, b2, b3 = (
         functions.C,
         -constants.d12 * functions.S * k2 * functions.C,

@@ -63,16 +63,16 @@ from rigidjax.exact.sigma_form import Differences
 from rigidjax.rotation.barrier import compiled_as_one_kernel
 from rigidjax.rotation.linalg3 import components
 
-# If the body turns by less than this angle, rad, from time 0 to t, the derivative of the turn comes
-# from a series of third order in time. The second derivatives of the series have an error of about
-# the square of the angle; the second derivatives of the closed form have an error of about the
-# round-off divided by the angle.
+# If the body turns by less than this angle, rad, from time 0 to t, the derivative of its rotation
+# comes from a series of third order in time, else from the closed form. Second derivatives from the
+# series have an error of about the square of the angle, those from the closed form an error of
+# about the round-off divided by the angle.
 _STILL = {jnp.dtype("float32"): 5e-3, jnp.dtype("float64"): 5e-6}
 
 
-# Up to this number of times, a loop over the times is used: it compiles sooner than one batch of
-# all times. The loop is as fast as the batch, except if only the values of one body are computed,
-# without derivatives.
+# The states of a body at n instants are computed in a loop if n is at most this number, else as one
+# batch (`jax.vmap`). The loop compiles sooner. It also runs as fast as the batch, except if only
+# the values of one body are computed, without derivatives.
 _LOOPED = 1000
 
 # The body momentum Π(t), the quaternion of the rotation from time 0 to t, and the body rate Ω(t).
@@ -134,10 +134,10 @@ def _derivative_variables_and_changes(
       principal axes, the three components of the body momentum Π(0), and the time t.
     - `tangents`: the changes of these three inputs, in the same form.
 
-    K is the inverse of the inertia tensor, given by six entries; `differences` are the differences
-    d12, d13, d23 of its diagonal entries (dij = kii − kjj) with its off-diagonal entries; and
-    E₂ = Π·KΠ is twice the energy. The ten variables are d12, d23, k12, k13, k23, the three of Π(0),
-    k33 and t.
+    K is the inverse of the inertia tensor, given by its six entries kij; `differences` are the
+    differences d12, d13, d23 of its diagonal entries (dij = kii − kjj) with its off-diagonal
+    entries; and E₂ = Π·KΠ is twice the energy. The ten variables are d12, d23, k12, k13, k23, the
+    three components of Π(0), k33 and t.
     """
     inverse_inertia, changes = jax.jvp(inverse_inertia_and_energy, primals[:2], tangents[:2])
     return (
@@ -232,9 +232,11 @@ def _rate_and_rotation_jvp(
     """
     tensor, omega, constants, t = primals
     d_tensor, d_omega, _, d_t = tangents
-    # The derivative is a product of two matrices. The left matrix depends on time. The right
-    # matrix, `first`, does not: it is computed once for all times. The part that JAX transposes in
-    # reverse mode is therefore short.
+    # The derivative of the motion with respect to the tensor and the initial rate is a product of
+    # two matrices: the derivatives of the motion with respect to nine variables, which depend on
+    # time; and `first`, the derivatives of these variables with respect to the tensor and the rate,
+    # which is computed once for all times. The changes of the inputs are only multiplied by the two
+    # matrices: in reverse mode JAX therefore has little to transpose.
     first = _variable_derivatives_by_body(jnp.concatenate([tensor.ravel(), omega]), constants)
     out, (rates, thetas) = _evaluate_at_each_time(
         lambda time: _rate_and_rotation_with_derivatives(tensor, omega, constants, time), t
@@ -327,9 +329,10 @@ def _variable_derivatives_by_body(
     """
     tensor, omega, axes = tensor_and_rate[:9].reshape(3, 3), tensor_and_rate[9:], constants.axes
     moments, momentum = _tensor_and_momentum_in_axes(tensor, omega, constants)
-    # In principal axes, δK = −K δI K is −BᵀδI B with B = A K, where the columns of A are the axes.
-    # The products are written as sums of products of entries, because on a GPU a product of
-    # matrices is rounded to ten bits in float32.
+    # A change δI of the inertia tensor, in the body frame, changes its inverse K, in principal
+    # axes, by δK = −BᵀδI B with B = A K, where the columns of A are the principal axes. The
+    # products are written as sums of products of entries, because on a GPU a product of matrices is
+    # rounded to ten bits in float32.
     k = jnp.stack(symmetric_rows(inverse_inertia_and_energy(moments, momentum)[1]))
     b = jnp.sum(axes[:, :, None] * k[None], axis=1)
     d_k = lambda i, j: -(b[:, None, i] * b[None, :, j]).ravel()  # noqa: E731
@@ -365,8 +368,8 @@ def _rate_and_rotation_with_derivatives(
     (_, (w, *axis), rate), rows, _ = motion_and_derivatives(moments, momentum, t)
     rate = combine_columns(constants.axes, rate)
     turn = jnp.stack([w, *combine_columns(constants.axes, tuple(axis))])
-    # Return the derivatives as rows, not as matrices: in a batch, stacking the rows takes five
-    # times as long as computing them.
+    # Return the derivatives of the components as three separate rows, not as one matrix: if many
+    # times are computed at once, stacking the rows takes five times as long as computing them.
     in_body = jax.vmap(lambda *v: combine_columns(constants.axes, v))
     return (jnp.stack(rate), turn), (in_body(*rows.rate), in_body(*rows.theta))
 
@@ -496,8 +499,9 @@ def _motion_derivatives(
         along = sum(a * b for a, b in zip(weights, d_k, strict=True))
         along = along + t * sum(a * b for a, b in zip(rate, start, strict=True)) + energy2 * et
         theta = tuple(r * (a + b * along) for a, b in zip(across, out, strict=True))
-        # Near rest the derivative is a series in t, from θ' = δΩ − Ω × θ with Ω = KΠ and Π' = Π ×
-        # Ω.
+        # If the body turns by a tiny angle only, the change θ of its rotation is a power series in
+        # the time t. It follows from θ' = δΩ − Ω × θ, with the body rate Ω = KΠ, its change δΩ, and
+        # the momentum Π with Π' = Π × Ω.
         faster = add(matvec(d_k, momentum), matvec(inverse_inertia, start))
         d_pull = add(cross(start, rate), cross(momentum, faster))
         gained = add(matvec(d_k, pull), matvec(inverse_inertia, d_pull))
@@ -613,7 +617,8 @@ def _changes_of_momentum_derivatives(
         )
 
     def columns(x):
-        # Compute one column after the other: a batch of columns takes longer to compile.
+        # Compute the derivatives with respect to the ten variables one after the other: as one
+        # batch (`jax.vmap`) they take longer to compile.
         column = lambda e: jax.jvp(of_inputs, (x,), (e,))[1]  # noqa: E731
         return jax.lax.map(column, jnp.eye(10, dtype=x.dtype))
 

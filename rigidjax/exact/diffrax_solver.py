@@ -17,10 +17,12 @@ from rigidjax.motion.equations import AttitudeEquations, EulerEquations
 class FreeInterpolation(dfx.AbstractLocalInterpolation):
     """Evaluate the motion of a free body between the two ends of a diffrax step in closed form.
 
-    - `t0`, `t1`: the times of the two ends, in the time of diffrax.
-    - `y0`: the state at `t0`, a `Spin` or an `Attitude`.
-    - `inertia`: of the body about its centre of mass.
-    - `direction`: −1 if diffrax integrates backwards, in which case its times are −t; else 1.
+    - `t0`, `t1`: the times of the two ends as diffrax counts them, which are −t if it integrates
+      backwards in the time t.
+    - `y0`: the state at `t0`, a `Spin` (a body rate) or an `Attitude` (a quaternion and a body
+      rate).
+    - `inertia`: the inertia of the body about its centre of mass.
+    - `direction`: −1 if diffrax integrates backwards, else 1.
     """
 
     t0: Any
@@ -44,11 +46,13 @@ class FreeInterpolation(dfx.AbstractLocalInterpolation):
 
 
 class FreeSolver(dfx.AbstractSolver):
-    """Solve torque-free spins and attitudes in diffrax, where each step evaluates the closed form.
+    """Solve the equations of a torque-free body in diffrax, where each step evaluates the closed
+    form.
 
-    Use it with `diffrax.ODETerm(rigidjax.equations_of_motion(inertia, y0))` of a `Spin` or an
-    `Attitude`, with no torque. One step over the whole interval is enough. Events, dense output and
-    every adjoint work as with any solver.
+    Use it with the term `diffrax.ODETerm(rigidjax.equations_of_motion(inertia, y0))`, where the
+    state `y0` is a `Spin` (a body rate) or an `Attitude` (a quaternion and a body rate), and no
+    torque is given. One step over the whole interval is enough. Events, dense output and every
+    adjoint work as with any solver.
 
     **Raises:** `ValueError` for another term, or for equations with a torque.
 
@@ -65,13 +69,15 @@ class FreeSolver(dfx.AbstractSolver):
     interpolation_cls: ClassVar[Callable[..., FreeInterpolation]] = FreeInterpolation
 
     def order(self, terms: PyTree[dfx.AbstractTerm]) -> int | None:
-        """Return the order 1: an exact step needs no order, but some step size controllers ask for
-        it.
+        """Return 1 as the order of this solver: its steps are exact and have no order, but some
+        step size controllers of diffrax ask for one.
         """
         return 1
 
     def error_order(self, terms: PyTree[dfx.AbstractTerm]) -> float | None:
-        """Return the order 1 of the error, which is zero in each step."""
+        """Return 1 as the order of the error of a step, which diffrax asks for; the error of this
+        solver is zero.
+        """
         return 1.0
 
     def init(
@@ -122,11 +128,13 @@ class FreeSolver(dfx.AbstractSolver):
 
 
 def field_and_direction(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
-    """Return two things from inside the terms of a diffrax solver: the vector field; and the
-    direction of time, 1 or −1, with which diffrax wraps the term.
+    """Return two things from inside the terms that diffrax gives to a solver: the vector field, or
+    `None` if there is none; and the direction of time, 1, or −1 if diffrax integrates backwards.
+
+    - `terms`: an `ODETerm`, or an object of diffrax that holds such a term and the direction.
     """
-    # Read attributes of the wrapped term: diffrax promises only the methods `vf` and `contr`, which
-    # return numbers and not the inertia.
+    # Read the attributes of these objects: the public methods of a term, `vf` and `contr`, return
+    # numbers only, but the solver needs the inertia that the vector field holds.
     term = getattr(terms, "term", terms)
     return getattr(term, "vector_field", None), getattr(terms, "direction", 1)
 

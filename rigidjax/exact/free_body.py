@@ -32,8 +32,8 @@ class FreeBody(eqx.Module):
     `at` with many times.
 
     The constants of the motion are computed once. **Arguments:** `inertia` of the body about its
-    centre of mass, kg m², body frame; `state0` the state at time 0, a `Spin` or an `Attitude`.
-    `free_body` has the same two arguments.
+    centre of mass, kg m², body frame; `state0` the state at time 0, a `Spin` (the body rate Ω) or
+    an `Attitude` (the quaternion q and Ω). `free_body` describes the same two arguments in full.
 
     >>> motion = FreeBody(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([0.0, 0.0, 1.0]))
     >>> motion(10.0).omega
@@ -48,7 +48,9 @@ class FreeBody(eqx.Module):
 
     def __init__(self, inertia: Inertia, state0: HasSpin):
         inertia = _checked_inertia(inertia, state0)
-        # Scale by powers of two: this loses no digit, and then no body is too large or too small.
+        # Divide the tensor and the body rate by powers of two, so that their largest entries are
+        # near 1: this loses no digit, and no product below overflows or underflows for a huge or a
+        # tiny body.
         self.exponent = largest_binary_exponent(state0.omega)
         self.tensor = times_power_of_two(inertia.tensor, -largest_binary_exponent(inertia.tensor))
         self.omega = times_power_of_two(state0.omega, -self.exponent)
@@ -56,13 +58,17 @@ class FreeBody(eqx.Module):
         self.state0 = state0
 
     def __call__(self, t: ScalarLike) -> HasSpin:
-        """Return the state at the time `t`, one number, in seconds since `state0`."""
+        """Return the state of the free body at the time `t`, one number, s; the time is 0 at the
+        initial state `state0`.
+        """
         return self.at(_checked_time(t, self.state0.omega))
 
     def at(self, ts: Float[Array, "*n"]) -> HasSpin:
-        """Return the states at the times `ts` (n,), in seconds since `state0`.
+        """Return the states of the free body at the times `ts` (n,), s; the time is 0 at the
+        initial state `state0`.
 
-        The result is that of `jax.vmap` over the times, but the method compiles sooner.
+        Each array of the result begins with an axis of length n. `jax.vmap` over the times has the
+        same result, but this method compiles sooner.
 
         >>> motion = FreeBody(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([0.0, 0.0, 1.0]))
         >>> motion.at(jnp.array([0.0, 10.0])).omega
@@ -70,8 +76,9 @@ class FreeBody(eqx.Module):
                [0., 0., 1.]], dtype=float64)
         """
         t = ts.astype(self.tensor.dtype)
-        # If the body turns by more than 1/eps rad, the dtype holds no digit of the angle within one
-        # turn: the state is then unknown, and the time becomes NaN.
+        # If the body turns by more than 1/eps rad until the time t, the dtype holds no digit of the
+        # angle within one turn, and the state is unknown: replace t by NaN, so that the state is
+        # NaN, too.
         turned = jnp.abs(t) * jnp.max(jnp.abs(self.state0.omega))
         t = jnp.where(turned <= 1 / jnp.finfo(t.dtype).eps, t, jnp.nan)
         since = times_power_of_two(t, self.exponent)
@@ -85,11 +92,13 @@ class FreeBody(eqx.Module):
 
 
 class FreeMotion(eqx.Module):
-    """Hold the motion of a free body for any state: a `FreeBody`, and for a `Rigid` also the
-    straight path of the centre of mass.
+    """Hold the motion of a free body from any initial state: the rotation as a `FreeBody`, and, if
+    the state is a `Rigid` (position, velocity, quaternion and body rate), also the straight path of
+    the centre of mass.
 
-    Call the object with a time, or with times (n,), in seconds since `state0`. If the body turns by
-    more than 1/eps rad in a time, where eps is the machine epsilon of the dtype, the result is NaN.
+    Call the object with one time or with times (n,), s; the time is 0 at the initial state. The
+    result is NaN at a time until which the body turns by more than 1/eps rad, where eps is the
+    machine epsilon of the dtype.
     """
 
     state0: Any
@@ -102,8 +111,8 @@ class FreeMotion(eqx.Module):
         self.turning = FreeBody(body if isinstance(body, Inertia) else body.inertia, turning)
 
     def __call__(self, since: Float[Array, "*n"]) -> Any:
-        """Return the states at the times `since`, one time or times (n,), in seconds since
-        `state0`.
+        """Return the state of the free body at the time `since`, or the states at the times `since`
+        (n,), s; the time is 0 at the initial state `state0`.
         """
         turned: Any = self.turning.at(since)
         if not isinstance(self.state0, Rigid):

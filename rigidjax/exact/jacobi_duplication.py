@@ -56,10 +56,12 @@ class Modulus(NamedTuple):
 
 
 class IterationLimits(NamedTuple):
-    """Hold the number of doublings, the number of steps of the arithmetic–geometric mean, and two
-    limits of a free motion, all for one dtype.
+    """Hold, for one dtype, how often the computation of the elliptic functions repeats its steps,
+    and two limits beyond which a free motion is taken as a simpler one.
 
-    Here u is the time, and p and q are the parameters of the elliptic functions of the motion.
+    `doublings` and `agm` are the numbers of doublings of the time and of steps of the
+    arithmetic–geometric mean; `floor` and `rest` are the limits, where u is the time, and p and q
+    are the parameters of the elliptic functions of the motion.
     """
 
     doublings: int  # the number of doublings from u/2^doublings to u
@@ -69,8 +71,8 @@ class IterationLimits(NamedTuple):
 
 
 def iteration_limits(dtype: jnp.dtype) -> IterationLimits:
-    """Return the numbers of steps and the limits of the elliptic functions for the dtype float32 or
-    float64.
+    """Return the numbers of steps and the limits with which the elliptic functions of a free motion
+    are computed in the dtype float32 or float64.
 
     The number of doublings is enough for the longest quarter period, which is ln(4/√floor)/√max(p,
     q), where p and q are the parameters of the elliptic functions. The limit `floor` is chosen so
@@ -148,7 +150,8 @@ def elliptic_taylor_series(
     hh = time * time
     p, q = modulus.p * hh, modulus.q * hh
     e, f = p + q, p * q
-    # The smallest term comes first, because it must be summed first.
+    # The list begins with the smallest term of the Taylor series of S: the terms are added in the
+    # order of the list, and the sum has the least round-off if the smallest comes first.
     terms = [
         -e * f * f * (e * e * (258821 / 3027024000) + f * (13511 / 36036000)),
         e * e * (e * e * f * (8303 / 518918400) + f * f * (9481 / 14414400))
@@ -205,18 +208,18 @@ def elliptic_functions(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Sc
     """
     n = iteration_limits(u.dtype).doublings
     f = elliptic_taylor_series(u * 2.0**-n, modulus, mu, phase_factor)
-    # A loop compiles eight times sooner than nine copies of its body.
+    # Double the time in a loop: it compiles eight times sooner than nine doublings written out.
     return jax.lax.fori_loop(
         0, n, lambda _, g: elliptic_functions_at_double_time(g, modulus, mu, phase_factor), f
     )
 
 
 class HalfPeriod(NamedTuple):
-    """Hold three numbers of half a period of the elliptic function S, which solves (dS/du)² = (1 −
-    pS²)(1 − qS²) with S(0) = 0 for two numbers p and q of the motion.
+    """Hold the duration of half a period of the elliptic function S of a free motion, the phase ξ
+    at its end, and the mean of S² over it.
 
-    The phase ξ is the angle κ ∫ S²/(1 + μS²) du from 0, with two more numbers μ and κ of the
-    motion.
+    S solves (dS/du)² = (1 − pS²)(1 − qS²) with S(0) = 0, and ξ is the angle κ ∫ S²/(1 + μS²) du
+    from 0, for four numbers p, q, μ and κ of the motion.
     """
 
     time: Scalar  # the least time T > 0 with S(T) = 0; infinite on the separatrix
@@ -243,23 +246,24 @@ def half_period(modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> HalfPerio
     big = jnp.where(at_rest, 1.0, big)
     gap = jnp.abs(modulus.gap)
     endless = is_aperiodic(modulus)
-    # Compute in units of λ: XLA may multiply the divisors below into one product, which must not
-    # underflow.
+    # Divide all quantities by powers of λ = √max(p, q): XLA may multiply the divisors below into
+    # one product, which would underflow for a slow motion.
     w = small / big
     a, b = jnp.ones_like(big), jnp.sqrt(jnp.where(endless, 1.0, gap / big))
-    # The equality c₁ = w/(2(a₀ + b₀)) is exact; `ratio` is c_n²/w and `c` is c_n.
+    # The loop begins at n = 1, with c_n in `c` and 2^{n−1} c_n²/w in `ratio`. The formula
+    # c₁ = w/(2(a₀ + b₀)) equals (a₀ − b₀)/2, but has no difference that would lose digits.
     c = w / (2.0 * (a + b))
     ratio = w / (4.0 * (a + b) ** 2)
-    # Use a loop: eleven steps written out would take as long to compile as everything else in the
-    # motion.
+    # Use a loop: the eleven steps of the arithmetic–geometric mean, written out, would take as long
+    # to compile as the rest of the free motion.
     point, half, one = jnp.sqrt(1.0 + mu / big), jnp.full_like(a, 0.5), jnp.ones_like(a)
     start = (a, b, c, ratio, half, point, one, one)
     a, *_, total, _, _, sum_parts = jax.lax.fori_loop(
         0, iteration_limits(a.dtype).agm, _arithmetic_geometric_mean_step, start
     )
     time = math.pi / (a * jnp.sqrt(big))
-    # The phase ξ of half a period T is ½ κ T Σ/(λ² + μ), where Σ is `sum_parts` (DLMF 19.8.7 with
-    # α² = −μ/λ²).
+    # The phase ξ = κ ∫ S²/(1 + μS²) du over half a period T is ½ κ T Σ/(λ² + μ), where Σ is
+    # `sum_parts`, κ is `phase_factor` and λ² = max(p, q) (DLMF 19.8.7 with α² = −μ/λ²).
     phase = phase_factor * time * 0.5 / (big + mu) * sum_parts
     return HalfPeriod(jnp.where(endless, jnp.inf, time), phase, total / big)
 

@@ -91,9 +91,10 @@ def momentum_jacobian_and_integral(
         halves == 0, 1.0, jnp.abs(gap)
     )
 
-    # If k12 changes, the entry 12 of T = diag(D, 1, C) changes by t12 times the change of k12; t13
-    # and t23 are such factors for the entries 13 and 23. The three factors are divided differences
-    # of T.
+    # The diagonal matrix T = diag(D, 1, C), with the elliptic functions D and C at the time t, is a
+    # function of the inverse inertia K. If the entry k12 of K changes, the entry 12 of T changes by
+    # t12 times this change; t13 and t23 are the factors for the entries 13 and 23. Each factor is a
+    # divided difference of two diagonal entries of T.
     s = half_time_integrals.f.S * half_time_integrals.f.S
     cc, dd = (
         half_time_integrals.f.C * half_time_integrals.f.C,
@@ -108,8 +109,9 @@ def momentum_jacobian_and_integral(
     ss, tt = S * S, jnp.where(three, D, C)
     rw = 1.0 / (tt * tt + ss * z)
     m1, m2, m3 = y1 * rw, y2 * rw, y3 * rw
-    # Let W = 1/rw be the divisor. For short times compute C − W, CD − W and D − W from C − 1, D − 1
-    # and W − 1, which are small and are found without a subtraction.
+    # The body momentum Π(t) is the vector (y1, y2, y3) divided by W = 1/rw. Its derivative needs
+    # C − W, CD − W and D − W. For short times compute these from C − 1, D − 1 and W − 1, which are
+    # small and are found without a subtraction.
     w1 = ss * (z - jnp.where(three, q, p))
     short = jnp.abs(w1) < 0.5
     c1 = jnp.where(C > 0, -p * ss / (1.0 + jnp.abs(C)), C - 1.0)
@@ -161,8 +163,9 @@ def momentum_jacobian_and_integral(
 
     rows = jax.vmap(lambda e: tangent(*e))(jnp.eye(10, dtype=t.dtype))
 
-    # The entry 22 of G is computed first. The entries 11 and 33 follow from it, because A₁ and A₃
-    # are constants of the motion. The off-diagonal entries are computed last.
+    # The entry 22 of G = ∫ Π Πᵀ dt is computed first. The entries 11 and 33 follow from it, because
+    # A₁ = d₁₂Π₂² + d₁₃Π₃² and A₃ = d₁₃Π₁² + d₂₃Π₂² are constants of the motion. The off-diagonal
+    # entries are computed last.
     g22 = A1 * A3 * grown2 + (S * C * D * p2 * p2 + ss * p2 * u2) * rw
     still = d13 == 0
     rest = (g22 - p2 * p2 * t) / jnp.where(still, 1.0, d13)
@@ -188,7 +191,8 @@ def elliptic_functions_and_integrals(
     """
     n = iteration_limits(u.dtype).doublings
     f = elliptic_taylor_series(u * 2.0**-n, modulus, mu, phase_factor)
-    # The functions S²/D² and S²/C² are S²/(1 + μS²) with μ = −q and μ = −p.
+    # The integrand S²/D² is S²/(1 + μS²) with μ = −q, and S²/C² is the same with μ = −p: one series
+    # serves for both.
     low = jnp.where(modulus.gap > 0, -modulus.q, -modulus.p)
     first = Integrals(
         f,

@@ -109,8 +109,9 @@ def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Sca
     v = sigma_form.motion_invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
     endless = is_aperiodic(jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap)))
-    # If there is no period, the branch that is not taken gets other inputs, so that no derivative
-    # is NaN.
+    # If the motion has no period, compute the period of another motion, whose result is discarded
+    # below: JAX differentiates both branches of `where`, and the derivative of the discarded one
+    # must not be NaN.
     one, zero = jnp.ones_like(h), jnp.zeros_like(h)
     other = (one, 2 * one, 3 * one, zero, zero, zero), (one, zero, zero)
     safe_moments, safe_momentum = jax.tree.map(
@@ -180,10 +181,10 @@ def _momentum_integral_of_period(
     - `momentum`: the three components of the body momentum.
     - `period`: the period of the body rate, s.
 
-    Over a whole period the products of two components cancel. The squares of the three components
-    have the means `A₃(1 − p⟨S²⟩)/d₁₃`, `A₁A₃⟨S²⟩` and `A₁(1 − q⟨S²⟩)/d₁₃`, with the numbers A₁, A₃,
-    p and q of `sigma_form.motion_invariants`, d₁₃ = 1/I₁ − 1/I₃, and the mean ⟨S²⟩ of
-    `half_period`.
+    Over a whole period the integral of the product of two different components is zero. The squares
+    of the three components have the means `A₃(1 − p⟨S²⟩)/d₁₃`, `A₁A₃⟨S²⟩` and `A₁(1 − q⟨S²⟩)/d₁₃`,
+    with the numbers A₁, A₃, p and q of `sigma_form.motion_invariants`, d₁₃ = 1/I₁ − 1/I₃, and the
+    mean ⟨S²⟩ of `half_period`.
     """
     body, _, _ = inverse_inertia_and_energy(inertia, momentum)
     v = sigma_form.motion_invariants(body, momentum)

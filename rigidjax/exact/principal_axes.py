@@ -14,8 +14,9 @@ from rigidjax._types import Mat3, Scalar, Vec3
 from rigidjax.exact.components3 import SymmetricEntries, Triple
 from rigidjax.rotation.barrier import compiled_as_one_kernel, match_batch_axes
 
-# Jacobi's cyclic method converges quadratically: four or five sweeps are enough for any symmetric
-# 3×3 matrix.
+# The number of sweeps of Jacobi's cyclic method for eigenvalues; one sweep is three rotations. The
+# method converges quadratically: four or five sweeps are enough for any symmetric 3×3 matrix, and
+# six leave a margin.
 _SWEEPS = 6
 
 
@@ -114,7 +115,8 @@ def _axes_and_moments(matrix: Mat3) -> tuple[list[list[Scalar]], Triple]:
         d, o, axes = _rotate_last_two_axes(*state)
         return tuple((x[1], x[2], x[0]) for x in (d, o, axes))
 
-    # Each entry axes[i] is the i-th axis, a column of the matrix.
+    # After the loop `axes` has the three principal axes, each as three components: they are the
+    # columns, not the rows, of the matrix that is returned.
     d, _, axes = jax.lax.fori_loop(0, 3 * _SWEEPS, rotate, (d, o, axes))
     for i, j in ((0, 1), (1, 2), (0, 1)):
         d, axes = _exchange_to_ascending(d, axes, i, j)
@@ -160,7 +162,9 @@ def _rotate_last_two_axes(
     none = x == 0
     cot = 0.5 * (third - second) / jnp.where(none, 1.0, x)
     size = jnp.abs(cot)
-    # For a tiny x, √(1 + cot²) overflows in float32; then t = 1/(2 cot).
+    # The tangent t of the angle of rotation is the smaller root of t² + 2bt − 1 = 0, where b is the
+    # cotangent `cot` of twice the angle. If the off-diagonal entry x is tiny, b² overflows in
+    # float32; then |t| is 1/(2|b|).
     t = 1.0 / (size + jnp.where(size > 1e15, size, jnp.sqrt(1.0 + jnp.minimum(size, 1e15) ** 2)))
     t = jnp.where(none, 0.0, jnp.where(cot < 0, -t, t))
     c = 1.0 / jnp.sqrt(1.0 + t * t)
@@ -168,7 +172,8 @@ def _rotate_last_two_axes(
     turned = [tuple(c * p - s * q for p, q in zip(v, w, strict=True))]
     turned.append(tuple(s * p + c * q for p, q in zip(v, w, strict=True)))
     diagonal = (first, second - t * x, third + t * x)
-    # The off-diagonal entry (first, second) is z, and the entry (first, third) is y.
+    # The rotation makes the off-diagonal entry (2, 3), which is x, zero, and turns the entries
+    # (1, 3) and (1, 2), which are y and z, into each other.
     return diagonal, (jnp.zeros_like(x), s * z + c * y, c * z - s * y), (u, *turned)
 
 

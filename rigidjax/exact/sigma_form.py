@@ -159,8 +159,8 @@ def motion_invariants(inverse_inertia: Differences, momentum: Triple) -> Invaria
     )
 
 
-# This many doublings are made in addition to the number in `iteration_limits`: two terms of the
-# series in `sigma_by_taylor_series` are then enough.
+# The time is halved, and later doubled, this many times more often than `iteration_limits` says: at
+# so short a time two terms of the series in `sigma_by_taylor_series` are enough.
 _MORE = 10
 
 
@@ -238,7 +238,7 @@ def sigma_at_double_time(sigma: Sigma, constants: Invariants) -> Sigma:
     n13 = 2.0 * (m13 * m22 - m12 * m23)
     n23 = 2.0 * (m23 * m11 - m12 * m13)
     after = _normalised_sigma(2.0 * s * sigma.det, (n11, n22, n33, n12, n13, n23), sigma.y)
-    # The integral doubles as Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u).
+    # The integral Y = ∫₀ᵘ σ² T⁻² du at the double time is Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u).
     before = barrier(_scaled_matrix(sigma.adjugate, s / sigma.det))
     more = commuting_product(
         barrier(commuting_product(before, before)),
@@ -368,7 +368,9 @@ def momentum_and_integral_in_four_parts(
     )
 
     def take_eighth(i, state):
-        # The integral over each of the four parts is computed from Π at the middle of the part.
+        # The time is taken in eight steps, two for each of its four parts. After the first step of
+        # a part Π is the momentum at the middle of the part: the second step, with an odd i, gives
+        # the term of the integral that belongs to this part.
         point, total = state
         point, part = momentum_after_step_and_integral_term(inverse_inertia, terms, sigma, point)
         odd = i % 2 == 1
@@ -411,7 +413,8 @@ def momentum_period(constants: Invariants) -> Scalar:
     )
 
     def differences(z):
-        # Compute z − E₁₁ and z − E₃₃ without a subtraction if z is one of these two entries.
+        # Return the differences of z and the three diagonal entries of E. If z is the largest of
+        # these entries, E₁₁ or E₃₃, this needs no subtraction of nearly equal numbers.
         extra = z - top
         return (
             jnp.where(three, constants.gap, 0.0) + extra,
@@ -452,7 +455,8 @@ def momentum_and_outer_product_integral(
     v = barrier(motion_invariants(inverse_inertia, momentum))
     m = jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap))
     endless = is_aperiodic(m)
-    # If there is no period, dummy invariants keep NaN out of the derivatives.
+    # If the motion has no period, compute the period of another motion (`tame`), whose result is
+    # not used: JAX differentiates it, too, and its derivatives must not be NaN.
     one, zero = jnp.ones_like(t), jnp.zeros_like(t)
     tame = Invariants(one, one, one, one, zero, one, one, zero, zero, zero)
     usual = jax.tree.map(lambda a, b: jnp.where(endless, b, a), v, tame)
@@ -464,8 +468,8 @@ def momentum_and_outer_product_integral(
     whole = barrier(momentum_period(usual))
     r = 2.0 * clip_time_on_separatrix(0.5 * (t - jnp.where(several, count * whole, 0.0)), m)
 
-    # Compute the motion over the reduced time and over one whole period in one loop, so that it is
-    # compiled once.
+    # The time t is `count` whole periods and the rest r. Compute the motion over r and over one
+    # whole period by the same program, in one loop, so that this program is compiled once.
     both = jax.tree.map(lambda *a: jnp.stack(a), (v, r), (usual, whole))
     out, g = jax.lax.map(
         lambda a: momentum_and_integral_in_four_parts(inverse_inertia, momentum, *a), both

@@ -72,9 +72,10 @@ class LagrangeEquations(eqx.Module):
         )
 
     def energy(self, y: Coordinates) -> Scalar:
-        """Return Jacobi's integral `q̇·∂L/∂q̇ − L`, J, of the state `y`.
+        """Return Jacobi's integral `q̇·∂L/∂q̇ − L` of the Lagrangian L in the state `y`, J, a
+        scalar; q̇ are the rates of the coordinates.
 
-        The integral is conserved if there is no `force` and L does not depend on the time.
+        The integral is conserved if there is no `force`.
         """
         momentum = jax.grad(self._lagrangian_value, argnums=1)(y.q, y.rate)
         return jnp.sum(y.rate * momentum) - self._lagrangian_value(y.q, y.rate)
@@ -108,9 +109,9 @@ def equations_of_motion(
     - `force`: a callable `(t, q, q̇) → Q` (n,), the generalised forces without a potential, or
       `None`.
 
-    **Returns** a Module, for `diffrax.ODETerm`. The linear system is solved by cofactors for up to
-    three coordinates, by LU (`lineax`) for more. Source: Landau and Lifshitz, Mechanics, eq 2.6;
-    the notes mention it after eq 57.
+    **Returns** a Module, for `diffrax.ODETerm`. The linear system for q̈ is solved by cofactors for
+    up to three coordinates, by LU (`lineax`) for more. Source: Landau and Lifshitz, Mechanics,
+    eq 2.6; the notes mention it after eq 57.
 
     If the matrix ∂²L/∂q̇∂q̇ is singular (at a singularity of the coordinates, or for a coordinate
     without inertia), the result has infinities or NaN.

@@ -33,10 +33,11 @@ class Momentum(eqx.Module):
 
 
 class MomentumAndDirection(eqx.Module):
-    """Hold the state of a heavy top: the angular momentum, and a vector fixed in the world.
+    """Hold the state of a heavy top: the angular momentum, and a vector fixed in the world (such as
+    the acceleration of gravity), both in body axes.
 
-    The attitude itself is not needed, because the motion does not depend on a turn about this
-    vector.
+    The attitude itself is not needed, because the equations do not change if the body is turned
+    about this vector.
 
     **Arguments:**
 
@@ -172,8 +173,8 @@ class HeavyTopHamiltonian(eqx.Module):
 
     The object is a function of the angular momentum Π (3,), in N m s, and of gravity γ = Rᵀ g (3,),
     both in the body frame. Here g is the acceleration of gravity in world axes, in metres per
-    second squared, and R is the attitude, body → world. `start` makes the state of the vector
-    field.
+    second squared, and R is the attitude, body → world. The method `start` makes the initial state
+    for `lie_poisson_with_direction` from an attitude and a body rate.
 
     **Raises:** `ValueError` for a principal moment that is zero and not traced by JAX.
 
@@ -203,8 +204,9 @@ class HeavyTopHamiltonian(eqx.Module):
         return 0.5 * dot(pi, apply(self.inverse, pi)) - self.top.mass * dot(self.top.com, gamma)
 
     def start(self, state: HasAttitude) -> MomentumAndDirection:
-        """Return the state of the vector field: the angular momentum Π = IΩ and the gravity
-        γ = Rᵀ g, both in body axes, where g is the gravity of the top in world axes.
+        """Return the initial state of the heavy top for `lie_poisson_with_direction`, a
+        `MomentumAndDirection`: the angular momentum Π = IΩ and the gravity γ = Rᵀ g, both in body
+        axes, where g is the acceleration of gravity of the `top` in world axes.
 
         `state` has the attitude R (a quaternion `q`, body → world) and the body rate Ω, rad/s.
         """

@@ -22,7 +22,8 @@ from rigidjax.workprecision.standard_scenes import scenes
 
 STORED = Path("tests/workprecision/record.csv")
 QUICK = ("free-top", "heavy-top", "damped-gyrostat")
-# The methods of a quick run, and for each method the adjoints that are measured.
+# The methods of a quick run. For each method: the ways to compute a gradient (the adjoints) that
+# are measured; with none, only the value is measured.
 SMALL = {
     "closed form": ("forward",),
     "simulate": ("forward",),
@@ -75,10 +76,11 @@ def add_subcommand(commands: argparse._SubParsersAction) -> None:
 
 
 def run_subcommand(options: argparse.Namespace) -> int:
-    """Run the subcommand, and **return** the exit code.
+    """Run the subcommand `workprecision` with the `options` of the command line, and **return** its
+    exit code.
 
-    The code is 0 for success, 1 if an error or a number of steps changed since the stored table,
-    and 2 for wrong options or files.
+    The code is 0 for success; 1 if, with `--check`, an error or a number of steps differs from the
+    stored table of measurements; and 2 for wrong options or files.
     """
     try:
         known = [*scenes(), DRIFT]
@@ -145,8 +147,12 @@ def _measure_scenes(options: argparse.Namespace) -> list[Measurement]:
 
 
 def summary(records: Iterable[Measurement]) -> str:
-    """Return a text that shows, for each scene, the time in microseconds in which each method
-    reaches each wanted error.
+    """Return a text with a table for each scene, for values and for gradients: a line for each
+    method has the times, µs, in which the method reaches the errors `pareto.WANTED`, its least
+    error, and its compile time, s.
+
+    - `records`: measurements; for those of the long run (`long_drift`) the drifts are shown
+      instead.
 
     A * marks the methods on the Pareto front of error and time; a + marks the methods on the front
     of the methods in JAX alone.

@@ -52,7 +52,8 @@ def gravity_gradient_torque(
 
     - `inertia`: the entries Ixx, Iyy, Izz, Ixy, Ixz, Iyz of the inertia tensor I.
     - `constants`: one number, the orbital rate n, rad/s.
-    - `sin`, `cos`: the sine and the cosine for these numbers.
+    - `sin`, `cos`: the sine and the cosine for the kind of number that is used (floats, numbers of
+      high precision, or symbols of another package).
     - `to_body`: a function (q, x, y, z) that returns the vector (x, y, z) of the world in body
       axes, for the quaternion q.
     """
@@ -156,7 +157,7 @@ def foucault_vector_field(
 
     - `constants`: three numbers, the gravity g, and the components of the angular velocity of the
       Earth along north and up.
-    - `sqrt`: the square root for these numbers, which is not used here.
+    - `sqrt`: not used here; the other vector field of a point in this module needs a square root.
     """
     g, wn, wu = constants
 
@@ -181,7 +182,8 @@ def three_body_vector_field(
     distance of the two large bodies, their total mass and the rate of the frame are 1).
 
     - `constants`: one number μ, the mass of the smaller of the two large bodies.
-    - `sqrt`: the square root for these numbers.
+    - `sqrt`: the square root for the kind of number that is used (floats, numbers of high
+      precision, or symbols of another package).
     """
     (mu,) = constants
     nu = 1 - mu

@@ -18,10 +18,11 @@ from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.workprecision.scene import BenchmarkScene, PreparedMethod, TimedMethod
 
-# TOLERANCES are the settings of adaptive methods. EIGHT and FOUR are numbers of equal steps, for a
-# turn of 50 rad. FOUR is for the Runge–Kutta method of order 4, which needs more steps; EIGHT is
-# for all other methods with equal steps. MOST is the largest number of steps of an adaptive run.
-# MODES has the two ways to take a gradient.
+# TOLERANCES are the settings of methods with adaptive steps. EIGHT and FOUR are the settings of
+# methods with equal steps: numbers of steps, for a motion in which the body turns by 50 rad. FOUR
+# is for the Runge–Kutta method of order 4, which needs more steps; EIGHT is for all others. MOST is
+# the largest number of steps of a run with adaptive steps. MODES has the two ways to take a
+# gradient.
 TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 EIGHT = (40, 60, 80, 120, 170, 240, 340, 480, 680, 1000)
 FOUR = (200, 500, 1200, 3000, 8000, 20000, 60000)
@@ -272,11 +273,12 @@ def _compile_value_or_gradient(
 def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> TimedMethod:
     """Return a method for `measure` from any `diffrax` solver, with adaptive steps.
 
-    The solver runs on the handwritten equations of the scene (`plain`), or on our vector field for
-    a scene without such equations.
+    For each scene (a motion to run) the solver runs on the equations that the scene has in plain
+    arithmetic (`BenchmarkScene.plain`), or on our vector field if it has none.
 
     **Arguments:** `solver` a solver with an error estimate; `gradients` whether gradients are
-    measured, too, by the adjoints `forward`, `checkpointed` and `backsolve` of diffrax.
+    measured, too, by three of diffrax's ways to differentiate a solution: forward mode (`forward`),
+    reverse mode with checkpoints (`checkpointed`) and the adjoint equation (`backsolve`).
 
     >>> diffrax_method(dfx.Heun()).name
     'diffrax Heun'
@@ -315,7 +317,7 @@ def _own_timed_method(
     state of a motion) and its gradients.
 
     - `name`: the name of the method.
-    - `settings`: the tolerances, or the numbers of equal steps.
+    - `settings`: the tolerances, or the numbers of equal steps, with which the method is run.
     - `make_flow`: a function of a scene (a motion to run) that returns the flow of the method (a
       function of the scene's numbers and of a setting that returns the last state and the number of
       steps), or `None` if the method cannot do the scene.

@@ -59,8 +59,8 @@ class _TimedRun(NamedTuple):
     scene (a motion to run).
 
     **Fields:** `record` the measurement, still without its times; `ready` the compiled method;
-    `times` the measured times, s. The first of them is the time of the run that found the errors,
-    and it does not enter the median.
+    `times` the measured times, s. The first of them was measured when the errors were found; it
+    tells how often the run is to be repeated, and does not enter the median.
     """
 
     record: Measurement
@@ -78,16 +78,18 @@ def measure(
     rounds: int = 5,
     progress: Callable[[str], None] | None = None,
 ) -> list[Measurement]:
-    """Return the error and the cost of each method at each of its settings, for value and gradient.
+    """Return the error and the cost of each method at each of its settings (tolerances or numbers
+    of steps), for the value (the last state of a motion) and for gradients.
 
     All runs are in this process. Each round times all runs, one after another; compilation is timed
     separately. The records omit methods that cannot do the scene, and runs with an error of 0.5 or
     more (rad, or relative).
 
-    **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more methods;
-    `gradients` whether gradients are measured, too; `thin` a number k to use every k-th setting
-    (for gradients every 2k-th); `rounds` the least number of timings of each run; `progress` is
-    called with a line of text.
+    **Arguments:** `scene` the motion to run; `methods` the methods to compare (all of `methods()`
+    by default); `peers` more methods; `gradients` whether gradients are measured, too; `thin` a
+    number k to use every k-th setting (for gradients every 2k-th); `rounds` how often each run is
+    timed (three times as often if it takes less than 0.02 s, and three times in all if it takes
+    more than 0.5 s); `progress` a function that is called with a line of text for each method.
 
     **Raises:** `TypeError` for a `scene` that is no `BenchmarkScene`, or a method that is no
     `TimedMethod`.
@@ -124,10 +126,12 @@ def measure(
 
 
 def compute_reference(scene: BenchmarkScene, gradients: bool = True) -> Reference:
-    """Return a reference for a scene without one, from a method of order 8 with fixed steps.
+    """Return a reference (the correct last state and gradient) for a scene (a motion to run) that
+    has none, from our method of order 8 with equal steps.
 
-    The error of the reference is the difference from a run with half as many steps, but at least
-    100 times the machine epsilon.
+    The error that the reference states for itself is its difference from a run with half as many
+    steps, but at least 100 times the machine epsilon. `gradients` tells whether the gradient is
+    computed, too.
     """
     counts = (4000, 2000)
     numbers, scale = scene.numbers, max(1.0, _estimated_turning_angle(scene) / 50)
@@ -148,9 +152,11 @@ def compute_reference(scene: BenchmarkScene, gradients: bool = True) -> Referenc
 
 
 def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
-    """Return the scene in single precision, without its handwritten equations.
+    """Return a scene (a motion to run) in single precision, without its equations in plain
+    arithmetic (`plain`), which are in double precision.
 
-    The reference is computed in double precision from the numbers rounded to single precision.
+    The new scene has a reference (the correct last state, and, if `gradients` is true, the correct
+    gradient) that is computed in double precision from the numbers rounded to single precision.
     """
 
     def cast(scene: BenchmarkScene, dtype: DTypeLike) -> BenchmarkScene:
@@ -164,7 +170,7 @@ def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
     right = compute_reference(
         dataclasses.replace(cast(low, jnp.float64), reference=None), gradients
     )
-    # The scene loses `plain`: the handwritten equations have constants in double precision.
+    # Leave out `plain`, the handwritten equations: they have constants in double precision.
     return dataclasses.replace(low, name=f"{scene.name}, float32", reference=right, plain=None)
 
 
@@ -179,8 +185,8 @@ def _estimated_turning_angle(scene: BenchmarkScene) -> float:
 
 
 def _settings_for_scene(scene: BenchmarkScene, method: TimedMethod, stride: int) -> list[float]:
-    """Return the settings, tolerances or numbers of equal steps, at which a method is measured on a
-    scene.
+    """Return the settings (tolerances, numbers of equal steps, or lengths of a step) at which a
+    method is measured on a scene.
 
     Numbers of equal steps, which are stated for a turn of 50 rad, are scaled to the angle by which
     the body turns; tolerances that the precision cannot reach are left out.
@@ -205,9 +211,9 @@ def _run_once_for_errors(
     prepared: PreparedMethod,
     reference: Reference,
 ) -> list[_TimedRun]:
-    """Run a prepared method once to find its errors, and return a list that holds this run. If the
-    error of the run is NaN, or 0.5 (`WRONG`) or more, in rad or relative, the list is empty, and
-    the run is not timed.
+    """Run a prepared method to find its errors, and return a list that holds this run, to be timed
+    later. If the error of the run is NaN, or 0.5 (`WRONG`) or more, in rad or relative, the list is
+    empty, and the run is left out of the measurements.
 
     - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
     - `method`: the method, for its name and group.
@@ -277,8 +283,11 @@ def energy_and_momentum_drifts(
     """Return two numbers for the change from the initial to the last state: the relative drift of
     the energy; and the largest drift of a conserved momentum.
 
+    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
+    - `final_state`: the last state as one vector, (7,) for a body or (6,) for a point.
+
     For a point the two numbers are the relative drift of the first conserved quantity of its
-    motion, and NaN.
+    motion, and NaN. A number is NaN, too, if the motion conserves no such quantity.
     """
     if scene.body is None:
         law: Any = scene_of_force(scene.torque)
@@ -309,8 +318,9 @@ def _append_measured_times(runs: list[_TimedRun], rounds: int) -> None:
             first = job.times[0]
             if turn >= (3 if first > LONG else rounds if first > SHORT else 3 * rounds):
                 continue
-            # This call is not timed: it finds the caches of the processor filled by another method,
-            # and a long program such as that of the closed form then takes fifteen times as long.
+            # Do not time the first call after a call of another method, which has filled the caches
+            # of the processor: a long program such as that of the closed form then takes fifteen
+            # times as long.
             job.ready.run(job.record.setting)
             many = max(1, int(BURST / first))
             begin = time.perf_counter()
@@ -325,8 +335,11 @@ def long_drift(
     *,
     progress: Callable[[str], None] | None = None,
 ) -> list[Measurement]:
-    """Return the largest drift of energy and momentum over `steps` equal steps of an asymmetric
-    heavy top.
+    """Measure how far the energy, and the momentum along gravity, of an asymmetric heavy top drift
+    over `steps` equal steps by each method of `RUNS`, and return the measurements.
+
+    `names` are the methods to run (all by default), and `progress` is a function that is called
+    with a line of text for each method.
 
     Each method has two records: one for the first hundredth of the run, one for the whole run. The
     drift is bounded if both drifts are about equal, and grows with time if the drift of the whole

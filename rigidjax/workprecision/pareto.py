@@ -14,11 +14,12 @@ WANTED = (1e-4, 1e-7, 1e-10)
 
 
 def pareto_front(records: Iterable[Measurement]) -> list[Measurement]:
-    """Return the records on the Pareto front of error and time, by falling error.
+    """Return the measurements that lie on the Pareto front of error and time, in the order of
+    falling error.
 
-    All `records` are of one scene and one kind. A record is on the front if no method reaches the
-    error of the record in less time than the record; the time of a method is interpolated log–log
-    between its settings.
+    All `records` are of one scene and one kind (values, or gradients). A record is on the front if
+    no method reaches the error of the record in less time than the record; the time of a method is
+    interpolated log–log between its settings.
     """
     records = [r for r in require_measurements(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
@@ -36,8 +37,8 @@ def pareto_front(records: Iterable[Measurement]) -> list[Measurement]:
 
 
 def first_answers(records: Iterable[Measurement]) -> list[Measurement]:
-    """Return the records with their times increased by the time of compilation: the time of a first
-    answer.
+    """Return the measurements with the time of compilation added to the times of a run: this is the
+    time until a user has a first answer.
     """
     return [
         dataclasses.replace(r, time=r.time + c, time_low=r.time_low + c, time_high=r.time_high + c)
@@ -101,8 +102,8 @@ class Choice(NamedTuple):
 
 
 def choose(records: Iterable[Measurement], wanted: Sequence[float] = WANTED) -> list[Choice]:
-    """Return, for each scene and wanted error, our quickest method and any quicker method of
-    others.
+    """Return, for each scene and each wanted error, our quickest method and, if there is one, a
+    quicker method of another package (diffrax included).
 
     **Arguments:** `records` of any scenes, as `measure` returns them; `wanted` the wanted errors,
     rad for an attitude, else relative.
@@ -121,9 +122,9 @@ def choose(records: Iterable[Measurement], wanted: Sequence[float] = WANTED) -> 
 
 def _choose_for_scene(records: list[Measurement], scene: str, error: float) -> Choice:
     """Return our quickest methods (for the value, and for the gradient) for one scene and one
-    wanted error, and the quickest method of other packages for the value if it is quicker than
-    ours. The times of our default method (the closed form if it was measured, else `simulate`) are
-    included.
+    wanted error, and the quickest method of other packages (diffrax included) for the value, if it
+    is quicker than ours or if none of ours reaches the error. The times of our default method (the
+    closed form if it was measured, else `simulate`) are included.
 
     - `records`: the measurements on this scene.
     - `scene`: the name of the scene.
@@ -167,7 +168,8 @@ def times_to_error_by_method(
 
 
 def table(lines: Iterable[Choice]) -> str:
-    """Return the lines of `choose` as a table in Markdown.
+    """Return a table in Markdown with a line for each of the `lines`, which are the results of
+    `choose`: the quickest methods for each scene and wanted error.
 
     >>> print(table([]).splitlines()[0][:28])
     | scene | wanted error, rad

@@ -334,7 +334,8 @@ class _GradsolveEnsemble:
     def __init__(
         self, scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
     ):
-        # Without this setting NumPy records a single scene, which takes a thousand times as long.
+        # Without this setting gradsolve uses NumPy to record the steps of the solution of a single
+        # scene, which takes a thousand times as long.
         os.environ.setdefault("GRADSOLVE_RECORDER", "jax")
         self.module, self.plain = module, scene.plain
         self.name, self.t1 = scene.name, scene.end
@@ -369,9 +370,9 @@ def _prepare_gradsolve(
         try:
             solution = ensemble.call("solve", setting)
         except RuntimeError:
-            # gradsolve raises this error if its 50 000 steps do not reach the end of the run, as
-            # with a fast top. A run with a last state of NaN is left out of the records, and the
-            # other methods go on.
+            # gradsolve raises a `RuntimeError` if its 50 000 steps do not reach the end of the
+            # motion, as with a fast top. Return NaN as the last state: `measure` then leaves this
+            # run out and goes on with the other methods.
             return np.full_like(start, np.nan), 0
         return solution.y_final[0], int(solution.accepted_steps[0])
 
@@ -419,11 +420,12 @@ def _prepare_gradsolve_gradient(
 
 
 def methods_of_other_packages() -> list[TimedMethod]:
-    """Return the methods of SciPy, numba, MuJoCo, heyoka and gradsolve, as far as they are
-    installed.
+    """Return the methods of SciPy, numba, MuJoCo, heyoka and gradsolve, as far as these packages
+    are installed.
 
-    heyoka.py's adaptive Taylor method: Biscani and Izzo 2021, doi:10.1093/mnras/stab1032.
-    gradsolve's replay of the recorded steps of Verner's method of order 7: arXiv:2609.02876.
+    Sources: for the adaptive Taylor method of heyoka, Biscani and Izzo 2021,
+    doi:10.1093/mnras/stab1032; for gradsolve, which takes gradients of recorded steps of Verner's
+    method of order 7, arXiv:2609.02876.
     """
     peers = {
         "scipy": TimedMethod("scipy DOP853", "peer", TOLERANCES, _prepare_scipy),
@@ -449,8 +451,8 @@ def methods_of_other_packages() -> list[TimedMethod]:
 
 
 def methods(group: str | None = None) -> list[TimedMethod]:
-    """Return the methods to compare: our methods, those of diffrax, and those of installed
-    packages.
+    """Return the methods to compare: our methods, those of diffrax, and those of the other packages
+    (SciPy, numba, MuJoCo, heyoka, gradsolve) that are installed.
 
     **Arguments:** `group` `ours`, `jax` or `peer`, to return the methods of one group only.
 

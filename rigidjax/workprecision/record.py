@@ -11,7 +11,8 @@ from pathlib import Path
 
 from rigidjax import _checks
 
-# Errors of the size of round-off vary between machines: an error below FLOOR is compared as FLOOR.
+# Two tables are compared by their errors. An error below FLOOR counts as FLOOR, because errors of
+# the size of round-off vary between machines.
 FLOOR = 1e-13
 # A change is reported if an error changes by more than the factor WORSE, a number of steps by more
 # than 1 and by more than the fraction STEPS of the old number, or a time by more than the factor
@@ -26,17 +27,17 @@ class Measurement:
     """Hold the errors and the cost of one method at one setting on one scene.
 
     **Fields:** `scene`, `method` names; `group` `ours`, `jax` or `peer`; `kind` `value` or
-    `gradient`; `adjoint` the way a gradient is computed; `setting` the tolerance, or the number of
-    equal steps; `error` of the attitude, an angle in rad (for a point the relative error of its
-    position), and for a gradient g the relative error |g − g*|/|g*|, where g* is the correct
-    gradient; `error_rate` the error of the body rate Ω, divided by the length of the initial rate
-    Ω0 (for a point the relative error of the velocity); `energy` the relative drift of the energy;
-    `momentum` the largest drift of the conserved momenta; `by_inertia`, `by_rate`, `by_attitude`
-    the relative errors of the gradient with respect to the inertia, the initial rate and the
-    initial attitude (for a point `by_rate` is for the velocity and `by_attitude` for the position);
-    `steps` the number of steps; `time` the median time of a run, and `time_low`, `time_high` the
-    quartiles, s; `compile` the time of compilation, s; `memory` the bytes of temporary arrays in
-    the compiled run. A field that does not apply is NaN.
+    `gradient`; `adjoint` the way a gradient is computed; `setting` the tolerance, the number of
+    equal steps, or the length of a step in s; `error` of the attitude, an angle in rad (for a point
+    the relative error of its position), and for a gradient g the relative error |g − g*|/|g*|,
+    where g* is the correct gradient; `error_rate` the error of the body rate Ω, divided by the
+    length of the initial rate Ω0 (for a point the relative error of the velocity); `energy` the
+    relative drift of the energy; `momentum` the largest drift of the conserved momenta;
+    `by_inertia`, `by_rate`, `by_attitude` the relative errors of the gradient with respect to the
+    inertia, the initial rate and the initial attitude (for a point `by_rate` is for the velocity
+    and `by_attitude` for the position); `steps` the number of steps; `time` the median time of a
+    run, and `time_low`, `time_high` the quartiles, s; `compile` the time of compilation, s;
+    `memory` the bytes of temporary arrays in the compiled run. A field that does not apply is NaN.
 
     >>> Measurement("free-top", "closed form", "ours", "value", "", 0.0, error=1e-15).time
     nan
@@ -64,7 +65,9 @@ class Measurement:
 
     @property
     def label(self) -> str:
-        """Return the method and, for a gradient, the adjoint as one name."""
+        """Return one name for the method and the adjoint (the way in which a gradient is computed)
+        of this measurement; for a value, which has no adjoint, the name of the method alone.
+        """
         return f"{self.method}, {self.adjoint}" if self.adjoint else self.method
 
 
@@ -85,7 +88,9 @@ def require_measurements(
 
 
 def write_csv(records: Iterable[Measurement], path: str | Path) -> None:
-    """Write records to a CSV file, one line for each record, after a header; NaN is left empty."""
+    """Write measurements to a CSV file, one line for each of the `records`, after a header line; an
+    entry that is NaN is left empty.
+    """
     with Path(path).open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(field.name for field in dataclasses.fields(Measurement))
@@ -95,9 +100,10 @@ def write_csv(records: Iterable[Measurement], path: str | Path) -> None:
 
 
 def read_csv(path: str | Path) -> list[Measurement]:
-    """Return the records of a file that `write_csv` wrote.
+    """Return the measurements of a file that `write_csv` wrote.
 
-    **Raises:** `ValueError` for a file without the columns of a record.
+    **Raises:** `ValueError` for a file in which a column is missing; the columns are the fields of
+    `Measurement`.
     """
     with Path(path).open(newline="") as file:
         rows, names = (
@@ -119,14 +125,15 @@ def sentences_about_changes(
 ) -> tuple[list[str], list[str]]:
     """Return two lists of sentences: about changed errors and steps; and about changed times.
 
-    Two tables of measurements are compared, a new one (`records`) and an old one (`stored`);
-    measurements of other packages are left out.
+    Two tables of measurements are compared, a new one (`records`) and an old one (`stored`). Only
+    the methods of rigidjax and of diffrax are compared (the groups `ours` and `jax`).
 
     A change is reported if an error has become more than three times as large, or less than a
-    third; if the number of steps differs by more than 2 %; if a measurement in `stored` with an
-    error below 0.1 is missing in `records`, although `records` has others of its scene; or if the
-    ratio of a method's median time to that of `diffrax Dopri8`, on the same scene at common
-    settings, has changed by more than a factor of 2.
+    third (an error below 1e-13 counts as 1e-13); if the number of steps differs by more than 2 %
+    and by more than 1; if a measurement in `stored` with an error below 0.1 is missing in
+    `records`, although `records` has others of its scene; or if the ratio of a method's median time
+    to that of `diffrax Dopri8`, on the same scene at common settings, has changed by more than a
+    factor of 2.
     """
     records, stored = require_measurements(records), require_measurements(stored, "stored")
     now = {_run_key(r): r for r in records if r.group != "peer"}

@@ -27,11 +27,13 @@ A, B, C = (0.6, -0.48, 0.64), (0.36, 0.8, -0.48), (0.28, -0.5, 0.82)
 
 
 class Reference(NamedTuple):
-    """Hold the correct last state of a scene, and the correct gradient of its scalar (`loss`).
+    """Hold the correct last state of a scene (a motion to run), and the correct gradient of the
+    scalar function `loss` of this state.
 
     **Fields:** `end` the last state as one tuple; `error` the estimated error of its entries;
-    `gradient` of the scalar with respect to the scene's `numbers`, or empty; `gradient_error` the
-    estimated error of its entries; `source` a sentence about the method.
+    `gradient` the gradient of the scalar with respect to the scene's `numbers`, or empty;
+    `gradient_error` the estimated error of the entries of the gradient; `source` a sentence about
+    the method by which both were computed.
 
     >>> top = stored_reference("heavy top")
     >>> top is None or top.error < 1e-12
@@ -106,7 +108,7 @@ class BenchmarkScene(eqx.Module):
 
     @property
     def numbers(self) -> Float[Array, " parameters"]:
-        """Return the numbers with respect to which gradients are taken.
+        """Return the numbers of this scene with respect to which gradients are taken, as one array.
 
         For a body they are the entries Ixx, Iyy, Izz, Ixy, Ixz, Iyz of the inertia tensor, the
         initial body rate, and the quaternion of the initial attitude (13,). For a point they are
@@ -120,10 +122,11 @@ class BenchmarkScene(eqx.Module):
 
     @property
     def blocks(self) -> dict[str, slice]:
-        """Return the slices of `numbers` for inertia, initial rate and initial attitude.
+        """Return where the array `numbers` of this scene has the inertia, the initial rate and the
+        initial attitude: a dictionary of three slices.
 
         The keys are the fields of a `Measurement` that hold the error of a gradient with respect to
-        these numbers; for a point the slices are of position and velocity.
+        these numbers. For a point there are two slices, of position and velocity.
         """
         if self.body is None:
             return {"by_attitude": slice(0, 3), "by_rate": slice(3, 6)}
@@ -132,8 +135,8 @@ class BenchmarkScene(eqx.Module):
     def assemble(
         self, numbers: Float[Array, " parameters"]
     ) -> tuple[Inertia | None, Attitude | Point]:
-        """Return the body and the initial state that `numbers` describe; the body is `None` for a
-        point.
+        """Return the body and the initial state that an array like the property `numbers` of this
+        scene describes; the body is `None` for a point.
         """
         if self.body is None:
             return None, Point(numbers[:3], numbers[3:])
@@ -141,13 +144,15 @@ class BenchmarkScene(eqx.Module):
         return Inertia(tensor), Attitude(quaternion.normalise(numbers[9:]), numbers[6:9])
 
     def flatten(self, state: PyTree) -> Float[Array, " state"]:
-        """Return a state as one vector, (7,) for a body or (6,) for a point."""
+        """Return a state of this scene as one vector: (7,) for a body, whose state is an
+        `Attitude`, or (6,) for a `Point`.
+        """
         return jnp.concatenate(jax.tree.leaves(state))
 
     @property
     def size(self) -> tuple[float, float]:
-        """Return two scales of errors: 1 rad for the attitude; and for the body rate the length
-        |Ω0| of the initial body rate.
+        """Return the two scales by which errors in this scene are divided: 1 rad for the attitude;
+        and for the body rate the length |Ω0| of the initial body rate.
 
         For a point they are the initial distance |x0| for the position, and for the velocity the
         initial speed |v0|, or |x0|/`end` if that is larger.
@@ -159,7 +164,13 @@ class BenchmarkScene(eqx.Module):
         return 1.0, float(np.linalg.norm(state.omega))
 
     def loss(self, end: Float[Array, " state"]) -> Float[Array, ""]:
-        """Return the scalar whose gradient is compared, from the last state as one vector `end`."""
+        """Return a scalar function of the last state `end` (one vector): the gradients of this
+        function are compared between methods.
+
+        For a body it is a·R b + c·Ω/|Ω0|, with three constant vectors a, b and c, the attitude R
+        and body rate Ω at the end, and the initial body rate Ω0. For a point it is such a sum for
+        position and velocity.
+        """
         one, two = self.size
         a, b, c = (jnp.asarray(v, end.dtype) for v in (A, B, C))
         if self.body is None:
@@ -193,11 +204,12 @@ def state_errors(
 
 
 class PreparedMethod(NamedTuple):
-    """Hold a method prepared for a scene.
+    """Hold a method that is prepared (compiled) for one scene, a motion to run.
 
-    **Fields:** `run` a function of the setting that returns two things, when the computation is
-    complete: the last state, or the gradient, as one vector; and the number of steps; `compile` the
-    time of preparation, s, and `memory` the bytes of temporary arrays, NaN if unknown.
+    **Fields:** `run` a function of the setting (a tolerance, a number of steps, or the length of a
+    step) that returns, only when the computation is complete, two things: the last state, or the
+    gradient, as one vector; and the number of steps; `compile` the time of preparation, s, and
+    `memory` the bytes of temporary arrays, both NaN if unknown.
 
     >>> prepared = PreparedMethod(lambda setting: ([0.0, 1.0], 1 / setting))
     >>> prepared.run(1e-2)[1], prepared.compile
@@ -213,11 +225,12 @@ class TimedMethod(NamedTuple):
     """Define a method to compare; `measure` takes your own, or a peer's, in this form.
 
     **Fields:** `name`; `group` `ours`, `jax` (anything else that runs in JAX) or `peer`; `settings`
-    tolerances, or numbers of equal steps, from coarse to fine; `value` prepares the method for a
-    scene, and returns `None` for a scene that it cannot do; `gradients` has, by the name of the
-    adjoint (the way in which a gradient is computed), functions like `value` for the gradient of
-    the scene's scalar with respect to its `numbers`; `equal` whether the settings are numbers of
-    equal steps for a run that turns by 50 rad, which are scaled to the angle of the scene.
+    tolerances, numbers of equal steps, or lengths of a step, from coarse to fine; `value` a
+    function of a scene that returns a `PreparedMethod`, or `None` for a scene that the method
+    cannot do; `gradients` has, by the name of the adjoint (the way in which a gradient is
+    computed), functions like `value` for the gradient of the scene's scalar `loss` with respect to
+    its `numbers`; `equal` whether the settings are numbers of equal steps for a motion in which the
+    body turns by 50 rad: they are then scaled to the angle of the scene.
 
     >>> import numpy as np
     >>> prepared = PreparedMethod(lambda setting: (np.ones(7), 0))

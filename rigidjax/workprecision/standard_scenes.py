@@ -115,7 +115,8 @@ def _scene_of_body(
 ) -> BenchmarkScene:
     """Return a standard scene, a motion to compare methods on, of a rigid body.
 
-    - `name`: the name of the scene, by which its stored answer is found.
+    - `name`: the name of the scene, by which its stored reference (the correct last state and
+      gradient) is found.
     - `title`: the name in words.
     - `moments`: the three principal moments of inertia, kg m².
     - `omega`: the initial rate (3,), rad/s, body axes.
@@ -141,7 +142,9 @@ def _scene_of_body(
             )
         return wrap(equations.body_vector_field(numbers[:6], torque))
 
-    # MuJoCo can do scenes without torque, and scenes whose only torque is that of weight.
+    # MuJoCo needs the mass, the centre of mass and gravity as data (`notes`); for a free body the
+    # last two are zero. A scene with any other torque than weight gets no such data, because our
+    # method for MuJoCo cannot do it.
     com, gravity = (
         (constants[:3], constants[3:])
         if handwritten_torque is equations.heavy_top_torque
@@ -167,7 +170,8 @@ def _scene_of_point(
 ) -> BenchmarkScene:
     """Return a standard scene, a motion to compare methods on, of a particle.
 
-    - `name`: the name of the scene, by which its stored answer is found.
+    - `name`: the name of the scene, by which its stored reference (the correct last state and
+      gradient) is found.
     - `title`: the name in words.
     - `start`: the initial position and velocity.
     - `end`: the last time, in the unit of time of the equations (seconds for the pendulum).
