@@ -241,7 +241,8 @@ def _rate_and_rotation_jvp(
     out, (rates, thetas) = _evaluate_at_each_time(
         lambda time: _rate_and_rotation_with_derivatives(tensor, omega, constants, time), t
     )
-    # Sum products of entries: on a GPU a product of matrices is rounded to ten bits in float32.
+    # Multiply by the matrices as sums over their entries: on a GPU a product of matrices is rounded
+    # to ten bits in float32.
     change = jnp.sum(first * jnp.concatenate([d_tensor.ravel(), d_omega])[None], axis=-1)
     change = jnp.broadcast_to(change, (*t.shape, 9))
     change = jnp.concatenate([change, d_t[..., None]], axis=-1)

@@ -52,7 +52,7 @@ class FreeSolver(dfx.AbstractSolver):
     Use it with the term `diffrax.ODETerm(rigidjax.equations_of_motion(inertia, y0))`, where the
     state `y0` is a `Spin` (a body rate) or an `Attitude` (a quaternion and a body rate), and no
     torque is given. One step over the whole interval is enough. Events, dense output and every
-    adjoint work as with any solver.
+    adjoint (diffrax's ways to differentiate a solution) work as with any solver.
 
     **Raises:** `ValueError` for another term, or for equations with a torque.
 
@@ -133,8 +133,8 @@ def field_and_direction(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
 
     - `terms`: an `ODETerm`, or an object of diffrax that holds such a term and the direction.
     """
-    # Read the attributes of these objects: the public methods of a term, `vf` and `contr`, return
-    # numbers only, but the solver needs the inertia that the vector field holds.
+    # Read the attributes of the term and of the object around it: the public methods of a term,
+    # `vf` and `contr`, return numbers only, but the solver needs the inertia in the vector field.
     term = getattr(terms, "term", terms)
     return getattr(term, "vector_field", None), getattr(terms, "direction", 1)
 

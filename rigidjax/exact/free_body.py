@@ -147,17 +147,17 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     (Jacobi 1850; Landau and Lifshitz, Mechanics, eq 37.10 for Ω; the attitude is the addition
     theorem of the Weierstrass sigma function at the half time.) Sphere, symmetric tops, plates,
     spins about any axis, the separatrix and rest are ordinary points. The quaternion is continuous
-    in t, has length 1, and `R(q) I Ω` is constant to round-off. A traced time in which the body
-    turns by more than 1/eps rad gives NaN.
+    in t, has length 1, and `R(q) I Ω` is constant to round-off. A time that JAX traces and in which
+    the body turns by more than 1/eps rad gives NaN.
 
     Derivatives with respect to all arguments are closed forms, correct to second order at all these
     points, as functions of the whole tensor. For a spin about the unstable middle axis they grow as
     e^{λt}, where λ is the rate at which a small deviation grows, up to λt ≈ 150 (float32: 40).
 
-    **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, a `Rigid`;
-    for values that JAX does not trace, also for NaN, a tensor that no real body has (a traced one
-    gives NaN), a moment of zero, a quaternion that is not unit, and a time in which the body turns
-    by more than 1/eps rad.
+    **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, or a state
+    with a position (`Rigid`); for values that JAX does not trace, also for NaN, a tensor that no
+    real body has (a traced one gives NaN), a moment of zero, a quaternion that is not unit, and a
+    time in which the body turns by more than 1/eps rad, where eps is the machine epsilon.
 
     >>> state0 = rj.Attitude([1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1e-4])
     >>> free_body(rj.Inertia.from_principal(1.0, 2.0, 3.0), state0, 20.0).omega

@@ -109,9 +109,9 @@ def momentum_jacobian_and_integral(
     ss, tt = S * S, jnp.where(three, D, C)
     rw = 1.0 / (tt * tt + ss * z)
     m1, m2, m3 = y1 * rw, y2 * rw, y3 * rw
-    # The body momentum Π(t) is the vector (y1, y2, y3) divided by W = 1/rw. Its derivative needs
-    # C − W, CD − W and D − W. For short times compute these from C − 1, D − 1 and W − 1, which are
-    # small and are found without a subtraction.
+    # The body momentum Π(t) is the vector (y1, y2, y3) divided by W = 1/rw. The derivatives of
+    # Π(t) − Π(0) need C − W, CD − W and D − W. For short times compute these from C − 1, D − 1 and
+    # W − 1, which are small and are found without a subtraction of nearly equal numbers.
     w1 = ss * (z - jnp.where(three, q, p))
     short = jnp.abs(w1) < 0.5
     c1 = jnp.where(C > 0, -p * ss / (1.0 + jnp.abs(C)), C - 1.0)

@@ -64,7 +64,8 @@ def _tensor_in_axes_jvp(
     """
     # Take the symmetric part of the change of the tensor, so that a gradient is a symmetric matrix.
     axes, change = primals[1], 0.5 * (tangents[0] + tangents[0].T)
-    # Sum products of entries: on a GPU a product of matrices is rounded to ten bits in float32.
+    # Write the two products of matrices as sums over their entries: on a GPU a product of matrices
+    # is rounded to ten bits in float32.
     turned = jnp.sum(axes[:, :, None] * change[:, None], axis=0)
     m = jnp.sum(turned[:, None] * axes.T[None], axis=2)
     return tensor_in_axes(*primals), (m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2])
@@ -99,9 +100,9 @@ def _axes_and_moments(matrix: Mat3) -> tuple[list[list[Scalar]], Triple]:
     principal axes; and the three moments (the eigenvalues) in ascending order.
     """
     one, zero = jnp.ones_like(matrix[0, 0]), jnp.zeros_like(matrix[0, 0])
-    # If the moments are nearly equal, subtract the least diagonal entry from all three. This
-    # subtraction is exact by Sterbenz' lemma, and so the differences of the moments keep their
-    # digits.
+    # If no diagonal entry is more than twice the least one, subtract the least one from all three.
+    # This subtraction is exact by Sterbenz' lemma, and so the differences of nearly equal moments
+    # keep their digits.
     least = jnp.minimum(jnp.minimum(matrix[0, 0], matrix[1, 1]), matrix[2, 2])
     most = jnp.maximum(jnp.maximum(matrix[0, 0], matrix[1, 1]), matrix[2, 2])
     shift = jnp.where(2.0 * least >= most, least, zero)
@@ -110,8 +111,8 @@ def _axes_and_moments(matrix: Mat3) -> tuple[list[list[Scalar]], Triple]:
     axes = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
 
     def rotate(_, state):
-        # Always rotate the last two axes, then move each axis on by one place: only one rotation is
-        # then compiled.
+        # Always rotate the last two axes, then exchange the three axes cyclically, so that the next
+        # rotation is of another pair: only one rotation is then compiled.
         d, o, axes = _rotate_last_two_axes(*state)
         return tuple((x[1], x[2], x[0]) for x in (d, o, axes))
 

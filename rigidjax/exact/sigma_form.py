@@ -213,7 +213,7 @@ def sigma_at_double_time(sigma: Sigma, constants: Invariants) -> Sigma:
         constants.e23,
     )
     s12, s13, s23 = t12 * t12, t13 * t13, t23 * t23
-    # The off-diagonal entries of M = T² are exactly −σ²E.
+    # By T² = w 1 − σ²E, the off-diagonal entries of M = T² are exactly those of −σ²E.
     m11, m22, m33 = t1 * t1 + s12 + s13, t2 * t2 + s12 + s23, t3 * t3 + s13 + s23
     m12, m13, m23 = -ss * e12, -ss * e13, -ss * e23
     m11, m22, m33, m12, m13, m23 = barrier((m11, m22, m33, m12, m13, m23))

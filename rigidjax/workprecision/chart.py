@@ -15,7 +15,8 @@ _COLOURS = {"ours": "tab20", "jax": "Set2", "peer": "Dark2"}
 
 
 def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
-    """Draw the time against the error, log–log, for values and gradients, with the Pareto front.
+    """Draw the time of a run against its error, log–log, for all methods of the `records`, for
+    values and for gradients, with the Pareto front.
 
     Each scene has a row of panels, from left to right: the time of a run; the time of a first
     answer (compilation and one run), if it is known; and the error of each value against the

@@ -76,7 +76,8 @@ def time_to(records: Iterable[Measurement], error: float) -> float:
 
 
 class Choice(NamedTuple):
-    """Hold the quickest methods for one scene and one wanted error, a line of `table`.
+    """Hold the quickest methods for one scene (a motion to run) and one wanted error; the function
+    `table` shows this as a row.
 
     **Fields:** `scene` the name of the scene; `wanted` the wanted error; `method` the quickest of
     our methods, and `time`, s; `gradient` our quickest method for a gradient with the relative
@@ -168,7 +169,7 @@ def times_to_error_by_method(
 
 
 def table(lines: Iterable[Choice]) -> str:
-    """Return a table in Markdown with a line for each of the `lines`, which are the results of
+    """Return a table in Markdown with a row for each of the `lines`. These are the results of
     `choose`: the quickest methods for each scene and wanted error.
 
     >>> print(table([]).splitlines()[0][:28])

@@ -66,12 +66,13 @@ def stored_reference(name: str) -> Reference | None:
 class BenchmarkScene(eqx.Module):
     """Define one motion for the comparison of methods.
 
-    **Fields:** `name`, `title` words; `body` an `Inertia`, `None` for a `Point`; `state0` an
-    `Attitude` or a `Point`; `torque` as for `rigidjax.simulate`; `end` s, the run is from 0 to
-    `end`; `plain` the equations of the scene without JAX, `plain(numbers, sin, cos, sqrt) → f(t,
-    y)`, for other packages and references, or `None` to leave other packages out; `reference` the
-    correct answer, or `None` to compute it by our own method with small steps; `slow` true to leave
-    the scene out unless it is named; `notes` data that MuJoCo needs beyond the equations.
+    **Fields:** `name`, and `title` in words; `body` an `Inertia`, or `None` for a point; `state0`
+    the initial state, an `Attitude` (of a body) or a `Point` (position and velocity); `torque` as
+    for `rigidjax.simulate`; `end` the last time, s (the first is 0); `plain` the equations of the
+    scene without JAX, a function `plain(numbers, sin, cos, sqrt) → f(t, y)`, for other packages and
+    references, or `None` to leave other packages out; `reference` the correct last state and
+    gradient, or `None` to compute them by our own method with small steps; `slow` true to leave the
+    scene out unless it is named; `notes` data that MuJoCo needs beyond the equations.
 
     >>> from rigidjax import Attitude, Inertia, torques
     >>> scene = BenchmarkScene("mine", "my body", Inertia(jnp.eye(3)),

@@ -223,8 +223,8 @@ def scenes() -> dict[str, Callable[[], BenchmarkScene]]:
     """Return the standard scenes: name → a function that makes the scene (in the default precision
     of JAX).
 
-    The drift over a million steps is no standard scene: `python -m rigidjax workprecision
-    long-drift` measures this drift.
+    The long run of a million steps, for the drift of the energy, is not among these scenes: it is
+    run by `python -m rigidjax workprecision long-drift`.
 
     >>> sorted(scenes())[:3]
     ['arenstorf', 'asymmetric-top', 'damped-gyrostat']
