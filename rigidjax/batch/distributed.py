@@ -48,16 +48,18 @@ def connect(address: str, processes: int, process: int, *, patience: int = 20) -
 
 
 def share(tree: PyTree) -> PyTree:
-    """Return from each array of a tree the rows of the bodies that this process computes.
+    """Return the rows of the arrays in a tree that belong to the bodies of this process.
 
-    The N bodies are divided in order among P processes: each process gets ⌈N/P⌉ bodies, or one
-    fewer.
+    The N bodies of a run are divided in order among its P processes: each process gets ⌈N/P⌉
+    bodies, or one fewer.
 
     **Arguments:** `tree` of arrays with a leading axis of N bodies; leave out the numbers that all
     bodies share.
 
     **Raises:** `TypeError` for a leaf without a leading axis; `ValueError` for arrays of different
     length, and for fewer bodies than processes.
+
+    The only process of a run gets all bodies:
 
     >>> share(jnp.arange(5)).shape
     (5,)

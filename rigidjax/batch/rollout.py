@@ -122,8 +122,8 @@ def rollout(
       `None` means that no array has it. 0 means that all have it (`jax.vmap` of the torque's
       constructor makes such a torque). A function selects the arrays, or the parts of the torque
       that hold them: `lambda law: law.speed`, or `lambda law: law.parts[1]` for a `Sum`; it returns
-      several in a tuple. A tree like the torque has 0 in the place of each array with this axis,
-      and `None` in the place of each array without it.
+      several in a tuple. Or give a tree with the structure of the torque, with 0 in the place of
+      each array with this axis, and `None` in the place of each array without it.
     - `solver`: `None` takes `Magnus4` for the attitude of a free body or under a torque that does
       not depend on the attitude, and `rigidjax.solvers.RungeKutta4` otherwise. Any explicit method
       of `rigidjax.solvers` may be given; its steps agree with those of `diffrax` to round-off. Runs
@@ -160,10 +160,10 @@ def rollout(
 
     **Raises:** `TypeError` if bodies, states, torque and solver do not fit together; `ValueError`
     for shapes that do not agree, an input that is missing or that no torque reads, a step that is
-    not positive, or a `save_every` that does not divide `num_steps`. Known numbers are checked too:
-    `ValueError` for an inertia that no mass has, for a moment of zero, and for a quaternion that is
-    not unit. For a traced inertia that is NaN, or that no mass has, no error is raised: it makes
-    the states of its own body NaN, and those of no other body.
+    not positive, or a `save_every` that does not divide `num_steps`. Numbers that are not traced
+    are checked, too: `ValueError` for an inertia that no mass has, for a moment of zero, and for a
+    quaternion that is not unit. For a traced inertia that is NaN, or that no mass has, no error is
+    raised: it makes the states of its own body NaN, and those of no other body.
 
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))
@@ -235,8 +235,8 @@ def _take_fixed_steps_of_bodies(
         stepper = stepper_of(solver, field, state0, count)
 
         def advance_to_next_saved_state(carry: PyTree, first: Array) -> tuple[PyTree, PyTree]:
-            # These steps lead from one saved state to the next one. The number of the first of
-            # them is `first`.
+            # This function takes the steps from one saved state to the next one. They begin with
+            # step number `first` of the run, counted from 0.
             y, carried = carry
             y = march_steps(stepper, h, t0, first, every, y, inputs)
             if reduce is not None:

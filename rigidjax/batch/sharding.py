@@ -61,7 +61,8 @@ class CompiledFunction:
 
         On CPU they enable vectors of 512 bits; other backends have none, and get a plain `jit`.
         """
-        # This is made at the first call and not at import: `compiler_options` starts JAX's backend.
+        # The options are looked up at the first call of the function and not at import, because
+        # `compiler_options` starts JAX's backend.
         options, jit = compiler_options(), cast(Any, eqx.filter_jit)
         return jit(self.function, compiler_options=options) if options else self._without_options
 

@@ -61,11 +61,12 @@ class Batch(eqx.Module, Generic[State]):
     **Fields:**
 
     - `ts` (T,): the times of the states, s.
-    - `ys`: the states at these times, of the type of `states0`, with leading axes (N, T), in the
-      order of the given bodies; NaN at times that a body did not reach.
+    - `ys`: the states at these times, of the type of the initial states, with leading axes (N, T),
+      in the order of the given bodies; NaN at times that a body did not reach.
     - `result`: a `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `nonfinite_input` (an
       impossible inertia or state), `max_steps_reached` or `dt_min_reached`.
-    - `num_steps` (N,): the number of all steps, rejected steps included; 0 for the closed form.
+    - `num_steps` (N,): the number of all steps of each body, rejected steps included; 0 for free
+      bodies whose motion was computed in closed form, which takes no steps.
     - `own`: a tuple of the states that torques have of their own, such as the speed of a wheel,
       with the leading axes (N, T); `None` if no torque has a state.
 
@@ -266,17 +267,18 @@ def sort_bodies_for_chunks(key: Array, chunk: int, num_devices: int) -> tuple[Ar
     count = key.shape[0]
     chunk = min(chunk, -(-count // num_devices))
     size = -(-count // (chunk * num_devices)) * chunk
-    # `seats` are the places of the sorted bodies in the array for the devices: first chunk 0 of
-    # every device, then chunk 1 of every device, and so on. Each device has `size` places; the last
-    # device may have fewer.
+    # The sorted bodies fill the positions in the array for the devices in turn: first chunk 0 of
+    # every device, then chunk 1 of every device, and so on. `seats` has the turn of each position.
+    # Each device has `size` positions; the last device may have fewer.
     seats = (
         np.arange(size * num_devices).reshape(-1, num_devices, chunk).transpose(1, 0, 2).reshape(-1)
     )
     seats = seats[seats < count]
     place = np.arange(count) % chunk
     place = place % _UNROLLED if chunk % _UNROLLED == 0 else place
-    # Bodies with equal `place` are sorted by key and get, in this order, the positions with the
-    # same `place`.
+    # `place` is, for each body and for each position, the place within a chunk (or within a group
+    # of `_UNROLLED` bodies). The bodies with one value of `place` are sorted by key, and fill the
+    # positions with this value in the order of `seats`.
     bodies = jnp.lexsort((key, jnp.asarray(place, jnp.int32)))
     order = jnp.zeros_like(bodies).at[np.lexsort((seats, place))].set(bodies)
     return order, jnp.zeros_like(order).at[order].set(jnp.arange(count, dtype=order.dtype))

@@ -32,8 +32,9 @@ Check = tuple[Any, Callable[[int], None]]
 class BodyBatch(NamedTuple):
     """Hold the bodies, initial states and torque of many runs, split into three trees.
 
-    Each of the three trees has the structure of the tree `(bodies, states0, torque)`. Each leaf of
-    this tree is in one of the three trees; the other two trees have `None` in its place.
+    The three trees are `shared`, `per_body` and `constants`. Each of them has the structure of the
+    tree `(bodies, states0, torque)`. Each leaf of this tree is in one of the three trees; the other
+    two have `None` in its place.
     """
 
     shared: PyTree  # the arrays that all bodies share
@@ -41,14 +42,16 @@ class BodyBatch(NamedTuple):
     constants: PyTree  # the leaves that are no arrays
     num_bodies: int  # the number N of bodies
     dtype: np.dtype  # the precision of the states
-    # The checks of known numbers, whose results `require_valid_numbers` reads.
+    # The checks of inertias and quaternions that are not traced; `require_valid_numbers` reads
+    # their results.
     checks: tuple[Check, ...] = ()
 
     def require_valid_numbers(self) -> None:
-        """Raise an error for the first body with a known number that is wrong.
+        """Raise an error for the first body with an impossible inertia or a non-unit quaternion.
 
-        Call this after the computation has been started: the device then checks the bodies while
-        the host works on, and neither waits for the other.
+        The bodies are those of this batch. Traced numbers are not checked. Call this function after
+        the computation has been started: the device then checks the bodies while the host works on,
+        and neither waits for the other.
         """
         for index, refuse in self.checks:
             if (i := int(index)) >= 0:
@@ -132,8 +135,9 @@ def check_batch(
         _mask_of_arrays_with_body_rows(arrays[2], torque_axes, count),
     )
     per_body, shared = eqx.partition(arrays, axes)
-    # For an `Inertia` the shape of a row is enough for this check, and taking the row itself would
-    # cost as much time as many steps.
+    # The types are checked on one row of the arrays that have a row for each body. With an
+    # `Inertia` the shape of the row is enough: to take the row itself would cost as much time as
+    # many steps.
     shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
     row = (lambda a: a[0]) if isinstance(bodies, MassProperties) else shape
     validation.require_compatible_types(
@@ -142,7 +146,8 @@ def check_batch(
     validation.warn_of_unknown_inertia_scale(bodies, torque)
     batch = BodyBatch(shared, per_body, constants, count, dtype, tuple(checks))
     if all(isinstance(index, np.ndarray | np.integer) for index, _ in checks):
-        # Few bodies are checked on the host, so that errors are raised before anything is compiled.
+        # The numbers of few bodies have been checked on the host, not on the device. The error can
+        # be raised at once, before anything is compiled.
         batch.require_valid_numbers()
     return batch
 
@@ -248,7 +253,7 @@ def _mask_of_selected_arrays(torque: Torque | None, select: Callable[[Any], Any]
 def _check_inertia(
     bodies: Inertia | MassProperties,
 ) -> tuple[Inertia | MassProperties, list[Check]]:
-    """Return the bodies, and the check that a real body can have the inertia of each of them.
+    """Return the bodies, and a check of whether each of them has an inertia that a mass can have.
 
     **Returns** two things: the bodies; and a list with one check. The check is a pair: the index of
     the first body whose inertia is impossible (−1 if there is none), and a function that raises the

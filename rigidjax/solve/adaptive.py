@@ -21,7 +21,7 @@ REPLAY, NO_METER = ReplayAdjoint(), dfx.NoProgressMeter()
 
 
 class AdaptiveRun(NamedTuple):
-    """Hold the result of `adaptive`.
+    """Hold the result of a run with adaptive steps: the states, and how the run ended.
 
     **Fields:**
 
@@ -31,11 +31,10 @@ class AdaptiveRun(NamedTuple):
     - `result`: a `diffrax.RESULTS`, which says how the run ended.
     - `last_time`: the time at the end of the run, s.
     - `last`: the state at `last_time`.
-    - `next_step`: the length of the step that would follow, s; NaN if the adjoint is not a
-      `ReplayAdjoint`.
-    - `missed`: whether some part of the field switches more often than the search for switching
-      times can store; the steps then do not end at every switch. `None` if the field has no switch
-      in time.
+    - `next_step`: the length of the step that would follow, s; NaN if the run was made with another
+      adjoint than `ReplayAdjoint`, which records the steps.
+    - `missed`: whether some part of the field switches at more times than can be stored; steps then
+      do not end at all of these times. `None` if no switch of the field depends on the time.
     """
 
     ys: Any

@@ -30,7 +30,8 @@ from rigidjax.solve.tableaus import Tableau
 # diffrax inherits this member from optimistix, and type checkers do not find it there.
 NONFINITE: Any = dfx.RESULTS.nonfinite
 
-# The number of steps in one segment of a record (see the module), rejected steps included.
+# The number of steps in one segment, rejected steps included. A run whose steps are recorded for
+# derivatives is divided into segments.
 SEGMENT = 512
 # The number of additional rows for a segment that is run again for derivatives: if the program for
 # derivatives rounds differently from the program of the run, the segment may take a few more steps.
@@ -48,7 +49,7 @@ _TOGETHER = 16
 
 
 class Method(NamedTuple):
-    """Hold what is not an array in a run: the tableau of the method, functions and limits.
+    """Hold what a run with adaptive steps needs besides arrays: a tableau, functions and limits.
 
     The functions work on states (n, *bodies): a state has n numbers, and `*bodies` is one last axis
     for the bodies of a batch, or no axis for one body.
@@ -71,7 +72,10 @@ class Method(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Hold the arrays of a run, each with a last axis of bodies if there are several bodies."""
+    """Hold the arrays of a run with adaptive steps: its times, and the state at its start.
+
+    In a batch each array has a last axis of bodies.
+    """
 
     t0: Array  # the time at which the run begins
     stops: Array  # (J,) the times at which the field jumps, then the end of the run
@@ -111,10 +115,11 @@ class LoopState(NamedTuple):
 
 
 # Each recorded attempt at a step is one row (4 + n, *bodies), where n is the number of numbers of a
-# state, and *bodies one last axis of bodies, or no axis. The first `HEAD` = 4 entries are the
-# start time of the step, its length, its kind and the index of the next stop; the other n entries
-# are the state at the start. The kind is NONE if the step was rejected or not taken, LAST if the
-# accepted step ends at the next stop, and STEP for any other accepted step.
+# state, and *bodies one last axis of bodies, or no axis. The first `HEAD` = 4 entries are the start
+# time of the step, its length, its kind and the index of the next stop (a time at which a step has
+# to end); the other n entries are the state at the start. The kind is NONE if the step was rejected
+# or not taken, LAST if the accepted step ends at the next stop, and STEP for any other accepted
+# step.
 Rows = Array
 HEAD = 4
 NONE, STEP, LAST = range(3)
@@ -225,10 +230,9 @@ def start_length_and_end_of_steps(run: Run, rows: Rows) -> tuple[Array, Array, A
 
 
 def row_of_each_body(rows: Array, index: Array) -> Array:
-    """Return for each body the row of an array that has the index of this body.
+    """Return `rows[index]`, where each body of a batch has rows and indices of its own.
 
-    For one body this is `rows[index]`. An index out of range is replaced by the nearest one that is
-    in range.
+    An index out of range is replaced by the nearest one that is in range.
 
     - `rows`: (J, *bodies) the rows; `*bodies` is one last axis for the bodies of a batch, or no
       axis.
@@ -322,7 +326,8 @@ def map_over_bodies(run: Run, function: Callable[..., Any]) -> Callable[..., Any
 def initial_loop_state(run: Run) -> LoopState:
     """Return the state of the loop over steps before the first step of `run`."""
     zero = jnp.zeros(run.t0.shape, jnp.int32)
-    # A stop that is not after the start of the run needs no step.
+    # A stop (a time at which a step has to end) that is not after the start of the run needs no
+    # step, and counts as passed.
     passed = jnp.sum(run.stops[:-1] <= run.t0[None], 0, dtype=jnp.int32)
     still = lax.stop_gradient((run.t0, run.end))
     result = run.result
@@ -613,8 +618,8 @@ def fill_saved_states_of_segment(
     """
     size, many = run.between.shape[0], run.t0.ndim > 0
     width = 1 if many else min(size, _TOGETHER)
-    # The steps of all saved times are looked up at once: in a loop, each look-up would be many
-    # small kernels.
+    # The steps that contain the saved times are looked up for all saved times at once: in a loop,
+    # each look-up would be many small kernels.
     ts = lax.stop_gradient(run.between)
     search = map_over_bodies(
         run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1
@@ -627,8 +632,8 @@ def fill_saved_states_of_segment(
     still = segment.rows[0].at[1:3].set(0)
     pick = jax.vmap(lambda rows, i: rows[i], (-1 if many else None, -1), -1)
     if not many:
-        # For one body the saved times of a window are put into the last axis, where the bodies of a
-        # batch would be.
+        # For one body, the saved times whose states are computed together are put into the last
+        # axis, where the bodies of a batch would be.
         field, project = (
             jax.vmap(method.field, (None, -1, -1), -1),
             jax.vmap(method.project, -1, -1),

@@ -40,8 +40,8 @@ from rigidjax.solve.runge_kutta import Step, stages
 class Smooth(NamedTuple):
     """Hold the arrays of a `Run` that have derivatives, or their tangents or cotangents.
 
-    The arrays are the time at which the run begins, the stops (times at which steps end), the saved
-    times, and the state at the start, with the shapes that they have in `Run`.
+    A `Run` describes a run with adaptive steps. The arrays are the time at which the run begins,
+    the stops (times at which steps end), the saved times, and the state at the start.
     """
 
     t0: Array  # the time at which the run begins
@@ -97,9 +97,9 @@ def transpose_saved_states(
     state_at, most = partial(state_in_step, method), run.between.shape[0] - 1
     pick = map_over_bodies(run, lambda a, index: a[index])
 
-    # The saved times in a step are treated one after the other. An array with an axis for them
-    # would be as long as the largest number of saved times in this step of any body, and most
-    # bodies have far fewer.
+    # The saved times in a step are treated one after the other. To treat them together, the arrays
+    # of all bodies would need room for as many times as the body with most saved times has in its
+    # step, and most bodies have far fewer.
     def one(state: Any) -> Any:
         number, total, by = state
         inside, there = number < last, jnp.minimum(number, most)
@@ -274,7 +274,8 @@ def _segment_of_record(
     loop = loop._replace(steps=like.steps, result=like.result)
     count, filled = (jnp.max(a) for a in record.counts)
     again = number < count - 1
-    # The steps of the last segment are in the record, so that it takes no step here.
+    # Any segment but the last is run once more up to its end. The steps of the last segment are in
+    # the record: with the end −∞ it takes no step here.
     until = jnp.where(again, lax.stop_gradient(after.t), -jnp.inf)
     end, rows, count = record_segment(method, constants, run, loop, record.rows, until)
     # If the segment takes more steps than the record has rows for, some are missing and the

@@ -26,7 +26,10 @@ BLOCK = 16
 
 
 class Layout(NamedTuple):
-    """Describe which arrays of a program have a last axis for the bodies of a batch."""
+    """Describe which arrays of a program have a last axis for the bodies of a batch.
+
+    A program is a function of two lists of arrays: the constants, and the arrays of each body.
+    """
 
     bodies: bool  # whether the arrays of each body have this axis; without it there is one body
     shared: tuple[bool, ...]  # for each constant, whether all bodies share it, without this axis
@@ -106,7 +109,8 @@ def run_with_bodies_last(
         own, rest = batched[:number], batched[number:]
         many = len(each) - num_linear
         if not any(batched):
-            # JAX calls this rule without a batched array where only tangents are batched.
+            # JAX calls this rule for `vmap` even where no argument is batched, but only tangents of
+            # the arguments are: there is no new axis.
             out = program(was, constants, each)
             return out, [False] * len(out)
         if not any(own) and not any(rest[:many]):

@@ -53,7 +53,10 @@ class SearchMethod(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Hold the arrays of a run that is searched for zeros; a batch adds a last axis of bodies."""
+    """Hold the arrays of a run that is searched for zeros of a condition along its motion.
+
+    In a batch each array has a last axis of bodies.
+    """
 
     t0: Array
     stops: Array  # (J,) the times at which the field jumps, then the end of the run

@@ -80,10 +80,11 @@ class Event(eqx.Module):
 
     **Arguments:**
 
-    - `condition`: a Module or function `(t, state, body) → scalar` that is smooth along the motion;
-      it may hold traced numbers. If the condition jumps over zero (`jnp.sign(…)`), the event is at
-      the jump, and its time has NaN derivatives. If the torque has states of its own, the state is
-      a `Coupled`: use `state.motion.omega` and `state.own`.
+    - `condition`: a function or Module `(t, state, body) → scalar` that is smooth along the motion;
+      the fields of a Module may be traced. If the condition jumps over zero (`jnp.sign(…)`), the
+      event is at the jump, and its time has NaN derivatives. If the torque has states of its own,
+      such as the speed of a wheel, the state is a `Coupled` of two parts: read `state.motion.omega`
+      for the body rate, and `state.own` for the states of the torque.
     - `direction`: 1 for a zero on the way up, −1 for a zero on the way down, 0 for both (as in
       SciPy). In a run backwards in time, the way up means that the condition increases from step to
       step, that is with decreasing t.
@@ -124,15 +125,17 @@ class Event(eqx.Module):
 
 
 class Crossings(eqx.Module, Generic[State]):
-    """Hold the result of `crossings`.
+    """Hold the result of `crossings`: the times and states at which a condition is zero.
 
     **Fields:**
 
     - `times`: (K,) the times of the crossings, s, in the order of the run; NaN after the last one.
-    - `states`: the states at these times, of the type of `state0`, with a leading axis (K,).
+    - `states`: the states at these times, of the type of the initial state, with a leading axis
+      (K,).
     - `count`: the number of crossings.
-    - `result`: a `diffrax.RESULTS`: `successful` if the run reached `t1`, `event_occurred` if it
-      ended at crossing number `max_crossings`, else the reason why it ended early.
+    - `result`: a `diffrax.RESULTS`: `successful` if the run reached its end `t1`, `event_occurred`
+      if it ended at crossing number `max_crossings`, else the reason why it ended early. In the
+      second case the property `full` is true.
     - `num_steps`: the number of steps of the method, parts of steps included.
 
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
@@ -300,10 +303,10 @@ def solve_until_event(
     - `state0`: the state at `ts[0]`.
     - `ts`: (T,) the times at which states are saved, s, in the order of the run.
 
-    **Returns** five things: the states at `ts`, NaN at the times after the event; a dict of the
-    numbers of steps; how the run ended, a `diffrax.RESULTS` that is `event_occurred` if there was
-    an event; the time of the event, s; and the state at the event. If there is no event, this time
-    and this state are NaN.
+    **Returns** five things: the states at `ts`, NaN at the times after the event; the numbers of
+    steps, a dict as in `Solution.stats`; how the run ended, a `diffrax.RESULTS` that is
+    `event_occurred` if there was an event; the time of the event, s; and the state at the event. If
+    there is no event, this time and this state are NaN.
     """
     state0 = project_to_group(state0)
     crossed, numbers = condition_and_motion_of_run(setup, event, state0, ts)
@@ -480,9 +483,10 @@ class Section(NamedTuple):
     """
 
     solver: AbstractExplicit | None  # `None` is the closed form
-    # motion(constants, s, y) → dy/ds, or, in closed form, y at the time s.
+    # motion(constants, s, y) returns dy/ds, the slope of the state y along the time s; in closed
+    # form it returns the state at the time s instead.
     motion: Callable[[Arrays, Array, Array], Array]
-    # rates(constants, s, y) → g, dg/ds and dy/ds.
+    # rates(constants, s, y) returns the condition g, its slope dg/ds along the motion, and dy/ds.
     rates: Callable[[Arrays, Array, Array], tuple[Array, Array, Array]]
     tree: Callable[[Array], Any]  # the state from the vector of its numbers
     sizes: list[int]  # how many numbers each array of the state has
@@ -525,7 +529,8 @@ class Section(NamedTuple):
         return self.sign.astype(s.dtype) * s
 
 
-# The constants of a section's functions, the run that is searched, and its longest step.
+# Three things: the constants of the functions of a `Section`; the run that is searched for
+# crossings, a `Path`; and the length of its longest step, s.
 Numbers = tuple[Arrays, Path, Array]
 
 
@@ -622,7 +627,8 @@ def _sampling_interval(body: Any, state0: Any, length: Array) -> Array:
 def locate_crossings(section: Section, search: Search, numbers: Numbers) -> Located:
     """Return the first crossings of a run, without derivatives.
 
-    - `section`: the condition and the motion as functions of s = σt (see `Section`).
+    - `section`: the condition and the motion as functions of the time s = σt, where σ is 1 for a
+      run forwards in time t, and −1 for a run backwards.
     - `search`: the direction of the crossings, their largest number, and the largest number of
       steps.
     - `numbers`: the constants of the functions of the section, the run that is searched, and its
@@ -756,10 +762,10 @@ def chebyshev_step_to_crossing(
 ) -> tuple[Array, Array]:
     """Return the time and the state of a crossing by one step of Chebyshev's method from nearby.
 
-    The step makes the first and second derivatives of the crossing correct (see the formula in the
-    module).
+    The step makes the first and second derivatives of the crossing correct. Its formula is in the
+    docstring of this module.
 
-    - `section`: holds the condition g and the motion (see `Section`).
+    - `section`: holds the condition g, which is zero at a crossing, and the motion.
     - `constants`: the arrays on which the functions of the section depend.
     - `s`, `y`: the fixed time s = σt near the crossing, and the numbers (n,) of the state there; σ
       is 1 for a run forwards in time t, and −1 for a run backwards.
@@ -771,8 +777,9 @@ def chebyshev_step_to_crossing(
     rates = partial(section.rates, constants)
     g, rate, slope = rates(s, y)
     # The second time derivatives of g and of y are multiplied by g². At the crossing g² is zero,
-    # and so is the first derivative of g². The first and second derivatives of the results do
-    # therefore not contain the derivatives of these second time derivatives.
+    # and so is the first derivative of g². The first and second derivatives of the results
+    # therefore do not contain the derivatives of these second time derivatives, which are not
+    # taken.
     here = lax.stop_gradient((s, y))
     _, moved = jax.jvp(rates, here, (jnp.ones_like(s), lax.stop_gradient(slope)))
     _, second, turn = lax.stop_gradient(moved)

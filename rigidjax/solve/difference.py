@@ -27,8 +27,9 @@ _STEP = {8: 5e-7, 4: 5e-4}
 # size is therefore taken to be at least this fraction of the change of the value when each number
 # of x changes by its own size.
 _SLOW = 1e-3
-# The values at the two points are computed with the smaller tolerances of a second run. Their error
-# is taken to be this fraction of the error of the first run.
+# `error_of` computes the function at x with given tolerances, and again with smaller ones. The
+# values at the two points are computed with the smaller ones. Their error is taken to be this
+# fraction of the error that the value at x has with the given tolerances.
 _CLOSER = 0.01
 # Two slopes count as different if their difference is more than this many times its uncertainty.
 _UNSURE = 10.0
@@ -150,8 +151,8 @@ def slopes_by_derivative_and_values(
     - `values`: the values at the two points, NaN at a point that the function refuses.
     - `error`: a `FunctionError` with the derivative, and with the errors of value and derivative.
     """
-    # The numbers of the two points have been rounded, so that their difference is not exactly along
-    # the direction.
+    # The numbers of the two points have been rounded, so that the way from `x` to them is not
+    # exactly along the wanted direction. The derivative is therefore taken along the true way.
     moved = jax.tree.map(lambda side, leaf: side - leaf[None], points, x)
     rises = jax.vmap(lambda way: _directional_change(error.derivative, way))(moved)
     there = jnp.isfinite(values)

@@ -31,12 +31,14 @@ from rigidjax.solve.linear_map import known_with_derivatives_of
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
 from rigidjax.solve.sides import hold_piecewise_constant_laws_at
 
-# The tolerance of the second run divided by the tolerance of the run. With this value the second
-# run of a method of order 8 takes 1.6 times as many steps as the run.
+# The error of a run is measured by a second, more accurate run. This number is the tolerance of the
+# second run divided by the tolerance of the first. With this value the second run of a method of
+# order 8 takes 1.6 times as many steps as the first.
 _CLOSER = 2e-2
-# The second run is divided into this many equal parts, and a step ends at the end of each part. No
-# step is longer than ten times the step before it. In a run of a few steps this limit, and not the
-# tolerance, sets the steps, and without the parts the second run would take the same steps again.
+# The second, more accurate run, by which the error of a first run is measured, is divided into this
+# many equal parts, and a step ends at the end of each part. No step is longer than ten times the
+# step before it. In a run of a few steps this limit, and not the tolerance, sets the lengths of the
+# steps: without the parts the second run would take the same steps as the first.
 _CUTS = 8
 # A run evaluates the torque law at its stages only. To find short pulses between the stages, the
 # law is sampled at `_SAMPLES_OF_PART` times in each of `_PARTS` parts of the run. A sample is
@@ -44,14 +46,17 @@ _CUTS = 8
 # times the median of these distances in the part, plus `_ROUGH` times the relative rounding error
 # of the dtype. The distances are relative to the largest sample of the part.
 _PARTS, _SAMPLES_OF_PART, _SUDDEN, _ROUGH = 32, 512, 20.0, 1e3
-# The number of neighbouring runs, and the number of standard deviations that are reported as the
-# error. Three standard deviations over four runs (the run and its neighbours) exceed half of the
-# true error in all but a few of a thousand cases.
+# The round-off of a run is measured by its neighbours: runs whose inputs differ from those of the
+# run in the last digit. These two numbers are the number of neighbours, and the number of standard
+# deviations that are reported as the error. Three standard deviations over four runs (the run and
+# three neighbours) exceed half of the true error in all but a few of a thousand cases.
 _NEIGHBOURS, _DEVIATIONS = 3, 3.0
-# In float64 the neighbours are run at a larger tolerance, so that they take fewer steps: at the
-# square root of the tolerance of the run, but at `_LOOSE` at most. If a run at the larger tolerance
-# is farther than `_NEAR` from the run whose error is wanted, errors grow along the two runs in
-# different ways. The larger tolerance is then multiplied by `_FARTHEST`, again if necessary.
+# In float64 the neighbours (runs with inputs changed in the last digit, which show the round-off of
+# a run) are run at a larger tolerance, so that they take fewer steps: at the square root of the
+# tolerance of the run whose error is wanted, but at `_LOOSE` at most. If a run at the larger
+# tolerance is farther than `_NEAR` from the run whose error is wanted, errors grow along the two
+# runs in different ways. The larger tolerance is then multiplied by `_FARTHEST`, again if
+# necessary.
 _LOOSE, _NEAR, _FARTHEST = 1e-4, 0.03, 1e-3
 # A state counts as lost if its error is above half a radian, or above half of the largest value in
 # the run: an error so large no longer grows in proportion to the error before it.
@@ -60,11 +65,12 @@ _LOST = 0.5
 # are smaller need not be known to all digits. It is the ratio of the default `atol` to the default
 # `rtol`.
 _SMALL = 1e-3
-# One "rounding" is the relative rounding error of the dtype. Errors of steps and rounding errors
-# grow alike along most motions. If the errors of the steps are much larger from the beginning, one
-# neighbour is then enough to show that round-off can be neglected. Near an unstable rotation the
-# two kinds of errors do not grow alike: the nearer the motion is to the rotation, the smaller are
-# the errors of the steps, but the rounding errors stay as they are.
+# One "rounding" is the relative rounding error of the dtype. A "neighbour" is a run with inputs
+# changed in the last digit, by which the round-off of a run is measured. Errors of steps and
+# rounding errors grow alike along most motions. If the errors of the steps are much larger from the
+# beginning, one neighbour is then enough to show that round-off can be neglected. Near an unstable
+# rotation the two kinds of errors do not grow alike: the nearer the motion is to the rotation, the
+# smaller are the errors of the steps, but the rounding errors stay as they are.
 #
 # After the first neighbour no other is run if two conditions hold: the tolerance is above `_COARSE`
 # roundings; and the error of the steps is above `_CLEAR` times each of two bounds of round-off. The
@@ -76,12 +82,13 @@ _SMALL = 1e-3
 # tolerance is above `_COARSE` roundings and the error of the steps is above `_PLAIN` roundings of
 # each result.
 _ABOVE, _ABOVE_ONE, _CLEAR, _PLAIN, _COARSE = 100.0, 10.0, 3.0, 1e6, 1e5
-# The search for a tolerance starts with a run at the tolerance `_FIRST`. The second run of the
-# search has `_SECOND` times the tolerance that most motions need for the wanted accuracy: in 800
-# motions of `bench_error` the error was about n²/100 times the tolerance, within a factor of ten,
-# where n is the number of steps of the first run. From the second run on, the error is measured.
-# Errors are proportional to the tolerance only up to a factor of four, `_ALLOWED`, by which the
-# estimate of the error is multiplied. The search aims at the wanted accuracy divided by `_AIM`.
+# `simulate(…, accuracy=…)` searches for a tolerance at which a run is as accurate as wanted. The
+# search starts with a run at the tolerance `_FIRST`, which takes n steps. The tolerance of the next
+# run is found from n: in 800 motions of `bench_error` the error was n²/100 times the tolerance,
+# within a factor of ten. The next run has `_SECOND` times the tolerance at which this error would
+# be the wanted one. From the second run on, the error is measured. Errors are proportional to the
+# tolerance only up to a factor of four, `_ALLOWED`, by which the estimate of the error is
+# multiplied. The search aims at the wanted accuracy divided by `_AIM`.
 #
 # In three cases the error is not proportional to the tolerance: if the error is above `_FORESEEN`
 # (0.1 rad); if the run has fewer than `_FEW` steps; and if the number of steps grew from the run
@@ -136,9 +143,10 @@ class Error(eqx.Module):
 
     @property
     def total(self) -> dict[str, Float[Array, " times"]]:
-        """Return the errors of steps and of round-off together, by the names of the arrays.
+        """Return the error of steps and round-off together, for each array of a state by its name.
 
-        Each error is an array (T,), which is infinite at times at which the state is `lost`.
+        It is the root of the sum of the two squares, at each of the T times. From the first time on
+        at which the relative error of the state is above one half, it is infinite (see `lost`).
         """
         both = jax.tree.map(jnp.hypot, self.steps, self.round_off)
         return jax.tree.map(lambda part: jnp.where(self.lost, jnp.inf, part), both)
@@ -149,23 +157,26 @@ class Error(eqx.Module):
 
         The largest is taken over the arrays of the state (`q`, `omega`, …). For a quaternion the
         relative error is an angle, rad; for another array it is the error divided by the largest
-        length of this array in the run. The result is infinite at times at which the state is
-        `lost`.
+        length of this array in the run. The result is infinite from the first time on at which it
+        would be above one half (see `lost`).
         """
         return jnp.where(self.lost, jnp.inf, self._largest_relative_error)
 
     @property
     def lost(self) -> Bool[Array, " times"]:
-        """Return for each of the times (T,) whether the state is unknown, as in chaos.
+        """Return for each time (T,) whether the error is so large that the state is unknown.
 
-        The state is unknown from the first time on at which the largest relative error is above one
-        half.
+        The state is unknown, as it is in chaos, from the first time on at which the largest
+        relative error is above one half.
         """
         return lax.associative_scan(jnp.logical_or, self._largest_relative_error > _LOST)
 
     @property
     def known_until(self) -> Float[Array, ""]:
-        """Return the last of `ts` at which the state is not lost, s."""
+        """Return the last of the times `ts` of this error at which the state is still known, s.
+
+        The state is known before its relative error is above one half for the first time.
+        """
         return self.ts[jnp.sum(~self.lost) - 1]
 
     @property
@@ -182,7 +193,10 @@ class Error(eqx.Module):
 
 
 class TriedRun(NamedTuple):
-    """Hold one run of the search for a tolerance: the tolerance, and the results of the run."""
+    """Hold one run of a search for a tolerance: the tolerance, and the results of the run.
+
+    The search tries smaller and smaller tolerances until a run is as accurate as wanted.
+    """
 
     rtol: Array  # (), the relative tolerance of the run
     ys: Any  # the states at the T saved times, with a leading time axis
@@ -191,7 +205,7 @@ class TriedRun(NamedTuple):
 
     @property
     def accepted_steps(self) -> Array:
-        """Return the number of accepted steps of the run, a whole number."""
+        """Return the number of accepted steps of this run, a whole number."""
         return self.stats["num_accepted_steps"]
 
 
@@ -216,10 +230,10 @@ def estimate_error_of_run(
     - `ts`: (T,) the times of the states, s.
     - `ys`: the states at `ts` that the run gave, with a leading time axis.
     - `num_steps`: the number of steps of the run.
-    - `search`: `None`, or two runs of the search that found the tolerance of the given run: the
-      first run of the search, and the last run before the given one. Both have larger tolerances.
-      The error of the steps is then measured by the last run before the given one, not by a more
-      accurate run, and is too large by a factor of about four.
+    - `search`: `None`, or two runs that `simulate(…, accuracy=…)` tried while it searched for the
+      tolerance of the given run: the first run of the search, and the last one before the given
+      run. Both have larger tolerances. The error of the steps is then measured by the last run
+      before the given one, not by a more accurate run, and is too large by a factor of about four.
     """
     setup, ts, ys, num_steps, search = _without_derivatives((setup, ts, ys, num_steps, search))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
@@ -267,16 +281,16 @@ def _error_with_round_off(
     - `step_errors`: the known error of the steps, one array (T,) for each array of a state, by its
       name (`q`, `omega`, …).
     - `rtol`: the relative tolerance of the run.
-    - `search`: `None`, or two runs of the search that found the tolerance of the run: the first one
-      and the one before the last. Both have larger tolerances, and take fewer steps. Round-off is
-      measured on one of them in place of the run, so that no run at a larger tolerance has to be
-      made.
+    - `search`: `None`, or two runs that `simulate(…, accuracy=…)` tried while it searched for the
+      tolerance of the run: the first one and the one before the last. Both have larger tolerances,
+      and take fewer steps. Round-off is measured on one of them in place of the run, so that no run
+      at a larger tolerance has to be made.
     """
     sizes, start = _error_scales_by_name(ys), jax.tree.map(lambda leaf: leaf[0], ys)
     reached = jnp.isfinite(_largest_relative_distance(_distances_of_states(ys, ys), sizes))
     # `plain` is `_ABOVE` times the sum of the rounding errors of n = `num_steps` steps in a motion
-    # without growth of errors. The sum is about n^1.5 relative rounding errors: n^0.5 for the body
-    # rate, which is summed up over n steps for the angle.
+    # without growth of errors. In the body rate the sum is about n^0.5 relative rounding errors.
+    # The angle is the sum of the body rate over n steps, and has an error of about n^1.5 of them.
     eps = float(jnp.finfo(ts.dtype).eps)
     plain = {name: _ABOVE * eps * num_steps.astype(ts.dtype) ** 1.5 * sizes[name] for name in sizes}
     coarse = rtol > _COARSE * eps
@@ -291,8 +305,9 @@ def _error_with_round_off(
 
     def neighbour(clear: Array, inputs: Any) -> tuple[Array, tuple[Array, dict[str, Array]]]:
         number, near, later = inputs
-        # If round-off is known to be small (`clear`), all times of a neighbour are set to the first
-        # time, so that its run takes no step.
+        # A neighbour is a run with inputs changed in the last digit. If the first neighbour has
+        # shown that the round-off is small (`clear`), all times of the next ones are set to the
+        # first time, so that they take no step.
         changes = changes_of_neighbour(near, jnp.where(clear, ts[0], ts * later))
         shown = _lengths_of_changes_by_name(start, _DEVIATIONS * _ABOVE_ONE * changes)
         bounds = {name: jnp.maximum(plain[name], shown[name]) for name in sizes}
@@ -305,12 +320,12 @@ def _error_with_round_off(
         lambda leaf: _copies_changed_in_last_digit(leaf, rng, jnp.abs(leaf)), numbers
     )
     # The closed form computes the angle of rotation without steps and rounds it only once, so that
-    # neighbours may get the same rounded angle. In closed form the times of the neighbours are
+    # the runs with changed inputs may get the same rounded angle. In closed form their times are
     # therefore changed, too.
     later = jnp.asarray(1.0 + eps * free * np.array([1.0, -1.0, 1.0]), ts.dtype)
     inputs = jnp.arange(_NEIGHBOURS), near, later
-    # The neighbours are run one after another: a batch of them would take no less time, and the
-    # first neighbour may show that the others are not needed.
+    # The neighbours (runs with changed inputs) are run one after another: a batch of them would
+    # take no less time, and the first neighbour may show that the others are not needed.
     clear, (changes, bounds) = lax.scan(neighbour, jnp.asarray(False), inputs)
     off = _lengths_of_changes_by_name(
         start, _DEVIATIONS * jnp.sqrt(_variance_over_neighbours(changes))
@@ -683,7 +698,7 @@ def _more_accurate_setup(
 
 
 class FunctionError(eqx.Module):
-    """Hold a value and its derivative, with the error of each number: see `error_of`.
+    """Hold the value and derivative of a function at x, and their errors: the result of `error_of`.
 
     **Fields:**
 
@@ -708,10 +723,10 @@ class FunctionError(eqx.Module):
 
     @property
     def known(self) -> Bool[Array, ""]:
-        """Return whether the derivative is known: its error is below half of the derivative itself.
+        """Return whether the derivative is known: its error is shorter than half of the derivative.
 
-        The lengths of the two are compared, each taken over all numbers. If the derivative is not
-        known, as in chaos, it means nothing, even if it is finite.
+        The lengths are Euclidean norms over all numbers of the error and of the derivative. If the
+        derivative is not known, as in chaos, it means nothing, even if it is finite.
         """
         size = jnp.linalg.norm(ravel_pytree(self.derivative)[0])
         return jnp.linalg.norm(ravel_pytree(self.derivative_error)[0]) < _LOST * size

@@ -108,15 +108,19 @@ def take_equal_step(
     inputs: PyTree = None,
     first_row: int = 0,
 ) -> PyTree:
-    """Take one of a sequence of equal steps, and return the numbers of the state after it.
+    """Take one of a sequence of equal steps, and return the state after it as numbers.
+
+    The numbers stand for the state but may differ from it: they may hold the momentum in the place
+    of the body rate.
 
     **Arguments:**
 
-    - `stepper`: an object that takes a step of one body.
+    - `stepper`: holds the functions that take a step of one body, and that make a state from its
+      numbers.
     - `h`: the length of each step, s.
     - `t0`: the time at which step number 0 begins, s.
     - `i`: the number of the step, from 0.
-    - `y`: the numbers that stand for the state before the step, in the form of `stepper`.
+    - `y`: the numbers that stand for the state before the step.
     - `inputs`: `None`, or an array for each named input of the torque, with one row for each step.
     - `first_row`: the row of `inputs` for step number 0; step `i` uses row `first_row + i`.
     """
@@ -150,7 +154,7 @@ def take_equal_step(
 def changes_of_delayed_inputs(
     delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: PyTree, first_row: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Return where in a step each delayed input changes, and its values before and after this.
+    """Return where in a step each delayed input changes, with its values before and after it.
 
     An input of a torque is constant during each step; if it is delayed, it changes within a step.
 
@@ -208,16 +212,20 @@ def march_steps(
     stepper: AnyStepper, h: Array, t0: Array, first: Array, count: int, y: PyTree,
     inputs: PyTree = None,
 ) -> PyTree:  # fmt: skip
-    """Take many equal steps one after another, and return the numbers of the state after them.
+    """Take many equal steps one after another, and return the state after them as numbers.
+
+    The numbers stand for the state but may differ from it: they may hold the momentum in the place
+    of the body rate.
 
     **Arguments:**
 
-    - `stepper`: an object that takes a step of one body.
+    - `stepper`: holds the functions that take a step of one body, and that make a state from its
+      numbers.
     - `h`: the length of each step, s.
     - `t0`: the time at which step number 0 begins, s.
     - `first`: the number of the first step that is taken; it begins at `t0` + `first` · `h`.
     - `count`: how many steps are taken.
-    - `y`: the numbers that stand for the state before the first step, in the form of `stepper`.
+    - `y`: the numbers that stand for the state before the first step.
     - `inputs`: `None`, or an array for each named input of the torque, with one row for each step.
 
     In reverse mode the run is divided into about √count pieces. The states at the starts of all
