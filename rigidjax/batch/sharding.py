@@ -20,7 +20,8 @@ from rigidjax import _checks
 from rigidjax.rotation.barrier import platform
 
 AXIS = "bodies"
-# The type of `devices`: `None` is JAX's default device.
+# The type of the argument `devices`: `None` is JAX's default device, and "all" stands for all
+# devices of this process.
 Devices = Literal["all"] | Sequence[jax.Device] | None
 # The size, in bytes, of an array with one number for each body of a chunk. With this size the
 # arrays of a step stay in the first-level cache, which holds 32 KB on many cores.
@@ -47,8 +48,9 @@ def compiler_options() -> dict[str, Any]:
 class CompiledFunction:
     """Call a function under `jit`, with the options of `compiler_options` where JAX takes them.
 
-    JAX takes options only at the outermost `jit`. If the last argument of the function is traced,
-    the call is within another `jit`, and no options are given.
+    The options make the function faster on CPU. JAX takes them only at the outermost `jit`. If the
+    last argument of the function is traced, the call is within another `jit`, and no options are
+    given.
     """
 
     def __init__(self, function: Callable[..., Any]):

@@ -35,7 +35,7 @@ State = TypeVar("State", Spin, Attitude, Rigid)
 
 
 class Steps(NamedTuple):
-    """Describe fixed steps, which `simulate` takes instead of times.
+    """Describe fixed steps, which `rigidjax.batch.simulate` takes in place of times to save.
 
     **Fields:**
 

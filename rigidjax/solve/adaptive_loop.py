@@ -39,7 +39,8 @@ _MORE = 64
 # XLA on CPU makes one kernel of a loop whose state is smaller than a kilobyte. The rows of steps
 # are therefore collected in a block of at most `_BLOCK` bytes and `_MOST` rows, and each full block
 # is copied to the record. (When each row was written directly to the record, second derivatives
-# were wrong on jaxlib 0.12.0.1, if several blocks of bodies had segments that were run again.)
+# were wrong on jaxlib 0.12.0.1 for a batch of several blocks of bodies whose segments were run
+# again.)
 _BLOCK, _MOST = 560, 8
 # The next step has the length that the error estimate suggests, times the safety factor `_SAFETY`.
 # The ratio of this length to the length of the last step is limited to `_SMALLEST` … `_LARGEST`.
@@ -49,7 +50,7 @@ _TOGETHER = 16
 
 
 class Method(NamedTuple):
-    """Hold what a run with adaptive steps needs besides arrays: a tableau, functions and limits.
+    """Hold what a run with adaptive steps needs besides arrays, such as the method and the field.
 
     The functions work on states (n, *bodies): a state has n numbers, and `*bodies` is one last axis
     for the bodies of a batch, or no axis for one body.
@@ -59,13 +60,13 @@ class Method(NamedTuple):
     field: Field  # field(constants, t, y): dy/dt
     project: Callable[[Array], Array]  # project(y): the state y with its quaternion of length 1
     halt: Callable[..., Array] | None  # halt(t, y): whether the run ends at the time t
-    # control(again, (state, times), (left, right, error)) is the decision of the step controller on
-    # one step. `again` is whether a recorded step is repeated for a derivative; `state` holds the
-    # states of controller and progress meter; `times` are those at which the run begins and ends,
-    # and those at which the step begins and ends; `left` and `right` are the states of the body
-    # before and after the step; `error` is the error of the step. The result is five things:
-    # whether the step is accepted, the time after it, the time at which the next step is to end,
-    # the new `state`, and the result of the run so far.
+    # control(again, (state, times), (left, right, error)) returns the decision of the step
+    # controller on one step. `again` is whether a recorded step is repeated for a derivative;
+    # `state` holds the states of controller and progress meter; `times` are those at which the run
+    # begins and ends, and those at which the step begins and ends; `left` and `right` are the
+    # states of the body before and after the step; `error` is the error of the step. The result is
+    # five things: whether the step is accepted, the time after it, the time at which the next step
+    # is to end, the new `state`, and the result of the run so far.
     control: Callable[..., Any]
     sizes: list[int]  # how many numbers each array of the state has
     max_steps: int  # the largest number of steps, rejected steps included
@@ -126,12 +127,13 @@ NONE, STEP, LAST = range(3)
 
 
 def pack_loop_state(loop: LoopState) -> Arrays:
-    """Return a loop state as a short list of arrays, to which `unpack_loop_state` is the inverse.
+    """Return the state of the loop over steps as a short list of arrays.
 
-    The first array is the state y (n, *bodies), where `*bodies` is one last axis for the bodies of
-    a batch, or no axis for one body. All other fields are joined, with one array for each dtype.
-    Few arrays are wanted because XLA makes a kernel for each array that goes into or comes out of a
-    loop over blocks of bodies.
+    `unpack_loop_state` turns this list back into the loop state. The first array is the state y of
+    shape (n, *bodies), where `*bodies` is one last axis for the bodies of a batch, or no axis for
+    one body. All other fields are joined, with one array for each dtype. Few arrays are wanted
+    because XLA makes a kernel for each array that goes into or comes out of a loop over blocks of
+    bodies.
     """
     rest = _group_by_dtype(loop._replace(y=None))
     join = lambda leaves: jnp.concatenate([a.reshape(-1, *loop.t.shape) for a in leaves])  # noqa: E731
@@ -355,9 +357,9 @@ def is_running(method: Method, run: Run, loop: LoopState, until: Array | None) -
 
 
 def loop_state_at_end(method: Method, constants: Arrays, run: Run) -> LoopState:
-    """Return the loop state at the end of a run, without saving any state before the end.
+    """Return the state of the loop over steps at the end of a run; no earlier state is saved.
 
-    - `method`: the explicit method, the field and the limits.
+    - `method`: the explicit method, the field and the largest number of steps.
     - `constants`: the arrays on which the field depends.
     - `run`: the time and state at the start of the run, and the times at which steps end.
     """
@@ -369,16 +371,16 @@ def loop_state_at_end(method: Method, constants: Arrays, run: Run) -> LoopState:
 
 
 def run_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState]:
-    """Run one body, and return its states at the saved times and the loop state at the end.
+    """Run one body with adaptive steps, and return its states at the saved times.
 
-    - `method`: the explicit method, the field and the limits.
+    - `method`: the explicit method, the field and the largest number of steps.
     - `constants`: the arrays on which the field depends.
     - `run`: the time and state at the start, the times at which steps end, and the K saved times
       `run.between`.
 
     **Returns** two things: the states (K, n), NaN at a time that the run did not reach; and the
-    loop state at the end. The stages of dense output are evaluated only in steps that contain a
-    saved time.
+    state of the loop over steps at the end. The stages of dense output are evaluated only in steps
+    that contain a saved time.
     """
     size = run.between.shape[0]
 
@@ -398,7 +400,9 @@ def run_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Array, Lo
         ys, k = lax.while_loop(lambda state: next_time(state[1]) <= after.t, save, (ys, k))
         return after, ys, k
 
-    # A saved time equal to the start of the run gets its state when the first step is accepted.
+    # The last number counts the saved times whose states are known. It begins at 0 even if the
+    # first of these times is the start of the run: this time gets its state with the first accepted
+    # step.
     state = (initial_loop_state(run), _array_for_saved_states(run), jnp.zeros((), jnp.int32))
     more = lambda state: is_running(method, run, state[0], None)  # noqa: E731
     loop, ys, _ = lax.while_loop(more, one, state)
@@ -422,14 +426,14 @@ def _array_for_saved_states(run: Run) -> Array:
 def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState, Record]:
     """Run one body or many and record the steps, from which derivatives are computed later.
 
-    - `method`: the explicit method, the field and the limits.
+    - `method`: the explicit method, the field and the largest number of steps.
     - `constants`: the arrays on which the field depends.
     - `run`: the time and state at the start, the times at which steps end, and the K saved times
       `run.between`.
 
     **Returns** three things: the states (K, n, *bodies) at the saved times, NaN at a time that the
-    run did not reach; the loop state at the end; and the record of the run. `*bodies` is one last
-    axis for the bodies of a batch, or no axis for one body.
+    run did not reach; the state of the loop over steps at the end; and the record of the run.
+    `*bodies` is one last axis for the bodies of a batch, or no axis for one body.
     """
     loop, most = initial_loop_state(run), method.max_steps + run.stops.shape[0]
     count = -(-most // SEGMENT) + 1
@@ -463,7 +467,7 @@ def _attempt_step(
 ) -> tuple[LoopState, Array, tuple[Step, Array]]:  # fmt: skip
     """Compute one attempted step of every body; return the loop state after it and the step itself.
 
-    - `method`: the explicit method, the field, the step controller and the limits.
+    - `method`: the explicit method, the field, the step controller and the largest number of steps.
     - `constants`: the arrays on which the field depends.
     - `run`: the time and state at the start of the run, and the times at which steps end (stops).
     - `loop`: the loop state before the step.
@@ -562,7 +566,7 @@ def record_segment(
     A segment that is recorded for the first time ends when the array of rows is full or the run
     ends. For derivatives the segment is run again, up to the time at which it ended the first time.
 
-    - `method`: the explicit method, the field and the limits.
+    - `method`: the explicit method, the field and the largest number of steps.
     - `constants`: the arrays on which the field depends.
     - `run`: the time and state at the start of the run, and the times at which steps end.
     - `loop`: the loop state at the start of the segment.
@@ -677,9 +681,9 @@ def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
       output included; n is the number of numbers of the state.
     """
     theta = ((t - step.t) / jnp.where(step.h == 0, 1, step.h)).astype(slopes.dtype)
-    # Dense output is a polynomial in θ, the fraction of the step before the time t. It is evaluated
-    # for the weights of the slopes, which are one number for each stage: with states as
-    # coefficients, each coefficient would have n numbers.
+    # Dense output is the state at the start of the step plus its length times a weighted sum of the
+    # slopes at the stages. The weights are polynomials in θ, the fraction of the step before the
+    # time t. They are evaluated first: a weight is one number, while a slope has n numbers.
     rows = arrays_of_tableau(method.tableau, slopes.dtype).dense
     shares = change_within_step(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
     rise = jnp.sum(shares[None] * slopes, 1)

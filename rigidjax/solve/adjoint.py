@@ -186,8 +186,8 @@ def cotangents_of_run(
     - `wants_time_cotangents`: whether the cotangents of the times of the run are computed; else
       they are 0.
 
-    **Returns** two things: the list of the cotangents of `constants`; and the cotangents of the
-    arrays of `run` that have derivatives, in a `Smooth`.
+    **Returns** two things: the list of the cotangents of `constants`; and a `Smooth`, the tuple of
+    the cotangents of the times of `run` and of its state at the start.
     """
     number, size = jnp.max(record.counts[0]), run.between.shape[0]
 

@@ -96,7 +96,10 @@ class Motion(NamedTuple):
 
 
 class Search(NamedTuple):
-    """Describe the crossings to find: their direction and the largest number of them."""
+    """Describe which crossings to find: their direction, and the largest number of them.
+
+    A crossing is a zero of a condition g along a motion.
+    """
 
     direction: int  # 1: g goes up through zero, −1: down, 0: both
     max_crossings: int  # the largest number of crossings
@@ -259,8 +262,8 @@ def _next_search_state(
     )
 
     # If the error of a step is below the tolerance, one of three things happens: the step is
-    # accepted; or the step is taken again up to the extremum of g (`shorter`); or the zero of g in
-    # the step is searched for (`crossed`).
+    # accepted; or the step is taken again up to an extremum of g, because g may have two zeros
+    # beside it (`shorter`); or the zero of g in the step is searched for (`crossed`).
     step = on & ~arrived & ~body.refining
     whole = run.stops[-1] - run.t0
     good, following = acceptance_and_next_step_of_search(
@@ -385,8 +388,9 @@ def _may_hide_zeros(
     a, b = sign_at_low * low.rate * width, sign_at_low * high.rate * width
     first, last = sign_at_low * low.g, sign_at_low * high.g
     rise = last - first
-    # The slope of the cubic is a + c x + d x², where x goes from 0 at `low` to 1 at `high`. The
-    # cubic is multiplied by `sign_at_low`, so that it is positive at `low`.
+    # The cubic polynomial with the values and slopes of g at both ends is multiplied by
+    # `sign_at_low`, so that it is positive at `low`. Its slope is a + c x + d x², where x goes from
+    # 0 at `low` to 1 at `high`.
     c, d = 2 * (3 * rise - 2 * a - b), 3 * (a + b - 2 * rise)
     root = jnp.sqrt(jnp.maximum(c * c - 4 * a * d, 0))
     q = -0.5 * (c + jnp.where(c < 0, -root, root))

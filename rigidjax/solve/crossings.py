@@ -673,7 +673,7 @@ def _locate_crossings_of_bodies(
 
     def counts(s: Array, y: Array, steps: Array) -> Array:
         # The round-off of n steps adds up as a random walk does, to about √n times that of one
-        # step.
+        # step. In closed form, without a solver, there are no steps.
         many = 1 if solver is None else jnp.sqrt(1 + steps.astype(y.dtype))
         return ~(clear(s, y) < _CLEAR * many)
 

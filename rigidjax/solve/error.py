@@ -361,8 +361,8 @@ def _run_at_larger_tolerance(
     stay near `ys`.
 
     No new run is made in three cases: if the given run is in float32, where it takes few steps
-    anyway; if it is in closed form; and if its steps are not recorded, as they are with a
-    `ReplayAdjoint`. The given set-up and states are then returned, with the factor 1.
+    anyway; if it is in closed form; and if it does not record its steps for derivatives, as a run
+    with a `ReplayAdjoint` does. The given set-up and states are then returned, with the factor 1.
 
     **Arguments:**
 

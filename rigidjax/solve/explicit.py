@@ -32,7 +32,10 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
     coefficients: Any
 
     def evaluate(self, t0: RealLike, t1: RealLike | None = None, left: bool = True) -> PyTree:
-        """Return the state at the time `t0`; if `t1` is given, its change from `t0` to `t1`."""
+        """Return the interpolated state at the time `t0`, or its change from `t0` to `t1`.
+
+        The change is returned if `t1` is given.
+        """
         if t1 is not None:
             return jax.tree.map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
         length = self.t1 - self.t0
@@ -115,7 +118,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
         step = Step(jnp.asarray(t0), h, jnp.asarray(t1), numbers)
         there = stages(self.tableau, field, [], step)
         # The quaternion is scaled to length 1 once, after the stages: if it were scaled in each
-        # stage, the method would have another order (jaxsim#192).
+        # stage, the method would have another order (issue 192 of jaxsim).
         y1 = project_to_group(tree(there.end))
         # Derivatives hold the lengths of steps constant, so that the error, from which the lengths
         # are chosen, needs no derivative. What this leaves out is as small as the error of a step,

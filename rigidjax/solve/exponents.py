@@ -174,7 +174,8 @@ def _exponents_of_run(
     - `t0`, `length`: the time at which the run begins, and its length, s.
     - `rtol`, `atol`: the relative and the absolute tolerance of each step.
     """
-    # `options` are not arrays, so that `filter_jit` compiles again if one of them changes.
+    # The options are no arrays: `filter_jit` takes them as static, and compiles again if one of
+    # them changes.
     solver, many, intervals, transient, max_steps = options
     state0 = project_to_group(state0)
     step = length / intervals
