@@ -324,8 +324,8 @@ img {{ max-width: 100%; margin: 1rem 0 }}
 
 
 def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str:
-    """Return the status, the table of quantities and the verdict of a fit as HTML, for a page or a
-    notebook.
+    """Return a fit as HTML, for a page or a notebook: its status, a table of its quantities, and
+    the verdict, which says in words whether the fit can be trusted, and what to try.
 
     **Arguments:**
 

@@ -18,11 +18,12 @@ from rigidjax.identify.uncertainty.quantities import Quantity
 
 # One sentence names at most this number of quantities.
 MOST = 3
-# A free bias is reported as large if it exceeds this fraction of the root mean square of the
-# readings. The bias of a real gyro is about a hundredth of the rates in a record that is worth a
-# fit.
+# A bias that a fit estimates is reported as large if it exceeds this fraction of the root mean
+# square of the readings. In a record that is worth a fit, the bias of a real gyro is about a
+# hundredth of the rates.
 REMARKABLE = 0.2
-# These words describe the small constant errors of a sensor whose sizes are in `considered.USUAL`.
+# These words describe the two kinds of small constant errors of a sensor. The sizes of these
+# errors, 1 % and 1°, are the numbers of `considered.USUAL`.
 _WAYS = {
     "scale": "an error of 1 % in the scale of one axis",
     "cross_axis": "an axis that leans by 1°",
@@ -46,9 +47,10 @@ def describe_allowed_sensor_errors(
     - `considered_errors`: the errors that the intervals allow for. They are the errors of the
       sensors with a `Tolerance`.
     - `usual_shifts`: for each sensor without a tolerance two things: the index of the sensor; and a
-      dict of kind of error → shifts (q,) of the q `quantities`. The kinds are "scale" (an error of
-      1 %) and "cross_axis" (an error of 1° between axes), as in
-      `considered.quantity_shifts_by_usual_errors`.
+      dict of kind of error → shifts (q,), where a shift is the change of one of the q `quantities`
+      that the error would cause. The kinds are "scale" (an error of 1 %) and "cross_axis" (an error
+      of 1° between axes). The function `considered.quantity_shifts_by_usual_errors` computes these
+      shifts.
     - `quantities`: the q reported quantities that the sentences name.
     """
     out = []
@@ -75,6 +77,7 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
 
     Such a bias may stand for a part of the motion that the model lacks: in one fit the bias of a
     pendulum's gyro came out as 1.6 rad/s. The text is empty if there is no such bias.
+
     **Arguments:** `model` the fitted model; `quantities` the reported quantities of the fit, which
     hold the fitted biases.
     """
@@ -105,8 +108,8 @@ def _describe_quantity_shifts(
     error, such as an error of 1 % in the scale of one axis.
 
     The words are such as "I1 by 0.02 (interval ±0.1)". The number in brackets is half the width of
-    the 95 % interval of the quantity; it is left out if it is not finite. At most `MOST` quantities
-    are named.
+    the 95 % interval of the quantity; it is left out if it is not finite. Only the first `MOST`
+    (three) quantities are named.
 
     **Arguments:**
 

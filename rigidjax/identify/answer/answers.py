@@ -6,9 +6,10 @@ explains the readings.
 
 import equinox as eqx
 
-# These words are the possible answers on the search.
+# The answer on the search is one of these words: the search found the best point, or another motion
+# fits as well, or the search did not end in a minimum.
 FOUND, NOT_ALONE, NOT_ENDED = "found", "not alone", "not ended"
-# These words are the possible answers on the model.
+# The answer on the model is one of these words, which say how well the model explains the readings.
 EXPLAINS, LEAVES, FAILS = "explains the readings", "leaves a part", "does not explain the readings"
 
 # If the errors are larger than the given noise by more than this factor, sensors cannot have made
@@ -43,7 +44,7 @@ class Cause(eqx.Module):
     - `sensor`: the class of the sensor that has the errors.
     - `share`: the fraction of the sum of squared errors that the cause explains, 0 to 1. It is 1
       for the cause "misread" (the file was read with a wrong unit, axis or sign), and `None` for a
-      guess.
+      cause that is only a guess from the class of the sensor.
     - `words`: the cause in words.
     - `remedy`: what to do about the cause.
 
@@ -62,10 +63,11 @@ class Cause(eqx.Module):
 
 
 def joined_status(search: Answer, model: Answer) -> str:
-    """Return the answer on the `search` and the answer on the `model` in one line of text.
+    """Return the two answers of a fit in one line of text.
 
-    The text is `ok` if the search found the best point, the model explains the readings, and
-    neither answer has a reason.
+    The answer on the `search` says whether the search found the best point; the answer on the
+    `model` says whether the model explains the readings. The text is `ok` if the search found the
+    best point, the model explains the readings, and neither answer has a reason.
     """
     if search == Answer(FOUND) and model == Answer(EXPLAINS):
         return "ok"

@@ -117,8 +117,9 @@ def goodness_of_fit(
         slope = linear.slopes[index] * root[..., None]
         white = left <= tiny or _is_white(e * root, mask, slope, own, has_noise)
         has_clock_error = left > tiny and time_stamp_cause(model, noise, linear, index) is not None
-        # Errors that are no larger than the given noise, and errors that are small beside the
-        # readings, cannot hide a missing part of the model.
+        # Errors cannot hide a missing part of the model in two cases: a noise is given and they are
+        # no larger (`factor` is 1); or they are small beside the readings, with at most a QUARTER
+        # of the variance of the readings.
         small = has_noise or left <= QUARTER * varies + tiny
         if factor == 1.0 and white and small and not has_clock_error:
             continue
@@ -393,7 +394,8 @@ def assess(
 
     **Arguments:**
 
-    - `model`: the model that was fitted, whose readings may be padded.
+    - `model`: the model that was fitted, whose recordings may be padded with masked
+      readings.
     - `best`: the best point, with the errors at this point and their derivatives.
     - `noise`: the standard deviations of the errors of each sensor.
     - `attempts`: the ends of the searches from all starts.
@@ -432,8 +434,10 @@ def assess(
     limits = flat_limit.distances_from_flat_bodies(
         model, numbers, -white.determined @ linear.misfit_gradient, [n for n, _ in of]
     )
-    # In a long curved valley the steps of a search stay short, although the misfit can hardly fall
-    # any more. The search has then ended if the minimum of the linearised problem is near.
+    # A search has ended if it converged, or if the minimum of the linearised problem is near: in a
+    # long curved valley the steps of a search stay short, although the misfit can hardly fall any
+    # more. If a body would be unreal at this minimum (`limit.free` is negative), the distance to
+    # the minimum is measured with the flatness of the body held constant.
     held = [limit.slope for limit in limits if limit.free < 0]
     near_end = AT_THE_END
     if count := count_of_errors_if_unit_noise(model):
@@ -441,9 +445,10 @@ def assess(
     done = bool(best.converged) or uncertainty.distance_to_minimum(linear, white, held) < near_end
     chi2, dof, explanation, left = goodness_of_fit(model, noise, linear, times, white.determined)
     believable = explanation.word != FAILS
-    # A start fits as well as the best one if its log-likelihood is at most ten lower. If some noise
-    # is estimated, the cost is measured in mean squared residuals at the best point. Autocorrelated
-    # errors count as fewer independent errors, which makes the margin of the cost larger.
+    # A start fits as well as the best one if its log-likelihood is at most ten lower, so that its
+    # cost (half the sum of squared residuals) is at most `margin` higher. If some noise is not
+    # known, the mean squared residual at the best point is the unit of the cost. Autocorrelated
+    # errors count as fewer independent errors, which makes `margin` larger.
     guessed = not all(r.has_known_noise and not has_unit_noise(r) for r in model.records.readings)
     unit = 2 * best_cost / model.records.size if guessed else 1.0
     margin = 10.0 * unit * max(times.longest_span, 1.0)

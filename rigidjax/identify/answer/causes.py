@@ -60,13 +60,15 @@ ATTITUDES = {
 
 
 def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None) -> Cause | None:
-    """Return the mistake with which the gyro or the attitudes of one body were read from a file.
+    """Return the likely mistake with which the gyro or the attitudes of one body were read from a
+    file, such as a wrong unit, a mirrored axis, or a quaternion with its scalar last.
 
-    The result is `None` if no mistake is likely. The rates of the gyro are compared with the rates
-    between successive attitudes. Without attitudes the rates are inserted in Euler's equations with
-    the inertia that fits best, and a correction is accepted only if this inertia is that of a real
-    body. A mirrored axis then shows only under a torque: free motion with a mirrored axis is a free
-    motion, too.
+    The result is `None` if no mistake is likely. Each possible mistake has a correction of the
+    rates or attitudes, which is tried on the recordings. The rates of the gyro are compared with
+    the rates between successive attitudes. Without attitudes the rates are inserted in Euler's
+    equations with the inertia that fits best, and a correction is accepted only if a real body can
+    have this inertia. A mirrored axis then shows only under a torque: free motion with a mirrored
+    axis is a free motion, too.
 
     **Arguments:** `recordings` are the recordings of one body; `torque` is the torque of the model.
     """
@@ -74,8 +76,8 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None
     if not gyros:
         return None
     turn, scale = (getattr(gyros[0].sensor, name) for name in ("mounting", "scale"))
-    # A user who gives a large mounting turn, or a scale far from 1, has considered the axes and the
-    # units of the sensor.
+    # Look for no mistake if the user gave a large mounting turn, or a scale far from 1: this user
+    # has considered the axes and the units of the sensor.
     if turn is not None and np.abs(turn).max() >= 0.1:
         return None
     if scale is not None and np.abs(np.asarray(scale) - 1).max() >= 0.1:
@@ -91,8 +93,9 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None
             ratios[name] = _relative_rate_difference(recordings, changed, _SAME)
     elif depends_on_rate_only(torque):
         bound, margin = _euler_residual_and_tensor_margin(recordings, torque, _SAME)
-        # Sensor errors alone can make the body that fits best slightly unreal, but they cannot move
-        # it far away from real bodies.
+        # The body that fits the uncorrected rates best may be unreal. Sensor errors alone can make
+        # it slightly unreal, but not as far as a margin of −0.8. The file was then misread, and a
+        # correction is believed even if it does not make the residual smaller.
         bound *= BETTER if margin > -0.8 else EQUAL
         fits = {
             name: _euler_residual_and_tensor_margin(recordings, torque, turn)
@@ -102,7 +105,9 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None
             fits["the torque with the other sign"] = _euler_residual_and_tensor_margin(
                 recordings, torque, _SAME, -1.0
             )
-        # A margin near 1 belongs to a ball: any constant rate is a free motion of a ball.
+        # A correction is believed only if the body that fits best is real (a margin not below
+        # zero) and no ball (a margin near 1): any constant rate is a free motion of a ball, so that
+        # a ball is no evidence for a correction.
         ratios = {name: left if -0.01 < m < 0.8 else np.inf for name, (left, m) in fits.items()}
     else:
         return None
@@ -136,7 +141,7 @@ def _euler_residual_and_tensor_margin(
     - `torque`: the torque on the body, or `None`.
     - `correction`: (3, 3) the matrix by which the recorded rates are multiplied, to try a
       permutation or a mirror of the axes, or another unit.
-    - `sign`: the factor by which the torque is multiplied.
+    - `sign`: the factor by which the torque is multiplied; −1 tries a torque whose sign was wrong.
     """
     balances = [
         integrated_euler_equations(recording, torque, correction) for recording in recordings
@@ -266,8 +271,8 @@ def time_stamp_cause(model: Model, noise: Noise, linear: Linearisation, index: i
         return None
     along = np.sum(np.sum(error * slope, axis=-1)[moving] ** 2 / moved[moving])
     channels = np.sum(error[kept] ** 2, axis=0)
-    # Random errors that are as large in each channel as the errors have this fraction of their sum
-    # of squares along dy/dt by chance.
+    # Random errors lie along dy/dt, too, by chance. If they are as large in each channel as the
+    # errors of the fit, `chance` is the expected fraction of their sum of squares along dy/dt.
     ways = np.mean(slope[moving] ** 2 / moved[moving][:, None], axis=0)
     chance, share = float(ways @ channels / channels.sum()), float(along / channels.sum())
     if not share > chance + 0.5 * (1.0 - chance) + 1.0 / np.sqrt(moving.sum()):

@@ -74,7 +74,7 @@ def fit(
     progress: Callable[[str], Any] | None = None,
 ) -> Fit:
     """Fit the free numbers of a model to its recordings: the body, the initial states and all
-    `Free`s.
+    `Free`s (numbers of torques or sensors that the fit may move).
 
     **Arguments:**
 
@@ -318,8 +318,9 @@ def _search_from_each(
     """
     like, print_of = Attempt(points[0]), ""
     if checkpoint is not None:
-        # Put the costs in the fingerprint, too: without the costs the fingerprint would be the same
-        # for two different torque functions with one name.
+        # The fingerprint tells whether a checkpoint belongs to this model and these starts. It
+        # contains the costs at the starts, too: without them it would be the same for two different
+        # torque functions with one name.
         costs = [cost_of(task.model, point, task.noise) for point in points]
         print_of = fingerprint(points, task, costs)
     keep = Checkpoint(checkpoint, like, print_of)
@@ -421,9 +422,10 @@ def _converged_integrator(
             break
         steps, errors = finer, exact
         if apart <= 8 * _MATTERS:
-            # The integration errors fall by more than a factor of 8 with twice as many steps of a
-            # method of order 4, and with a hundredth of the tolerance: this integrator is accurate
-            # enough, and no further comparison is needed.
+            # The errors of `finer` are below an eighth of `apart`, because integration errors fall
+            # by more than a factor of 8 with twice as many steps of a method of order 4, and with a
+            # hundredth of the tolerance. So `finer` is accurate enough, and is not compared with
+            # still shorter steps.
             break
     else:
         if apart > _MATTERS:

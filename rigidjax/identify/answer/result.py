@@ -74,10 +74,12 @@ class Fit(eqx.Module):
       or `does not explain the readings`.
     - `left`: the indices of the sensors whose errors the model does not explain.
     - `limits`: for each body with free moments its distance from a flat body, whose principal
-      moments are I1 + I2 = I3.
-    - `near`: (n,) the free numbers of a slightly thicker body, at which derivatives are taken if a
-      body is flat at x; else `None`.
-    - `freedom`: the numbers from which the degrees of freedom of a variance are computed.
+      moments are I1 + I2 = I3. No real body lies beyond this limit.
+    - `near`: if a body is flat at x, the free numbers (n,) of a slightly thicker body, at which
+      derivatives are taken, because the derivative of the thickness is zero at a flat body; else
+      `None`.
+    - `freedom`: the numbers from which the degrees of freedom of the variance of any quantity are
+      computed; `None` takes them as infinite.
     - `linear`: the errors and their derivatives at the best point, from which the covariance and
       the answers are computed.
     - `considered`: the sensor errors that the covariance allows for by a `Tolerance`.
@@ -119,7 +121,8 @@ class Fit(eqx.Module):
 
     @property
     def status(self) -> str:
-        """Return the answers on the search and on the model in one line.
+        """Return the two answers of this fit in one line: `search` (did the search find the best
+        point?) and `explanation` (does the model explain the readings?).
 
         The line is `ok` if the search found the best point, the model explains the readings, and
         neither answer has a reason.
@@ -128,24 +131,25 @@ class Fit(eqx.Module):
 
     @property
     def ok(self) -> bool:
-        """Return whether the `status` is `ok`.
+        """Return whether the `status` of this fit is `ok`.
 
-        The search has then converged, the model explains the data, and no other motion fits as
-        well.
+        If it is, the search has converged, the model explains the readings, and no other motion
+        fits as well.
         """
         return self.status == "ok"
 
     @property
     def derivative_point(self) -> Float[Array, " n"]:
-        """Return the free numbers at which derivatives are taken.
+        """Return the free numbers (n,) at which the derivatives of this fit are taken.
 
-        They are the field `near` (a slightly thicker body) if a body is flat, else the field `x`.
+        They are the best point x. But if a body is flat at x (I1 + I2 = I3), they are the field
+        `near`, which describes a slightly thicker body.
         """
         return self.x if self.near is None else self.near
 
     @property
     def causes(self) -> tuple[Cause, ...]:
-        """Return the most likely causes of the errors that the model does not explain.
+        """Return the most likely causes of the errors of this fit that the model does not explain.
 
         The tuple is empty if the readings show no cause. Each cause has the fields `name`,
         `sensor`, `share`, `words` and `remedy`.
@@ -156,7 +160,9 @@ class Fit(eqx.Module):
 
     @property
     def advice(self) -> str:
-        """Return words that say whether the intervals can be trusted, and what to try."""
+        """Return words that say whether the intervals of this fit can be trusted, and what to
+        try.
+        """
         # Do not use χ² under a robust loss: outliers would dominate χ².
         error_ratio = np.sqrt(self.chi2 / self.dof) if self.model.loss is None else 1.0
         return answers.advice_on_intervals(
@@ -174,8 +180,8 @@ class Fit(eqx.Module):
         return f"{report.table(report.rows(self))}\n\n{report.verdict(self)}"
 
     def _repr_html_(self) -> str:
-        """Return HTML with the status, the quantities and the verdict of the fit, which a notebook
-        shows.
+        """Return HTML that a notebook shows for this fit: the status, a table of the quantities,
+        and the verdict, which says in words whether the fit can be trusted, and what to try.
         """
         from rigidjax.identify import report
 
@@ -185,25 +191,34 @@ class Fit(eqx.Module):
     def body(self) -> Any:
         """Return the fitted body, or a dict of name → body for several bodies.
 
-        The `scale` of a body is "arbitrary" if its chart has no scale, such as a chart of ratios.
+        The field `scale` of a body is "arbitrary" if the fit finds its inertia only up to a factor.
+        This happens if the chart, which maps free numbers to the body, describes ratios of moments.
         """
         return self.model.bodies(self.x)
 
     @property
     def state0(self) -> Any:
-        """Return the state at the first time; for several recordings it has a leading axis."""
+        """Return the fitted state of the body at the first time of the recording.
+
+        For several recordings the state has a leading axis.
+        """
         return self.model.unpack(self.x).state0
 
     @property
     def values(self) -> dict[str, Array]:
-        """Return a dict of name → value with the value of each `Free`, in its own unit."""
+        """Return a dict of name → fitted value with one entry for each `Free` (a number of a torque
+        or sensor that the fit may move), in the unit of this number.
+        """
         return self.model.values(self.x)
 
     @property
     def spreads(self) -> dict[str, Array]:
-        """Return a dict of name → spread for each `Free` that has a spread, given or estimated.
+        """Return a dict of name → spread for each `Free` (a number that the fit may move) that has
+        a spread, given or estimated.
 
-        The spread is the standard deviation between recordings, in the unit of the `Free`.
+        A `Free` with a spread has another value in each recording. The spread is the standard
+        deviation of these values about the value that the recordings share, in the unit of the
+        `Free`.
         """
         slots = self.model.slots
         return {s.name: s.spread * s.scale for s in slots if s.spread is not None}
@@ -324,7 +339,8 @@ class Fit(eqx.Module):
     def degrees_of_freedom(self, slope: np.ndarray) -> np.ndarray:
         """Return the degrees of freedom (…,) of the variance of each of several functions.
 
-        `slope` (…, n) holds the derivative of each function with respect to the n free numbers.
+        `slope` (…, n) holds the derivative of each function with respect to the n free numbers of
+        this fit. The result is infinite if the field `freedom` is `None`.
         """
         return (
             np.full(slope.shape[:-1], np.inf)
@@ -334,16 +350,17 @@ class Fit(eqx.Module):
 
     @property
     def undetermined_combinations(self) -> tuple[Combination, ...]:
-        """Return the combinations of numbers that the data do not determine at all.
+        """Return the combinations of numbers that the data of this fit do not determine at all.
 
-        The tuple is empty if the data determine all numbers. Each combination has the members
+        A combination is a set of numbers that may change together without changing a reading. The
+        tuple is empty if the data determine all numbers. Each combination has the members
         `names`, `changes` and `in_words`.
         """
         return undetermined_combinations(self)
 
     @property
     def identifiability(self) -> tuple[str, ...]:
-        """Describe which quantities the data determine well, weakly, and not at all."""
+        """Describe which quantities the data of this fit determine well, weakly, and not at all."""
         return undetermined.describe_identifiability(self)
 
 

@@ -133,8 +133,9 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
     )
     first, turns = len(names_units_and_signs(fit.model)), 3 * fit.model.count
     for other in (1, 0):
-        # First leave out the changes of attitude about the axes of the body, then those about the
-        # axes of the world.
+        # Compute the combinations twice, with changes of attitude about the axes of the world and
+        # about the axes of the body: first leave out the rows of the body's axes, then the rows of
+        # the world's axes. The combinations with fewer numbers are kept.
         begin = first + 6 * many + other * turns
         rows = np.delete(np.arange(len(names)), slice(begin, begin + turns))
         here, slope = [names[row] for row in rows], slopes[rows]
@@ -310,8 +311,9 @@ def _mask_of_reported_numbers(fit: "Fit", names: list[str], changes: np.ndarray)
     rows = bodies_at(fit.model, fit.derivative_point)
     mask = np.ones(len(names), bool)
     for (where, chart), body in zip(name_suffixes_and_charts(fit.model), rows, strict=True):
-        # A chart may report the components of the tensor as well. Of several entries with one name,
-        # the last entry is the one that `_slopes_and_values_for_report` adds.
+        # A name of a tensor component may occur twice in `names`: a chart, which maps free numbers
+        # to a body, may report the components, and `_slopes_and_values_for_report` adds them in any
+        # case. The last entry with the name is the one that this function adds.
         every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]
         places = [some[-1] for some in every]
         mask[[i for some in every for i in some]] = False

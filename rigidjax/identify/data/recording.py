@@ -47,7 +47,9 @@ class Reading(eqx.Module):
 
     @property
     def host_mask(self) -> np.ndarray:
-        """Return `mask` as a NumPy array, for work outside of `jit`."""
+        """Return the field `mask`, true where there is a reading, as a NumPy array, for work
+        outside of `jit`.
+        """
         return np.asarray(self.mask)
 
     @property
@@ -200,7 +202,7 @@ class Recording(eqx.Module):
 
     @property
     def sensors(self) -> tuple[AbstractSensor, ...]:
-        """Return the sensors, in the order of the readings."""
+        """Return the sensors of this recording, in the order of its readings."""
         return tuple(reading.sensor for reading in self.readings)
 
 

@@ -148,12 +148,14 @@ def _rotation_vectors_between(first: ArrayLike, last: ArrayLike) -> Array:
 class ReferenceStates(eqx.Module):
     """Hold the reference state of a recording.
 
-    The free numbers of the initial state are changes of the reference state.
+    A fit finds the initial state of the recording as a change of the reference state: the free
+    numbers of the initial state are zero at the reference state.
 
     **Fields:**
 
-    - `state`: the reference state, a `Spin`, `Attitude` or `Rigid`.
-    - `rate`: the typical body rate, rad/s.
+    - `state`: the reference state, of the type of the states of the model: `Spin` (body rate),
+      `Attitude` (attitude and body rate) or `Rigid` (with position and velocity, too).
+    - `rate`: the typical body rate of the motion, rad/s.
     - `units`: (n,) for each free number of the initial state the change of the state if the number
       is one. The whole change of the state is `units` times the free numbers.
 
@@ -176,11 +178,12 @@ class ReferenceStates(eqx.Module):
 def reference_states_of(recordings: Sequence[Recording], state_type: type) -> ReferenceStates:
     """Return the reference state of each recording, found from its first readings.
 
-    The free numbers of an initial state are changes of the reference state. The body rate of each
-    reference state is zero.
+    A fit finds the initial state of a recording as a change of its reference state. The body rate
+    of each reference state is zero.
 
     - `recordings`: R recordings; the result has a leading axis (R,).
-    - `state_type`: the type of the states: `Spin`, `Attitude` or `Rigid`.
+    - `state_type`: the type of the states: `Spin` (body rate), `Attitude` (attitude and body rate)
+      or `Rigid` (with position and velocity, too).
     """
     turns = [[*attitudes(r)[1], np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
     places = [_first_motion_and_typical_length(r) for r in recordings]

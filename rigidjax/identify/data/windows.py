@@ -56,8 +56,9 @@ def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"])
     """Return the mean sizes of the `errors` of predictions over all windows, as functions of the
     horizon (the number of steps from the start of a window).
 
-    - `starts`: a `Spin`, `Attitude` or `Rigid` with a leading axis, whose type names the parts of
-      an error vector.
+    - `starts`: the states at the starts of the windows, with a leading axis (N,). Their type tells
+      of which parts an error vector consists: a `Spin` is a body rate, an `Attitude` an attitude
+      and a body rate, and a `Rigid` has a position and a velocity, too.
     - `errors`: (N, L, n) the error vector for each of N windows and L steps.
     """
     by_kind = parts_by_name(jax.tree.map(lambda leaf: leaf[0], starts), errors)
@@ -157,7 +158,8 @@ class Windows(eqx.Module):
         sensor = StateSensor(kind, noise, unknown)  # pyright: ignore[reportCallIssue]
         values = jnp.asarray(np.concatenate(rows, axis=-1))
         reading = Reading(sensor, values, jnp.asarray(mask))
-        # A recording has as many samples as times; the sample at the last time is not used.
+        # A window of L steps has L + 1 times, but L input samples from its start on. A recording
+        # needs a sample for each time: repeat the last sample, which is not used at the last time.
         inputs = {name: np.asarray(rows) for name, rows in self.inputs.items()}
         inputs = {
             name: jnp.asarray(np.concatenate([rows, rows[:, -1:]], axis=1))
@@ -227,7 +229,8 @@ def windows(
 
     - `t`: (T,) evenly spaced times, s. Some samples may be missing. A window with its `before`
       input samples never reaches across a missing sample.
-    - `states`: a `Spin`, `Attitude` or `Rigid` with a leading axis (T,).
+    - `states`: the measured states with a leading axis (T,), in one `Spin` (body rates), `Attitude`
+      (attitudes and body rates) or `Rigid` (positions and velocities, too).
     - `inputs`: a dict of name → samples (T, *k), for each `rigidjax.torques.Input` of a torque.
       Each sample is held until the next one.
     - `length`: the number of steps of a window.
@@ -242,7 +245,7 @@ def windows(
       `starts` is given, `noise` must be given, too.
 
     **Raises:** `ValueError` for shapes that do not agree, NaN, uneven times, or a record without a
-    window of this length; `TypeError` for other states.
+    window of this length; `TypeError` for states of another type.
 
     >>> t = np.arange(6.0)
     >>> windows(t, Spin(np.ones((6, 3))), length=2, stride=2).count
@@ -341,7 +344,7 @@ def _require_finite_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str,
     An input is a logged quantity such as a motor command.
 
     - `times`: (T,) the times, s.
-    - `states`: a `Spin`, `Attitude` or `Rigid` with a leading axis (T,).
+    - `states`: the states with a leading axis (T,), in one `Spin`, `Attitude` or `Rigid`.
     - `inputs`: a dict of name → samples (T, *k), each sample an array of shape k.
     """
     rows = dict(zip(leaf_names(states), jax.tree.leaves(states), strict=True))
@@ -443,10 +446,11 @@ def window_starts_weights_and_stretches(
 
     Three things are returned:
 
-    - The starts of the N `windows` as `ReferenceStates`.
-    - The weights (N, m) of the m free numbers of each start, or `None` if the starts are known. The
-      weight of a free number is the change of the start if this number is one, divided by the
-      standard deviation of the start.
+    - The measured starts of the N `windows` as `ReferenceStates`. A fit finds the true start of a
+      window as a change of the measured start.
+    - The weights (N, m) of the m free numbers of each start, or `None` if the measured starts are
+      taken as exact. The weight of a free number is the change of the start if this number is one,
+      divided by the standard deviation of the measured start.
     - The index (N,) of the stretch of each window. The windows, in their order, are divided into at
       most `stretches` stretches.
     """

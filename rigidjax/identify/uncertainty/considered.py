@@ -31,12 +31,16 @@ _OFF_DIAGONAL = [(i, j) for i in range(3) for j in range(3) if i != j]
 
 
 class Consideration(eqx.Module):
-    """Hold an error that a sensor may have, and its effect on a fit.
+    """Hold a constant error that a sensor may have, and its effect on a fit.
+
+    The fit does not estimate the error, but its intervals allow for it. A `Tolerance` of the sensor
+    gives the standard deviation of the error.
 
     **Fields:**
 
     - `sensor`: the index of the sensor.
-    - `kind`: the name of the error, a field of `Tolerance`.
+    - `kind`: the name of the error, which is the name of a field of `Tolerance`: "scale",
+      "cross_axis", "bias" or "clock".
     - `deviation`: the standard deviation of the error.
     - `shifts`: (n, c) for each of c independent components of the error the changes of the n free
       numbers if this component is one standard deviation. The components are three scales, six
@@ -139,7 +143,7 @@ def shifts_by_unit_errors(
     """
     direction = _reading_changes_by_unit_errors(model, linear, sensor_index, error_kind)
     jitter_error = model.records.readings[sensor_index].jitter_error
-    # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
+    # Make NumPy arrays: single operations of JAX are slow outside of a compiled program.
     scaled = np.asarray(
         standardised_error_changes(direction, np.asarray(noise[sensor_index]), jitter_error)
     )

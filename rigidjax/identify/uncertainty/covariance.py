@@ -73,7 +73,7 @@ class Linearisation(eqx.Module):
 
     @property
     def free_count(self) -> int:
-        """Return the number n of free numbers."""
+        """Return the number n of free numbers of the linearised model."""
         return int(self.extra_slopes.shape[-1])
 
     def first_times(self, count: int) -> "Linearisation":
@@ -256,22 +256,24 @@ class Root(eqx.Module):
 
     A root of a matrix A is a matrix B with B Bᵀ = A. An own number of a recording is a free number
     on which no other recording depends, and which no prior ties to another recording. All other
-    free numbers are called shared.
+    free numbers are called shared; their number is s.
 
     **Fields:**
 
-    - `size`: (n,) the factor by which each number is multiplied, to make it of order one. All other
-      fields are for the multiplied numbers.
+    - `size`: (n,) the factor by which each number is multiplied, so that the derivatives with
+      respect to it are of order one. All other fields are for the multiplied numbers.
     - `lift`: (n, s) how all n numbers change with the s shared numbers, if the own numbers of each
       recording take the values with the least misfit.
-    - `core`: (s, r) a root of the covariance of the shared numbers.
+    - `core`: (s, r) a root of the covariance of the shared numbers, of which the data determine r
+      combinations.
     - `own`: for each recording three things:
         - the indices (k,) of its own numbers among all n numbers;
-        - a root (k, j) of the covariance of the own numbers for known shared numbers;
+        - a root (k, j) of the covariance of the own numbers for known shared numbers, of which the
+          data determine j combinations;
         - the derivatives (p, k + s), with respect to the own and the shared numbers, of the p
           residuals of priors that depend on own numbers.
     - `ties`: (q, s) the derivatives of the residuals of priors that depend on shared numbers only.
-    - `null`: (i, n) orthonormal directions that the data do not determine.
+    - `null`: (i, n) the i directions, orthonormal, that the data do not determine.
     """
 
     size: np.ndarray
@@ -291,7 +293,8 @@ class Root(eqx.Module):
 
         **Arguments:**
 
-        - `rows`: (R, q, m) rows for the m numbers of each recording.
+        - `rows`: (R, q, m) for each recording q rows with an entry for each of its m numbers, such
+          as the gradient of its misfit (q = 1).
         - `places`: (R, m) the indices of these numbers among all n numbers.
         - `middle`: (R, q, q) the matrix between the rows of each recording.
         """
@@ -316,8 +319,8 @@ class Root(eqx.Module):
 
     @property
     def covariance(self) -> np.ndarray:
-        """Return the covariance (n, n) for white errors, within the directions that the data
-        determine.
+        """Return the covariance (n, n) of the free numbers for white errors, computed from this
+        root, within the directions that the data determine.
         """
         half = self.lift @ self.core
         out = half @ half.T
@@ -360,8 +363,8 @@ class Covariance(eqx.Module):
     - `singular_values`: (n,) the singular values of the weighted Jacobian with columns of length
       one.
     - `null_directions`: (k, n) the directions that the data do not determine.
-    - `root`: a root of the covariance for white errors. It is `None` if the motion is not finite;
-      both covariances are NaN then.
+    - `root`: the covariance for white errors as a product B Bᵀ; the `Root` holds B, recording by
+      recording. It is `None` if the motion is not finite; both covariances are NaN then.
     """
 
     covariance: np.ndarray
@@ -387,8 +390,9 @@ def white_covariance(linear: Linearisation) -> Covariance:
         return Covariance(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)), None)
     triangles, owner = np.linalg.qr(dense, mode="r"), _only_dependent_recordings(linear)
     shared = np.flatnonzero(owner < 0)
-    # Columns are scaled to order one, so that a bias in rad/s does not look undetermined next to a
-    # moment of inertia. The lower bound of the size keeps round-off from being scaled up.
+    # Divide the columns of the Jacobian by their lengths (`size`), so that a bias in rad/s does not
+    # look undetermined next to a moment of inertia. The lower bound of `size` keeps columns of mere
+    # round-off from being scaled up.
     squares = np.bincount(linear.places.ravel(), np.sum(triangles**2, axis=1).ravel(), n + 1)[:n]
     size = np.sqrt(squares + linear.prior_weights**2 + np.sum(linear.extra_slopes**2, axis=0))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-150))
@@ -397,8 +401,8 @@ def white_covariance(linear: Linearisation) -> Covariance:
     lift = np.zeros((n, shared.size))
     lift[shared, np.arange(shared.size)] = 1.0
     ties = np.concatenate([np.diag(prior[shared]), extra[of < 0][:, shared]])
-    # Recordings without numbers of their own, such as windows with known starts, have nothing to
-    # eliminate: a loop over a thousand such recordings took most of the time.
+    # Take all recordings without own numbers together, such as windows with known starts: they have
+    # nothing to eliminate, and a loop over a thousand such recordings took most of the time.
     all_shared = ~np.isin(np.arange(len(triangles)), owner)
     no_own = np.zeros(0, int), np.zeros((0, 0)), np.zeros((0, shared.size))
     rest, own, values, null = (
@@ -627,16 +631,18 @@ def _sandwich_covariance(
     meats = [grown * _correlated_information(*channels, span) for span in spans]
     estimates = [root.sandwich_covariance(triangles, linear.places, meat) for meat in meats]
     if records > n // 2 and records > 5:
-        # The scatter between many recordings gives the variance without a model of the errors.
+        # The scatter of the gradients of the misfit between many recordings gives the variance
+        # without a model of how the errors are correlated. The factor R/(R − 1), for R recordings,
+        # is the usual one for a variance estimated from R samples.
         between = np.full((records, 1, 1), records / (records - 1))
         estimates.append(
             root.sandwich_covariance(
                 linear.misfit_gradients_by_recording[:, None], linear.places, between
             )
         )
-    # Take the estimate with the largest variances on average. Scale it up for each number whose
-    # variance is larger in one of the other estimates, of which the covariance for white errors is
-    # one.
+    # Take the estimate whose variances are largest on average, relative to those for white errors.
+    # Scale it up for each number that has a larger variance in another estimate; the covariance for
+    # white errors counts as an estimate, too.
     all_ = np.stack([np.diag(white.determined), *(np.diag(c) for c in estimates)])
     least = np.maximum(all_[0], 1e-300)
     out = estimates[int(np.argmax((all_[1:] / least).mean(axis=1)))]

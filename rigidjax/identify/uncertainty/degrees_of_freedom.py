@@ -18,16 +18,16 @@ class Freedom(eqx.Module):
     """Hold the numbers from which the degrees of freedom of the variance of any function of the
     free numbers are computed.
 
-    A width is the estimated `spread` of a `Free`: the standard deviation of the values of single
-    recordings about the value that the recordings share.
+    A `Free` is a number that the fit may move. A width is the estimated `spread` of a `Free`: the
+    standard deviation of its values in single recordings about the value that the recordings share.
 
     **Fields:**
 
     - `covariance`: (n, n) the covariance of the n free numbers, for white errors.
     - `places`: (R, m) the indices, among the free numbers, of the m numbers of each of R
       recordings.
-    - `groups`: (R,) the index of the group of each recording. The recordings of a group share their
-      noise.
+    - `groups`: (R,) the index of the group of each recording. In the recordings of one group a
+      sensor has the same standard deviation of its noise.
     - `blocks`: for each sensor the information matrices (R, m, m) of its readings.
     - `left`: for each sensor the degrees of freedom (G,) of its noise in each of G groups: the
       number of its independent errors minus the number of free numbers that these errors determine.
@@ -65,9 +65,10 @@ class Freedom(eqx.Module):
         several functions.
 
         The variance of a function is a sum of parts: one for the noise of each sensor in each group
-        of recordings, and one for each estimated `spread` of a `Free`. The degrees of freedom of
-        the sum follow from the fraction of each part and from its degrees of freedom (Satterthwaite
-        1946, doi:10.2307/3002019). If every noise has more than `PLENTY` degrees of freedom, the
+        of recordings, and one for each estimated `spread` of a `Free` (the scatter, between
+        recordings, of a number that the fit may move). The degrees of freedom of the sum follow
+        from the fraction of each part and from its degrees of freedom (Satterthwaite 1946,
+        doi:10.2307/3002019). If every noise has more than `PLENTY` degrees of freedom, the
         fractions of single noises are not computed: the smallest number of degrees is used for all
         noises. The argument `slope` (…, n) holds the derivative of each function with respect to
         the n free numbers.
@@ -113,7 +114,8 @@ def prepare_degrees_of_freedom(
     """
     groups, left, blocks = np.asarray(model.noise_groups), [], linear.information_by_sensor
     if model.clusters is not None:
-        # The variances of a fit of windows come only from the scatter between stretches of windows.
+        # The variances of a fit of windows come only from the scatter between C stretches (runs of
+        # neighbouring windows), so that they have C − 1 degrees of freedom.
         degrees = np.array([max(float(np.max(np.asarray(model.clusters))), 1.0)])
         none = np.zeros_like(groups)
         return Freedom(covariance, linear.places, none, blocks[:1], (degrees,), (), considered)

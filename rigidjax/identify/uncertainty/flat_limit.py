@@ -47,8 +47,8 @@ class Limit(eqx.Module):
     slope: np.ndarray
 
     def flatness_deviation(self, covariance: np.ndarray) -> float:
-        """Return the standard deviation of the flatness, or NaN if the variance of the flatness is
-        negative.
+        """Return the standard deviation of the flatness `(I1 + I2 − I3) / I3` of this body, or NaN
+        if the variance of the flatness is negative.
 
         The argument `covariance` (n, n) is the covariance of the n free numbers.
         """
@@ -56,20 +56,22 @@ class Limit(eqx.Module):
             return float(np.sqrt(self.slope @ covariance @ self.slope))
 
     def flatness_upper_bound(self, covariance: np.ndarray) -> float:
-        """Return the one-sided 95 % upper bound of the flatness.
+        """Return the one-sided 95 % upper bound of the flatness `(I1 + I2 − I3) / I3` of this body.
 
-        The bound is `z + √((1.645 σ)² + min(z, 0)²)`, where z is the field `free`, and σ is the
-        standard deviation of the flatness. The argument `covariance` (n, n) is the covariance of
-        the n free numbers.
+        The bound is `z + √((1.645 σ)² + min(z, 0)²)`, where z is the field `free` (the flatness at
+        the minimum of the linearised model, or at the best point if it is smaller there), and σ is
+        the standard deviation of the flatness. The argument `covariance` (n, n) is the covariance
+        of the n free numbers.
         """
         wide = self.flatness_deviation(covariance)
         return self.free + float(np.hypot(ONE_SIDED * wide, min(self.free, 0.0)))
 
     def is_flat_within(self, covariance: np.ndarray, deviations: float) -> bool:
-        """Return whether a flat body lies within this number of standard `deviations` of the best
-        point.
+        """Return whether the data allow that this body is flat (I1 + I2 = I3).
 
-        The argument `covariance` (n, n) is the covariance of the n free numbers.
+        They do if the field `free` (the flatness at the minimum of the linearised model, or at the
+        best point if it is smaller there) is less than `deviations` standard deviations of the
+        flatness. The argument `covariance` (n, n) is the covariance of the n free numbers.
         """
         return bool(self.free < deviations * self.flatness_deviation(covariance))
 
@@ -139,8 +141,8 @@ def _compiled_bodies(model: Model, x: Float[Array, " n"]) -> list[Any]:
     The bodies are in the order of the model's charts. A chart is the parametrisation of one body by
     free numbers.
     """
-    # Compile one program: outside of a trace each operation of JAX takes as long as a run of 100
-    # steps.
+    # Compile one program for all bodies: single operations of JAX are slow outside of a compiled
+    # program.
     return bodies_as_list(model.bodies(x))
 
 
@@ -159,7 +161,7 @@ def _numbers_of_thicker_body(
       this chart.
     - `body`: the body that may be flat.
     """
-    # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
+    # Use NumPy: single operations of JAX are slow outside of a compiled program.
     if isinstance(body, MassProperties):
         second = np.asarray(body.second_moment)
     else:
@@ -181,8 +183,8 @@ def _is_bounded_by_flat_bodies(chart: AbstractBodyChart) -> bool:
     """Return whether flat bodies are the limit of the bodies that a `chart` can describe.
 
     A chart is a map from free numbers to a possible body. A flat body has the principal moments
-    `I1 + I2 = I3`. The result is true if the chart is one of this package and changes moments of
-    inertia, not the mass alone.
+    `I1 + I2 = I3`. The result is true if the chart is one of rigidjax, not of a user, and
+    changes moments of inertia, not the mass alone.
     """
     return type(chart).__module__ == AbstractBodyChart.__module__ and any(
         name != "mass" for name in chart.log_names
@@ -201,8 +203,9 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
         if not _is_bounded_by_flat_bodies(chart):
             out.append(jnp.ones((), x.dtype))
             continue
-        # The last logarithms belong to the three moments, or to the ratios of two moments to the
-        # third moment.
+        # `chart.logs` returns the logarithms of the positive numbers that a fit reports. The last
+        # ones belong to the three moments or, for a chart of ratios, to the ratios of two moments
+        # to the third moment; the logarithm 0 of the third ratio, which is one, is then added.
         logs = chart.logs(body)[-3:]
         logs = logs if logs.size == 3 else jnp.append(logs, 0.0)
         low, middle, high = jnp.sort(jnp.exp(logs - jnp.max(logs)))
@@ -243,8 +246,8 @@ def distances_from_flat_bodies(
 
 
 def why_unreal(body: PyTree) -> str | None:
-    """Return in words why the numbers of `body` are physically impossible; `None` if they are
-    possible.
+    """Return in words why the numbers of `body`, an `Inertia` or a `MassProperties`, are physically
+    impossible; `None` if they are possible.
     """
     try:
         if isinstance(body, MassProperties):
@@ -261,8 +264,8 @@ def describe_unreal_bodies(
 ) -> list[str]:
     """Return one line of text for each body that is physically impossible, with the reason.
 
-    Only bodies of charts that a user wrote are checked, since all points of the charts of this
-    package are possible bodies. **Arguments:** `charts` the name and the chart of each body;
+    Only bodies of charts that a user wrote are checked, since all points of the charts of rigidjax
+    are possible bodies. **Arguments:** `charts` the name and the chart of each body;
     `bodies` the bodies in the same order.
     """
     ours = AbstractBodyChart.__module__

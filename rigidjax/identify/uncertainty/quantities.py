@@ -54,11 +54,13 @@ class Quantity(eqx.Module):
     freedom: float = np.inf
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Return the low and the high end of the interval of the number.
+        """Return the low and the high end of the interval of this quantity.
 
-        The interval of a positive number is computed for its logarithm. An interval ends where a
-        body would be flat. If an end of the interval of a positive number differs from the value by
-        more than a factor of 1e3, the ends are 0 and the field `most` (infinity by default).
+        The interval of a positive quantity is computed for its logarithm. An interval ends where a
+        body would be flat (I1 + I2 = I3). If an end of the interval of a positive quantity differs
+        from the value by more than a factor of 1e3, the ends are 0 and the field `most`, the
+        largest value that a real body can have (infinity by default).
+
         **Arguments:** `level` the probability that the interval holds the true value. **Raises**
         `ValueError` for a level outside (0, 1).
         """
@@ -171,8 +173,8 @@ def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
     """Return the quantities (q,) that a fit reports, at the free numbers x (n,) of a `model`.
 
     They are, in the order of `names_units_and_signs`, the moments and other numbers of each body,
-    the initial body rates (rad/s), and the values of each `Free`. A positive quantity is given by
-    its logarithm.
+    the initial body rates (rad/s), and the values of each `Free` (a number of a torque or sensor
+    that the fit may move). A positive quantity is given by its logarithm.
     """
     parts, bodies = [jnp.zeros(0, x.dtype)], bodies_as_list(model.bodies(x))
     for (_, chart), body in zip(name_suffixes_and_charts(model), bodies, strict=True):

@@ -30,8 +30,8 @@ HANGS, FEWEST = 0.85, 6
 class Stretches(eqx.Module):
     """Hold the changes of a fit if one of its C stretches of windows is left out.
 
-    A stretch is a run of neighbouring windows. A shared number is a free number on which several
-    windows depend.
+    A window is a short part of a record, and a stretch is a run of neighbouring windows. A shared
+    number is a free number on which several windows depend.
 
     **Fields:**
 
@@ -47,10 +47,11 @@ class Stretches(eqx.Module):
 
     @property
     def directions_shown_by_one_stretch(self) -> Float[np.ndarray, "k n"]:
-        """Return the directions (k, n) of the n free numbers that only one stretch of windows
-        determines.
+        """Return the directions (k, n) of the n free numbers that only one stretch (a run of
+        neighbouring windows) determines.
 
-        The variance along them is not known, since it comes from the scatter between stretches.
+        The variance along these directions is not known: a fit of windows takes variances from the
+        scatter between stretches, and one stretch alone has no scatter.
         """
         return np.concatenate(self.null)
 
@@ -87,8 +88,8 @@ def leave_out_each_stretch(model: Model, linear: Linearisation) -> Stretches | N
         both = np.linalg.solve(inner, np.concatenate([sides, pull[..., None]], axis=2))
         gram = gram - sides.swapaxes(1, 2) @ both[..., :-1]
         slope = slope - np.einsum("rks,rk->rs", sides, both[..., -1])
-    # A free number may have one value for each group of windows. The same column then stands for
-    # another number in each group.
+    # A free number may have one value for each group of windows. One column of the derivatives then
+    # stands for another number in each group of windows: the indices in `linear.places` tell which.
     places, columns = np.unique(linear.places[:, shared], return_inverse=True)
     columns = columns.reshape(len(gram), shared.size)
     grams, slopes = np.zeros((count, places.size, places.size)), np.zeros((count, places.size))
@@ -97,9 +98,9 @@ def leave_out_each_stretch(model: Model, linear: Linearisation) -> Stretches | N
     known = np.diag(linear.prior_weights[places] ** 2)
     steps, null = np.zeros_like(slopes), []
     for k in range(count):
-        # The matrices of the other stretches are added up. If the matrix of this stretch were
-        # subtracted from the sum of all, round-off would remain in the directions that the other
-        # stretches do not determine.
+        # Add up the information matrices (`grams`) of all stretches but stretch k. If the matrix of
+        # stretch k were subtracted from the sum of all, round-off would remain in the directions
+        # that the other stretches do not determine.
         rest = np.delete(grams, k, axis=0).sum(axis=0) + known
         blind = np.eye(places.size)
         if rest.any():
