@@ -89,8 +89,8 @@ def advice_on_intervals(
     - `search`: the answer on the search, whose word says whether the search found the best point.
     - `model`: the answer on the model, whose word says whether the model explains the readings.
     - `causes`: the likely causes of the errors.
-    - `covariance_kind`: the method by which the covariance was computed, in words, such as
-      "jackknife: …".
+    - `covariance_kind`: the method by which the covariance was computed, in words that begin with
+      the name of the method, such as "Gauss–Newton" or "jackknife".
     - `error_ratio`: the size of the errors divided by the given noise of the sensors.
     - `allowance`: sentences on the sensor errors that the intervals allow for, as
       `describe_allowed_sensor_errors` returns them.

@@ -216,7 +216,7 @@ def _sums_of_squares_of_errors_readings_round_off(
 
     They are the sum of its squared errors; the sum of the squared differences of its readings from
     their mean; and 1e-12 times the sum of its squared readings. The last one is a bound of
-    round-off.
+    round-off: the other two sums count as zero if they are not larger.
 
     **Arguments:**
 
@@ -394,8 +394,7 @@ def assess(
 
     **Arguments:**
 
-    - `model`: the model that was fitted, whose recordings may be padded with masked
-      readings.
+    - `model`: the model that was fitted, whose recordings may be padded with masked readings.
     - `best`: the best point, with the errors at this point and their derivatives.
     - `noise`: the standard deviations of the errors of each sensor.
     - `attempts`: the ends of the searches from all starts.

@@ -30,11 +30,13 @@ from rigidjax.identify.uncertainty.considered import slope_in_time
 from rigidjax.identify.uncertainty.covariance import Linearisation
 from rigidjax.motion.torques.base import Torque
 
-# A correction of the recorded body rates is believed if two conditions hold: the error of the
-# corrected rates, by the attitudes or by Euler's equations, is less than BETTER times the error
-# without the correction; and it is less than LITTLE times the size of the whole signal.
+# A correction of the recorded body rates is believed if two conditions hold. The error of the
+# corrected rates, which is their difference from the rates between attitudes or the residual of
+# Euler's equations, is less than BETTER times the error without the correction. This error is also
+# less than LITTLE times the rates between attitudes or the angular momentum.
 BETTER, LITTLE = 0.5, 0.3
-# Several corrections cannot be told apart if the error of each is at most EQUAL times the least.
+# Several corrections cannot be told apart if the error with each of them is at most EQUAL times the
+# least error: all of them are then named.
 EQUAL = 1.1
 _SAME = np.eye(3)
 
@@ -94,8 +96,9 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None
     elif depends_on_rate_only(torque):
         bound, margin = _euler_residual_and_tensor_margin(recordings, torque, _SAME)
         # The body that fits the uncorrected rates best may be unreal. Sensor errors alone can make
-        # it slightly unreal, but not as far as a margin of −0.8. The file was then misread, and a
-        # correction is believed even if it does not make the residual smaller.
+        # it slightly unreal, but not as far as a margin of −0.8. With such a margin the file was
+        # misread, and a correction to a real body is believed even if it does not make the residual
+        # smaller.
         bound *= BETTER if margin > -0.8 else EQUAL
         fits = {
             name: _euler_residual_and_tensor_margin(recordings, torque, turn)
@@ -186,11 +189,13 @@ def _relative_rate_difference(
     return float(np.sqrt(left / size))
 
 
-# A cause is named if it explains more than the fraction ENOUGH of the squared errors, and at least
-# NEARLY times as much as the best cause.
+# The best cause is named if it explains more than the fraction ENOUGH of the squared errors. A
+# cause that explains at least NEARLY times as much as the best one is then named, too.
 ENOUGH, NEARLY = 0.7, 0.95
-# The direction of a cause has length one. All changes of the readings that the free numbers can
-# make are subtracted from it. It is dropped if the remainder is shorter than this number.
+# A cause changes the readings along one or more directions of length one. All changes of the
+# readings that the free numbers can make are subtracted from them. A combination of the remainders
+# is dropped if its singular value is at most this number, since the free numbers could make nearly
+# the same change.
 APART = 0.05
 # The causes in LINEAR change the readings in proportion to their size only if the size is below
 # SMALL.

@@ -80,8 +80,9 @@ def fit(
 
     - `model`: the readings and the free numbers.
     - `starts`: the number of starting points. The first one comes from a regression, all others are
-      scattered at random. The search from each point fits a quarter, a half and then the whole of
-      the record.
+      scattered at random. The search from each point fits the whole record. If this fit does not
+      explain the readings, the search fits a quarter, a half and then the whole of the record. A
+      model of windows (short parts of a record) is fitted to longer and longer beginnings of them.
     - `initial`: (n,) a starting point of your own, which is tried first.
     - `key`: the random key of the scattered starting points; without a key these points are the
       same at each call.
@@ -159,8 +160,9 @@ def fit(
         points += starting_points(model, starts - len(points), key)
     points, interrupts, rough = points[:starts], [], []
     if isinstance(padded.integrator, Adaptive):
-        # Choose the tolerance of the integrator before the search: integration errors would slow
-        # the search down. Another tolerance needs no new compilation.
+        # Choose the tolerance of the integrator at the first starting point, before the search,
+        # because integration errors would slow the search down. Another tolerance needs no new
+        # compilation.
         first = Attempt(points[0], blocks=errors_and_slopes(padded, points[0]))
         finer = _converged_integrator(first, task, rough)
         task = task if rough else task._replace(model=_with_integrator(padded, finer))
@@ -341,7 +343,7 @@ def _search_from_each(
             aim = aim if aim <= sufficient_misfit(task.model) else 0.0
             attempts.append(fit_in_stages(point, task, aim=aim, watch=watch))
             latest = like
-            # Only the best start keeps its derivatives, which need memory.
+            # Only the best search so far keeps its errors and their derivatives, which need memory.
             best = min(attempts, key=_finite_cost)
             attempts[:] = [one if one is best else without_arrays(one) for one in attempts]
             keep.save(attempts)

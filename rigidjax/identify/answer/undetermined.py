@@ -115,9 +115,9 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
     """Return the combinations of numbers that the data of a fit do not determine at all.
 
     Each combination is made of few numbers, and it has one number that no other combination has,
-    because the combinations are the rows of a reduced row echelon form. Changes of the initial
-    attitude are expressed about the axes of the world or about the axes of the body: the axes with
-    which the combinations contain fewer numbers.
+    because the combinations are the rows of a reduced row echelon form. A change of the initial
+    attitude is described by turns about the axes of the world or about the axes of the body. Those
+    axes are chosen with which the combinations contain fewer numbers.
     """
     null = np.asarray(fit.null_directions)
     if not null.size:

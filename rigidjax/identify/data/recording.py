@@ -163,12 +163,12 @@ class Recording(eqx.Module):
         within = np.maximum.accumulate(read) & np.maximum.accumulate(read[::-1])[::-1]
         used = read | (within & np.any([hidden for *_, hidden in rows], axis=0))
         if any(not callable(source) for source in self.inputs.values()):
-            # Each sample is held until the next one, so that every time of a sampled input is
-            # needed.
+            # Drop no time if an input is an array of samples: each sample is held until the next
+            # one, so that every sample is needed.
             used = np.ones(t.size, bool)
-        # The number of dropped times is only for reports; a fit does not use it.
+        # The attribute `dropped` is only for reports; a fit does not use it.
         self.dropped = int((~used).sum())
-        # A slice makes no copy of a long recording.
+        # If no time is dropped, index with a slice: it makes no copy of a long recording.
         kept = used if self.dropped else slice(None)
         self.t = jnp.asarray(t[kept])
         _require_distinct_times(t[kept], self.t.dtype)

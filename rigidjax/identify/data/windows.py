@@ -140,7 +140,8 @@ class Windows(eqx.Module):
         return jnp.asarray(np.repeat(np.where(each == 0, 1.0, each), 3))
 
     def records(self) -> Recording:
-        """Return the windows as recordings with a leading axis.
+        """Return the N windows as N recordings, in one `Recording` whose arrays have a leading axis
+        (N,).
 
         Each recording has one sensor, which reads the whole state. The first time of a recording is
         the start of the window. The reading at this time is masked, because predictions begin
@@ -170,7 +171,8 @@ class Windows(eqx.Module):
     def held_horizons(self) -> Horizons:
         """Return the errors of a prediction that the state stays constant in each window.
 
-        A model is of use only if its errors are smaller than these.
+        A model is of use only if its predictions have smaller errors than this prediction, which
+        needs no model.
         """
         return average_by_horizon(self.starts, constant_state_errors(self.starts, self.wanted))
 

@@ -528,14 +528,14 @@ def white_or_sandwich_covariance(
 
     Here H⁻¹ is the covariance for white errors, and M is `Jᵀ C J` plus the information of the
     priors, where J holds the derivatives of the errors and C is the covariance of the errors in
-    time. In each channel the second differences of the errors give the variance of a white part.
-    The remaining variance belongs to a part whose autocorrelation decays exponentially. The decay
-    time cannot be found well from the errors of a fit. Each number therefore gets the largest
-    variance over all decay times from two samples to half a record. The errors of a fit are smaller
-    than the true errors: `Jᵀ C J` is multiplied by n/(n − p) for n independent errors and p free
-    numbers. If there are many recordings, the scatter between recordings gives a second estimate of
-    the variance, and the larger estimate is used. Source: White 1980, doi:10.2307/1912934; Liang
-    and Zeger 1986, doi:10.1093/biomet/73.1.13.
+    time. In each channel (one component of a sensor) the second differences of the errors give the
+    variance of a white part. The remaining variance belongs to a part whose autocorrelation decays
+    exponentially. The decay time cannot be found well from the errors of a fit. Each number
+    therefore gets the largest variance over decay times from two samples to half a record. The
+    errors of a fit are smaller than the true errors: `Jᵀ C J` is multiplied by n/(n − p) for n
+    independent errors and p free numbers. If there are many recordings, the scatter between
+    recordings gives a second estimate of the variance, and the larger estimate is used. Source:
+    White 1980, doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
 
     **Arguments:**
 

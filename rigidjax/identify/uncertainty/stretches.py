@@ -22,8 +22,8 @@ from rigidjax.identify.uncertainty.covariance import (
 )
 from rigidjax.identify.uncertainty.quantities import names_units_and_signs
 
-# A quantity hangs on one stretch of windows if this stretch causes more than the fraction HANGS of
-# the variance of the quantity. This is not tested if there are fewer than FEWEST stretches.
+# A quantity depends on one stretch of windows if this stretch causes more than the fraction HANGS
+# of the variance of the quantity. This is not tested if there are fewer than FEWEST stretches.
 HANGS, FEWEST = 0.85, 6
 
 
@@ -123,8 +123,8 @@ def jackknife_covariance(stretches: Stretches, white: Covariance) -> Covariance:
     """
     count, places = len(stretches.steps), stretches.places
     covariance = np.array(white.determined)
-    # The scatter of the shared numbers gives no covariance with the initial states of windows,
-    # which is set to zero.
+    # The covariance between shared numbers and the initial states of windows is set to zero, since
+    # the jackknife does not give it.
     covariance[places], covariance[:, places] = 0.0, 0.0
     square = (count - 1) / count * stretches.steps.T @ stretches.steps
     covariance[np.ix_(places, places)] = square
