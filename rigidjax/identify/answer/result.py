@@ -258,9 +258,10 @@ class Fit(eqx.Module):
         """Return the residuals (R, T, k) of each sensor, reading minus prediction, in the sensor's
         unit.
 
-        R is the number of recordings, T the number of times and k the number of components of an
-        error. The masked readings that a fit adds at the end of recordings are left out. **Raises**
-        `ValueError` for a fit that does not hold its errors (`linear` is `None`).
+        R is the number of recordings, T the number of samples in time and k the number of
+        components of an error. The masked readings that a fit adds at the end of recordings are
+        left out. **Raises** `ValueError` for a fit that does not hold its errors (`linear` is
+        `None`).
         """
         if self.linear is None:
             raise ValueError(

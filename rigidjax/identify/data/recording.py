@@ -27,8 +27,8 @@ class Reading(eqx.Module):
       of a reading whose time stamp is one standard deviation late; `None` for any other sensor. It
       is computed along the motion of the last fit.
 
-    Here T is the number of times and k the number of components of an error. Inside a `Model` all
-    arrays have a leading axis over recordings.
+    Here T is the number of samples in time and k the number of components of an error. Inside a
+    `Model` all arrays have a leading axis over recordings.
 
     >>> record = Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]]))
     >>> record.readings[0].values.shape, record.readings[0].mask.tolist()
@@ -57,8 +57,8 @@ class Reading(eqx.Module):
         """Return a mask (…, T, k), true for each component of a reading that is neither masked nor
         at full scale.
 
-        The full scale is the largest value that the sensor can read. T is the number of times and k
-        the number of components of an error.
+        The full scale is the largest value that the sensor can read. T is the number of samples in
+        time and k the number of components of an error.
         """
         mask = np.broadcast_to(
             self.host_mask[..., None], (*self.mask.shape, self.sensor.components)

@@ -314,9 +314,9 @@ def first_rates(
 ) -> Float[Array, "records 3"]:
     """Return the first body rate (R, 3), rad/s, that the readings of each of R recordings show.
 
-    A rate is zero if the readings show no rate. The argument `records` holds the recordings with a
-    leading axis, and `counts` (R,) the number of times of each recording without padding. The rates
-    are zero for traced recordings without a gyro.
+    A rate is zero if the readings show no rate. The rates are zero for recordings without a gyro
+    that JAX traces. The argument `records` holds the recordings with a leading axis, and `counts`
+    (R,) the number of samples in time of each recording without padding.
     """
     for reading in readings_of(records, Gyro):
         xp: Any = np if _checks.is_known(reading) else jnp

@@ -15,8 +15,8 @@ from rigidjax.motion.torques import Linear, Series
 
 
 def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
-    """Return the recordings as one `Recording` with a leading axis, and the number of times of each
-    recording.
+    """Return the recordings as one `Recording` whose arrays have a leading axis, and the number of
+    samples in time of each recording.
 
     Shorter recordings are padded with masked readings at their last time. Inputs and sensors may
     hold tables of time (a `Linear` or `Series`, which interpolates values between times). Shorter
@@ -82,7 +82,7 @@ def _count_table_rows(recording: Recording, axis: int) -> int:
 
 
 def _padded_length(count: int) -> int:
-    """Return the number of times to which a recording or a table of time with `count` times is
+    """Return the number of samples to which a recording or a table of time with `count` samples is
     padded.
 
     It is the least allowed number that is not below `count`. Only few numbers are allowed, so that
@@ -140,8 +140,8 @@ def recordings_on_host(
 ) -> tuple[Recording, ...]:
     """Return a tuple of single recordings with NumPy arrays, so that work on them compiles nothing.
 
-    `records` holds the recordings with a leading axis, and `counts` (R,) the number of times of
-    each recording without padding.
+    `records` holds the recordings with a leading axis, and `counts` (R,) the number of samples in
+    time of each recording without padding.
     """
     known = jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, records)
     return tuple(

@@ -199,10 +199,10 @@ def slope_in_time(
     """Return the time derivative (R, T, k) of the `prediction` (R, T, k) of the readings of a
     sensor.
 
-    Here R is the number of recordings, T the number of times and k the number of components. The
-    derivative is computed from differences of successive predictions. It is zero at the times that
-    pad a short recording, and in a recording of fewer than three times. The `model` holds the times
-    and the number of times of each recording.
+    Here R is the number of recordings, T the number of samples in time and k the number of
+    components. The derivative is computed from differences of successive predictions. It is zero at
+    the samples that pad a short recording, and in a recording of fewer than three samples. The
+    `model` holds the times of the samples, and the number of samples of each recording.
     """
     t, counts = np.asarray(model.records.t)[..., None], np.asarray(model.counts)
     gap = np.diff(t, axis=1)

@@ -33,16 +33,17 @@ class Linearisation(eqx.Module):
     """Hold the errors of a model at one point, and the derivatives of the errors with respect to
     the n free numbers.
 
-    Here R is the number of recordings, T the number of times, k the number of components of an
-    error, and m the number of free numbers on which one recording depends. The first six fields
-    hold one array for each sensor.
+    Here R is the number of recordings, T the number of samples in time, k the number of components
+    of an error, and m the number of free numbers on which one recording depends. The first six
+    fields hold one array for each sensor.
 
     **Fields:**
 
     - `raw`: (R, T, k) the errors in the unit of the sensor.
     - `raw_slopes`: (R, T, k, m) the derivatives of `raw` with respect to the m numbers of each
       recording.
-    - `errors`: (R, T, k) the errors in standard deviations of the noise (`terms.whiten`).
+    - `errors`: (R, T, k) the errors in standard deviations of the noise, as `terms.whiten` returns
+      them.
     - `slopes`: (R, T, k, m) the derivatives of `errors` with respect to the m numbers of each
       recording.
     - `weights`: (R, T) the weights of the robust loss.
@@ -823,10 +824,10 @@ def _autocorrelation_time_and_first_correlation(
 
 
 def _sums_of_lagged_products(rows: np.ndarray) -> np.ndarray:
-    """Return, for each lag l from 0 to T − 1, the sum of the products of entries that are l times
+    """Return, for each lag l from 0 to T − 1, the sum of the products of entries that are l samples
     apart.
 
-    The argument `rows` (R, T) holds x[r, i] for R recordings and T times. The sums (T,) of
+    The argument `rows` (R, T) holds x[r, i] for R recordings and T samples. The sums (T,) of
     `x[r, i] x[r, i + l]` over all r and i are computed by FFT.
     """
     size = rows.shape[1]
