@@ -165,16 +165,15 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
 
 
 def _readings_change_along(fit: "Fit", direction: np.ndarray) -> bool:
-    """Return whether readings change along a `direction` (n,) although their derivatives along it
-    are zero.
+    """Return whether the predicted readings of a `fit` change along a `direction` (n,) of the n
+    free numbers although their derivatives along it are zero.
 
-    The direction is a vector in the space of the n free numbers of a `fit`. Such a change comes
-    from a torque that switches at a certain time or state, if this time or state moves along the
-    direction. Without a torque the result is false. The change is half the difference of the
-    predicted readings after a step forwards and after a step backwards. The result is true if the
-    length of the change, over all readings together, is more than a hundredth of the noise. If the
-    readings depend only on the square of a number, their derivatives with respect to it are zero,
-    too, but the difference is zero as well.
+    This happens if a torque switches at a certain time or state, and this time or state moves along
+    the direction. Without a torque the result is false. The change of the readings is half the
+    difference of the predictions after a step forwards and after a step backwards. The result is
+    true if the length of this change, over all readings together, is more than a hundredth of the
+    noise. Readings that depend only on the square of a number have zero derivatives with respect to
+    it, too; but the two predictions are then equal, so that the result is false.
     """
     if fit.model.torque is None:
         return False

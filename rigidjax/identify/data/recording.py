@@ -242,8 +242,9 @@ def inputs_as_functions(recording: Recording) -> dict[str, Callable[[Any], Any]]
     t, out = recording.t, {}
     for name, source in recording.inputs.items():
         if not callable(source):
-            # The last sample belongs to the last time. If the samples of a window begin before the
-            # start of the window, there are more samples than times.
+            # The last sample belongs to the last time of the recording. The inputs of a window may
+            # begin before the window: there are then more samples than times, and the first samples
+            # belong to times before `t[0]`.
             steps = jnp.arange(t.size - len(source), t.size, dtype=t.dtype)
             source = Held(t[0] + (t[1] - t[0]) * steps, source)
         out[name] = source

@@ -189,8 +189,8 @@ def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0
     is 0 for one recording, and 1 for several recordings with a leading axis.
     """
     missing = count - recording.t.shape[axis]
-    # Pad the tables in sensors as well as in inputs: a sensor that observes a moving object holds a
-    # table of time, too.
+    # Pad the tables (values at given times) in sensors as well as in inputs: a sensor that observes
+    # a moving object, for example, may hold a table, too.
     inputs, sensors = jax.tree.map(
         lambda node: _pad_table(node, rows, axis) if _is_table(node) else node,
         (recording.inputs, recording.sensors),
