@@ -24,8 +24,8 @@ from rigidjax.cli.logs.layouts import imu_columns_of
 from rigidjax.cli.logs.units import TIME_UNITS, unit_in_column_name
 from rigidjax.workprecision import command as workprecision
 
-# The demo takes only these options. All other options describe how to read logs or what to fit to
-# them, and the demo reads no log.
+# The demo takes only the options in this tuple. All other options describe how to read logs or what
+# to fit to them, and the demo reads no log.
 _OF_DEMO = ("starts", "checkpoint", "figure", "report", "json", "no_cache")
 # Each of these options names a file to write. Two options must not name the same file, and none may
 # name a log that is read.
@@ -199,7 +199,7 @@ class _EscapingParser(argparse.ArgumentParser):
 
 
 _FLAG: dict[str, Any] = {"action": "store_true"}
-# These are the options of the command `identify`, each with the arguments of
+# This table has the options of the command `identify`, each with the arguments of
 # `argparse.ArgumentParser.add_argument`.
 OPTIONS: dict[str, dict[str, Any]] = {
     "logs": dict(metavar="FILE", nargs="*", help="logs of one body"),
@@ -532,7 +532,8 @@ def _write_outputs(
                 make()
                 _print_line(f"{what}: {path}")
         except Exception as error:
-            # A fit of an hour must not be lost because one output fails.
+            # Any error of one output, such as a full disk, is printed and not raised, so that the
+            # other outputs of the fit are still written: a fit of an hour must not be lost.
             _print_error(f"no {what}: {path}: {type(error).__name__}: {error}")
             all_written = False
     if "interrupted" in fit.status:

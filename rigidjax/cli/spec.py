@@ -49,7 +49,7 @@ _WHEEL_UNITS = ("rad/s", "rpm")
 
 
 class Channel(eqx.Module):
-    """Hold one sensor of a log.
+    """Hold the description of one sensor of a log.
 
     **Fields:**
 
@@ -327,7 +327,8 @@ def _fill_missing_rows(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, n
     place = (t - t[:1]) / step
     if not np.isfinite(step) or place[-1] > 10 * t.size:
         return t, values
-    # The mean step over the series is more exact than the difference of two rounded times.
+    # The step is computed as the mean step over the whole series, which is more exact than the
+    # difference of two rounded times.
     step *= place[-1] / np.round(place[-1])
     place = (t - t[0]) / step
     if np.abs(place - np.round(place)).max() > 1e-3:

@@ -15,8 +15,8 @@ from rigidjax.frames.point import Point
 
 
 class AbstractScene(eqx.Module):
-    """Define the equations of motion of a particle: a subclass has the methods `acceleration` and
-    `conserved`.
+    """Define the equations of motion of a particle, whose state is a `Point` (position and
+    velocity): a subclass has the methods `acceleration` and `conserved`.
 
     `rigidjax.simulate(None, Point(x, v), ts, scene)` solves a scene; `diffrax.ODETerm(scene.field)`
     is the term of the scene in plain diffrax.
@@ -38,17 +38,21 @@ class AbstractScene(eqx.Module):
 
     @abc.abstractmethod
     def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
-        """Return the acceleration d²x/dt² (3,), m/s², in the frame of the scene (notes, eq 84)."""
+        """Return the acceleration d²x/dt² (3,), m/s², of the particle with the position and
+        velocity in `state`, at the time `t`, s, in the frame of this scene (notes, eq 84).
+        """
 
     @abc.abstractmethod
     def conserved(self, t: ScalarLike, state: PyTree) -> dict[str, Scalar]:
-        """Return the quantities that the exact motion conserves, by name, at the time `t`, s; an
-        empty `dict` if none is known.
+        """Return, by name, the values of the quantities that the exact motion in this scene
+        conserves, at the time `t`, s, and the state `state`; an empty `dict` if no such quantity is
+        known.
         """
 
     def field(self, t: ScalarLike, y: PyTree, args: object = None) -> Point:
-        """Return the vector field `(dx/dt, dv/dt)` as a `Point`, for `diffrax.ODETerm`; `args` is
-        not used.
+        """Return the derivatives (dx/dt, dv/dt) of the position and velocity in the state `y`, as a
+        `Point`: the vector field of this scene for `diffrax.ODETerm`. The argument `args` is not
+        used.
         """
         return Point(y.v, self.acceleration(t, y))
 
@@ -86,8 +90,8 @@ class Force(AbstractScene):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times, s, at which the force jumps or has a kink: the `jump_times` of
-        `force`.
+        """Return the times, s, at which the force on the particle jumps or has a kink: the
+        attribute `jump_times` of the field `force`.
         """
         return jump_times_within(self.force)
 

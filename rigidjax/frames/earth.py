@@ -8,8 +8,8 @@ from rigidjax.frames.base import AbstractScene
 from rigidjax.frames.point import Point, require_point
 from rigidjax.rotation.linalg3 import components, dot_components
 
-# The rate of the Earth's rotation, rad/s: NIMA TR8350.2 (WGS84), table 3.1. Standard gravity, m/s²:
-# ISO 80000-3.
+# These are the rate of the Earth's rotation, rad/s (source: NIMA TR8350.2, WGS84, table 3.1), and
+# standard gravity, m/s² (source: ISO 80000-3).
 RATE = 7.292115e-5
 GRAVITY = 9.80665
 
@@ -39,7 +39,8 @@ class Earth(AbstractScene):
         return jnp.stack([jnp.zeros_like(north), north, up])
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """Return the acceleration g − Ω×(Ω×x') − 2Ω×v' (3,), m/s² (notes, eq 91).
+        """Return the acceleration g − Ω×(Ω×x') − 2Ω×v' (3,), m/s², of a body in free fall, in the
+        axes east, north, up (notes, eq 91).
 
         Here x' and v' are the position and velocity of `state`, Ω is the Earth's angular velocity,
         and g = (0, 0, −`gravity`).
@@ -125,7 +126,8 @@ class Foucault(AbstractScene):
     length: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """Return d²x'/dt² (3,), m/s², of the bob at x' (notes, eq 91).
+        """Return the acceleration d²x'/dt² (3,), m/s², of the pendulum's bob at the position x'
+        from the pivot, in the axes east, north, up (notes, eq 91).
 
         The acceleration along the string is such that the bob keeps its distance from the pivot;
         across the string the acceleration is that of a free particle.
@@ -140,8 +142,8 @@ class Foucault(AbstractScene):
         return {"jacobi": self.place.jacobi_integral(state), "length": length}
 
     def start(self, east: ScalarLike, north: ScalarLike) -> Point:
-        """Return the state of the bob at rest, at the horizontal distances `east` and `north`, m,
-        from the pivot.
+        """Return the state of the pendulum's bob at rest, at the horizontal distances `east` and
+        `north`, m, from the pivot.
 
         >>> foucault(0.5, 10.0).start(6.0, 0.0).x.tolist()
         [6.0, 0.0, -8.0]
@@ -151,7 +153,8 @@ class Foucault(AbstractScene):
     def state(
         self, east: ScalarLike, north: ScalarLike, east_speed: ScalarLike, north_speed: ScalarLike
     ) -> Point:
-        """Return the state of the bob below the pivot from its horizontal position and velocity.
+        """Return the state of the pendulum's bob, below the pivot, from its horizontal position and
+        velocity.
 
         **Arguments:** `east`, `north` the horizontal distances from the pivot, m, with √(east² +
         north²) less than the length of the string; `east_speed`, `north_speed` the horizontal
@@ -169,7 +172,8 @@ class Foucault(AbstractScene):
         return Point(jnp.stack([e, n, up]), jnp.stack([ve, vn, -(e * ve + n * vn) / up]))
 
     def small_swing(self, state: Point, t: ScalarLike) -> Point:
-        """Return the state of the bob at time `t`, s, in closed form, for small swings.
+        """Return the state of the pendulum's bob at the time `t`, s, in closed form, for small
+        swings.
 
         The complex number z = east + i north, with the position of the bob, obeys z'' + 2iΩ_z z' +
         ω₀² z = 0. Here Ω_z = Ω sin λ, with the rate Ω of the Earth and the latitude λ; and ω₀² =
@@ -192,8 +196,9 @@ class Foucault(AbstractScene):
         place = self.place
         up = (place.rate * jnp.sin(place.latitude)).astype(t.dtype)
         swing = jnp.sqrt(place.gravity.astype(t.dtype) / self.length.astype(t.dtype) + up * up)
-        # In axes that turn with the plane of swing the equation of the bob is that of a harmonic
-        # oscillator.
+        # In horizontal axes that turn with the plane of swing the bob is a harmonic oscillator: its
+        # position is a cos ωt + b sin ωt, where the vectors a and b follow from the position and
+        # velocity at t = 0.
         ax, ay, bx, by = x, y, (vx - up * y) / swing, (vy + up * x) / swing
         c, s = jnp.cos(swing * t), jnp.sin(swing * t)
         px, py = ax * c + bx * s, ay * c + by * s

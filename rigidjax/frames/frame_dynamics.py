@@ -55,7 +55,9 @@ class InFrame(AbstractScene):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times (n,), s, at which `inside` or `outside` jumps or has a kink."""
+        """Return the times (n,), s, at which a force of this scene, `inside` or `outside`, jumps or
+        has a kink.
+        """
         return jump_times_within(self.inside, self.outside)
 
     def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:

@@ -32,7 +32,8 @@ class Hoop(AbstractScene):
     gravity: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """Return the acceleration d²x'/dt² (3,), m/s², of the bead at x', in the axes of the hoop.
+        """Return the acceleration d²x'/dt² (3,), m/s², of the bead on the hoop at the position x',
+        in the axes that turn with the hoop.
 
         It is the sum of gravity, the centrifugal acceleration, and the force per mass of the hoop
         within its plane, which keeps the bead at the distance `radius` from the centre.
@@ -61,8 +62,8 @@ class Hoop(AbstractScene):
         return 2 * cast_like(state.x, self.rate)[0] * state.v[0]
 
     def state(self, angle: ScalarLike, speed: ScalarLike = 0.0) -> Point:
-        """Return the state of the bead at the angle θ = `angle` from the lowest place, rad, with
-        dθ/dt = `speed`, rad/s.
+        """Return the state of the bead on the hoop at the angle θ = `angle` from the lowest place,
+        rad, with the angular velocity dθ/dt = `speed`, rad/s.
 
         >>> hoop(2.0, 3.0).state(0.0, 1.0).v.tolist()
         [2.0, 0.0, 0.0]

@@ -66,11 +66,15 @@ class MovingFrame(eqx.Module):
         self.rate = getattr(rotation, "rate", None) if rate is None else rate
 
     def matrix(self, t: ScalarLike) -> Mat3:
-        """Return the rotation matrix M(t) (3, 3), S' → S, at the time `t`, s (notes, eq 85)."""
+        """Return the rotation matrix M(t) (3, 3) of this moving frame S' at the time `t`, s, which
+        takes components in S' to components in the inertial frame S (notes, eq 85).
+        """
         return rotation_models.rotation_matrix_at(self.rotation, _checks.checked_time(t))
 
     def at(self, t: ScalarLike) -> Instant:
-        """Return the frame at time `t`, s, as an `Instant`: M, Ω, dΩ/dt, X, dX/dt and d²X/dt².
+        """Return the motion of this frame at the time `t`, s, as an `Instant`: its rotation matrix
+        M, its angular velocity Ω and dΩ/dt, and the position X of its origin with dX/dt and
+        d²X/dt².
 
         >>> MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
@@ -83,9 +87,11 @@ class MovingFrame(eqx.Module):
         return Instant(self.matrix(t), rate, rate_change, origin, velocity, acceleration)
 
     def angular_velocity(self, t: ScalarLike) -> Vec3:
-        """Return the angular velocity Ω(t) (3,), rad/s, axes of S' (notes, eqs 45–50).
+        """Return the angular velocity Ω(t) (3,), rad/s, of this moving frame S' at the time `t`, s,
+        in the axes of S' (notes, eqs 45–50).
 
-        It is `rate(t)` if the frame has a `rate`, else vee(Mᵀ dM/dt).
+        It is `rate(t)` if the frame has a field `rate`. Otherwise it is vee(Mᵀ dM/dt): the vector
+        of the antisymmetric matrix Mᵀ dM/dt, with the rotation matrix M of the frame.
         """
         t = _checks.checked_time(t)
         if self.rate is not None:
@@ -129,41 +135,45 @@ class MovingFrame(eqx.Module):
         return self.at(t).from_inertial(state)
 
     def centrifugal(self, x: Vector, t: ScalarLike) -> Vec3:
-        """Return the centrifugal acceleration −Ω × (Ω × x') (3,), m/s², axes of S' (notes, eq 91).
+        """Return the centrifugal acceleration −Ω × (Ω × x') (3,), m/s², in the axes of this moving
+        frame S' with the angular velocity Ω (notes, eq 91).
 
         **Arguments:** `x` x' (3,), the position in S', m; `t` the time, s.
         """
         return self.at(t).centrifugal(x)
 
     def coriolis(self, v: Vector, t: ScalarLike) -> Vec3:
-        """Return the Coriolis acceleration −2 Ω × v' (3,), m/s², axes of S' (notes, eq 91).
+        """Return the Coriolis acceleration −2 Ω × v' (3,), m/s², in the axes of this moving frame
+        S' with the angular velocity Ω (notes, eq 91).
 
         **Arguments:** `v` v' (3,), the velocity in S', m/s; `t` the time, s.
         """
         return self.at(t).coriolis(v)
 
     def euler_acceleration(self, x: Vector, t: ScalarLike) -> Vec3:
-        """Return the Euler acceleration −dΩ/dt × x' (3,), m/s², axes of S' (eq 91, there
-        "inercial").
+        """Return the Euler acceleration −dΩ/dt × x' (3,), m/s², in the axes of this moving frame S'
+        with the angular velocity Ω (notes, eq 91, which calls it "inercial").
 
         **Arguments:** `x` x' (3,), the position in S', m; `t` the time, s.
         """
         return self.at(t).euler_acceleration(x)
 
     def translational_acceleration(self, t: ScalarLike) -> Vec3:
-        """Return the fictitious acceleration −Mᵀ d²X/dt² (3,), m/s², axes of S', due to the
-        acceleration of the origin X of S'; M is the rotation matrix of S'.
+        """Return the fictitious acceleration −Mᵀ d²X/dt² (3,), m/s², in the axes of this moving
+        frame S', due to the acceleration of its origin X, at the time `t`, s; M is the rotation
+        matrix of S'.
         """
         return self.at(t).translational_acceleration()
 
     def acceleration(
         self, x: Vector, v: Vector, t: ScalarLike, force: Vector | None = None
     ) -> Vec3:
-        """Return the acceleration d²x'/dt² (3,), m/s², of a particle in S' (notes, eq 91,
-        corrected).
+        """Return the acceleration d²x'/dt² (3,), m/s², of a particle relative to this moving frame
+        S', in the axes of S' (notes, eq 91, corrected).
 
-        d²x'/dt² = f − Ω×(Ω×x') − 2Ω×v' − dΩ/dt×x' − Mᵀ d²X/dt². (The notes have no moving origin,
-        and eq 91 prints one more x'' inside its bracket, a slip: see eq 90.)
+        d²x'/dt² = f − Ω×(Ω×x') − 2Ω×v' − dΩ/dt×x' − Mᵀ d²X/dt², with the angular velocity Ω, the
+        rotation matrix M and the origin X of S'. (The notes have no moving origin, and eq 91 prints
+        one more x'' inside its bracket, a slip: see eq 90.)
 
         **Arguments:** `x`, `v` (3,) position x' and velocity v' in S', m and m/s; `t` the time, s;
         `force` the force per mass f = MᵀF (3,), m/s², **axes of S'** (`force_from_inertial` makes f
@@ -188,19 +198,22 @@ class MovingFrame(eqx.Module):
         return now.to_inertial_axes(a - now.fictitious(x, v))
 
     def force_from_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
-        """Return the components MᵀF (3,) in the axes of S' of a force or direction F = `force`
-        (3,), which is given in the axes of S (notes, eq 91).
+        """Return the components MᵀF (3,) in the axes of this moving frame S' of a force or
+        direction F = `force` (3,), which is given in the axes of the inertial frame S, at the time
+        `t`, s (notes, eq 91).
         """
         return linalg3.apply(self.matrix(t).T, _checks.array_of_shape(force, (3,), "force"))
 
     def force_to_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
-        """Return the components M f (3,) in the axes of S of a force or direction f = `force` (3,),
-        which is given in the axes of S' (notes, eq 85).
+        """Return the components M f (3,) in the axes of the inertial frame S of a force or
+        direction f = `force` (3,), which is given in the axes of this moving frame S', at the time
+        `t`, s (notes, eq 85).
         """
         return linalg3.apply(self.matrix(t), _checks.array_of_shape(force, (3,), "force"))
 
     def jacobi_integral(self, state: PyTree, t: ScalarLike, potential: ScalarLike = 0.0) -> Scalar:
-        """Return the Jacobi integral ½|v'|² − ½|Ω × x'|² + V, m²/s².
+        """Return the Jacobi integral ½|v'|² − ½|Ω × x'|² + V, m²/s², of a particle in this moving
+        frame S', whose angular velocity is Ω.
 
         It is conserved if the origin is fixed and Ω and V(x') do not depend on time.
 

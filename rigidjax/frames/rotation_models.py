@@ -16,8 +16,8 @@ from rigidjax.rotation.validation import require_near_unit, require_rotation_mat
 
 
 class Uniform(eqx.Module):
-    """Describe a frame S' that turns uniformly: its rotation matrix is M(t) = exp(t hat Ω), with
-    M(0) = 1, where hat Ω is the matrix of the cross product with Ω.
+    """Describe a frame S' that turns uniformly: its rotation matrix is M(t) = exp(t hat Ω), the
+    unit matrix at t = 0, where hat Ω is the matrix of the cross product with Ω.
 
     **Arguments:** `omega` the angular velocity Ω (3,), rad/s. Its components in S' and in the
     inertial frame S are equal.
@@ -36,7 +36,9 @@ class Uniform(eqx.Module):
         return so3.exp(t * self.omega.astype(t.dtype))
 
     def rate(self, t: ScalarLike) -> Vec3:
-        """Return the angular velocity Ω (3,), rad/s, axes of S', which does not depend on `t`."""
+        """Return the angular velocity Ω (3,), rad/s, of this uniformly turning frame S', in the
+        axes of S'; it does not depend on `t`.
+        """
         return self.omega.astype(_checks.checked_time(t).dtype)
 
 
@@ -70,8 +72,8 @@ class AboutAxis(eqx.Module):
         )
 
     def rate(self, t: ScalarLike) -> Vec3:
-        """Return the angular velocity Ω (3,), rad/s, axes of S', at the time `t`, s: the unit axis
-        times the derivative of the angle.
+        """Return the angular velocity Ω (3,), rad/s, of this turning frame S' at the time `t`, s,
+        in the axes of S': the unit vector along the axis times the derivative of the angle.
         """
         t = _checks.checked_time(t)
         _, speed = jax.jvp(self.angle, (t,), (jnp.ones_like(t),))
@@ -102,7 +104,8 @@ def rotation_value_at(rotation: PyTree, t: Array) -> PyTree:
 
 
 def rotation_matrix_at(rotation: PyTree, t: Array) -> Mat3:
-    """Return the matrix M (3, 3), S' → S, of a frame's `rotation` at time `t`, s.
+    """Return the rotation matrix M (3, 3) of a moving frame S' at the time `t`, s, from its field
+    `rotation`; M takes components in S' to components in the inertial frame S.
 
     `rotation` is a function of the time that returns a matrix (3, 3), a quaternion (4,) or a state
     with `q`; or it is a solution of `simulate`.

@@ -30,8 +30,9 @@ def energy(
 
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for torques that depend on
     time. Wheels add no energy, except for `ReactionWheels`. If the torque has states of its own
-    (such as the speed of a wheel), `state` is a `Coupled`, as `batch.rollout` and `crossings`
-    return it. Source: notes, eq 79. **Raises:** `TypeError` for a torque without a potential.
+    (such as the speed of a wheel), `state` is a `Coupled`, which holds the state of the body
+    together with these states; `rigidjax.batch.rollout` and `rigidjax.crossings` return such
+    states. Source: notes, eq 79. **Raises:** `TypeError` for a torque without a potential.
 
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
@@ -72,8 +73,9 @@ def conserved(
       `mass · x × v + R(IΩ + h)`, if the body is free, or attracted by the origin.
 
     Here R is the attitude, I the inertia, Ω the body rate, h the momentum of the wheels, x the
-    position and v the velocity. `momentum` and `momentum_along_axis` are those of a state with an
-    attitude; the last two quantities are those of a `Rigid`.
+    position and v the velocity. The dict contains `momentum` and `momentum_along_axis` only if the
+    state has an attitude, and the last two quantities only if it also has a position (`Rigid`) and
+    `body` has a mass (`MassProperties`).
 
     Source: Noether's theorem; Marsden and Ratiu, Introduction to Mechanics and Symmetry, §§1.3,
     1.4.
@@ -107,7 +109,9 @@ def conserved(
         parts_and_laws = [
             (part, part.law if isinstance(part, FrozenLaw) else part) for part in parts
         ]
-        # A torque whose `feels` is `HasPose` may return a force as well.
+        # The linear momentum is conserved only if no part of the torque is a force. A part is known
+        # to return a torque alone if it is an `AbstractTorque` that does not read the position
+        # (`feels` is not `HasPose`); any other part may return a force as well.
         is_torque_only = lambda law: isinstance(law, AbstractTorque) and law.feels is not HasPose  # noqa: E731
         forces = [part for part, law in parts_and_laws if not is_torque_only(law)]
         if not forces:
@@ -126,10 +130,10 @@ def drift(
     """Return how far each conserved quantity drifts during a run, relative to its scale.
 
     **Arguments:** `ts` (n,) the times, s; `ys` the states at these times, with a leading time axis,
-    as a `Coupled` if the torque has states of its own (such as the speed of a wheel); `body`,
-    `torque` as for `simulate`. **Returns** for each quantity that `conserved` names the largest
-    distance from its value at `ts[0]`, divided by its scale, which is the largest value during the
-    run of
+    as a `Coupled` (the state of the body together with the states of the torque) if the torque has
+    states of its own, such as the speed of a wheel; `body`, `torque` as for `simulate`. **Returns**
+    for each quantity that `conserved` names the largest distance from its value at `ts[0]`, divided
+    by its scale, which is the largest value during the run of
 
     - the kinetic energy, for `energy`;
     - the magnitude of the quantity itself, for `linear_momentum` and `momentum_about_origin`;

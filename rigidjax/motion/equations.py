@@ -111,11 +111,11 @@ class EulerEquations(eqx.Module):
         _checks.require_unbatched_instance(inertia, Inertia, "inertia", hint=_HINT)
         if torque is not None:
             require_torque(torque)
-        # Numbers that JAX traces are checked only when a motion is computed: during a fit an
-        # optimiser may try numbers that no body has.
+        # An inertia that has no inverse is refused here only if its numbers are known. Numbers that
+        # JAX traces are not refused: during a fit an optimiser may try numbers that no body has.
         self.inertia = inertia.require_invertible() if _checks.is_known(inertia.tensor) else inertia
-        # The inverse is computed once per solve: a division inside the vector field costs 25 times
-        # as much as the rest of the field.
+        # The inverse of the inertia is computed here, once per solve: a division inside the vector
+        # field costs 25 times as much as the rest of the field.
         self.inverse = inverse(inertia.tensor)
         self.torque = torque
 
@@ -124,7 +124,7 @@ class EulerEquations(eqx.Module):
 
     def angular_acceleration(self, t: ScalarLike, state: HasSpin) -> Vec3:
         """Return dΩ/dt (3,), rad/s², body frame: the derivative of the body rate under the torque
-        that these equations hold.
+        in the field `torque` of these equations.
 
         - `t`: s, the time
         - `state`: any state with a body rate Ω and with each other part that the torque reads, such

@@ -92,7 +92,7 @@ class _Bytes:
 
     def __next__(self) -> int:
         self.place += 1
-        # An `IndexError` tells the caller that the data end within a frame.
+        # An `IndexError` of this line tells the caller that the data end within a frame.
         return self.data[self.place - 1]
 
 
@@ -122,7 +122,9 @@ class _Flight:
 
     def wrap_to_32_bits(self, name: str, values: np.ndarray) -> np.ndarray:
         """Return the `values` of the field `name` as the 32-bit integers that the flight controller
-        had; the time and the fields of slow and GPS frames are returned unchanged.
+        had: sums of many differences may lie outside of the range of such integers. The time, and
+        the fields of slow frames and GPS frames (records of other quantities than I and P frames),
+        are returned unchanged.
         """
         if name not in self.main or name == "time":
             return values
@@ -148,8 +150,10 @@ class _Flight:
             kind = self.kinds.get(next(stream))
             begin = stream.place
             if kind is None or (kind != self.kind.EVENT and kind not in self.fields):
-                # These bytes belong to a frame whose first byte, the letter of its kind, is
-                # damaged. Erased memory at the end of a log does not count as a frame.
+                # The byte that was read is not the letter with which a frame of this log begins: it
+                # belongs to a damaged frame. The frame is counted in `lost` if no frame since the
+                # last I frame was damaged before. It is added to `left_out` only when a later frame
+                # is found, since erased memory at the end of a log is no frame.
                 lost, order.is_valid = lost + order.is_valid, False
                 continue
             is_main = kind in (self.kind.INTRA, self.kind.INTER)
@@ -290,11 +294,14 @@ class _Order:
     def store_frame_if_in_order(
         self, iteration_and_time: Sequence[int], is_i_frame: bool, expected_iteration: int
     ) -> bool:
-        """Return whether a frame continues the last frame; if it does, store it as the last frame.
+        """Return whether a frame can be used, and if so, store it as the last frame. An I frame can
+        be used if it follows the last I frame closely, or is the first one; a P frame, if it
+        follows the last frame closely and no frame since the last I frame was left out.
 
         - `iteration_and_time`: the iteration of the flight controller's loop at which the frame was
           written, and the time, µs.
-        - `is_i_frame`: whether it is an I frame, which holds whole values and not differences.
+        - `is_i_frame`: whether it is an I frame, which holds whole values; a P frame holds
+          differences.
         - `expected_iteration`: the iteration that the frame has if no frame is missing.
         """
         values = iteration_and_time
@@ -361,7 +368,8 @@ def _read_variable_length_integer(stream: _Bytes) -> int:
 
 def _closely_follows_frame(last_frame: Sequence[int], frame: Sequence[int]) -> bool:
     """Return whether a frame follows the last frame closely: its iteration and its time are not
-    before those of the last frame, and not further after them than the decoder allows.
+    before those of the last frame, and not further after them than the flight controllers' own
+    decoder of such logs allows.
 
     Both arguments hold an iteration of the flight controller's loop, and a time, µs.
     """
@@ -380,7 +388,8 @@ def _factors_to_deg_per_s_and_g(headers: Mapping[str, Any]) -> dict[str, float]:
     factors = {}
     if "gyro_scale" in headers:
         value = headers["gyro_scale"]
-        # The header holds the bits of a 32-bit float, which the parser reads as an integer.
+        # In the header the scale of the gyro is a float of 32 bits, whose bits the parser of the
+        # header may have read as an integer.
         scale = struct.unpack("f", struct.pack("I", value))[0] if isinstance(value, int) else value
         baseflight = "baseflight" in str(headers.get("Firmware type", "")).lower()
         factors["gyroADC"] = scale * (1e6 * 180 / math.pi if baseflight else 1.0)

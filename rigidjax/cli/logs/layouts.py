@@ -25,8 +25,8 @@ class ImuColumns(NamedTuple):
 USUAL = ImuColumns(("t", "wx", "wy", "wz"), "rad/s", "s")
 
 
-# For each ending of the file name of a binary log: the units of fields whose names do not contain a
-# unit.
+# For each ending of the file name of a binary log, this table has the units of fields whose names
+# do not contain a unit.
 _UNITS = {
     ".bbl": {"time": "us", "gyroADC": "deg/s", "accSmooth": "g"},
     ".ulg": {"timestamp": "us"},
@@ -47,8 +47,8 @@ def imu_columns_of(path: str | Path) -> ImuColumns:
     """Return the columns of time and rates of a log, or the usual columns t, wx, wy, wz if they are
     not known.
 
-    The columns of a text log are found by the units in their names, because phyphox writes the
-    units in the same way in all languages.
+    The columns of a text log are found by the units in their names: the app phyphox, for example,
+    writes the same units in all languages, but not the same words.
     """
     path = Path(path)
     # Errors are suppressed here, since the reader of the log raises them later with better

@@ -28,7 +28,8 @@ def read_mcap(path: Path, columns: Sequence[str]) -> Columns:
         reader = make_reader(file, decoder_factories=[_Json(), ros()])
         for number, (_, channel, message, content) in enumerate(reader.iter_decoded_messages()):
             if not columns and number == _ENOUGH:
-                # Only names are wanted, and every topic is assumed to have had a message by now.
+                # Only the names of the fields are wanted here. Reading ends after the first _ENOUGH
+                # messages, since every topic is assumed to have had a message by then.
                 break
             first = message.log_time if first is None else first
             fields = {"log_time": 1e-9 * (message.log_time - first)} | dict(
@@ -53,7 +54,7 @@ class _Json:
     """Provide the decoder of messages in JSON, with the interface that the library mcap needs."""
 
     def decoder_for(self, encoding: str, schema: object) -> Callable[[bytes], Any] | None:
-        """Return the decoder of an encoding, or `None` for another encoding than JSON."""
+        """Return the decoder of messages in JSON if `encoding` is JSON, else `None`."""
         return json.loads if encoding == "json" else None
 
 

@@ -124,7 +124,8 @@ def _read_binary_columns(
         read = functools.partial(read_blackbox, flight=flight)
     else:
         _refuse_flight_unless_blackbox(path, flight)
-    # The readers raise many kinds of errors for an empty or a cut file.
+    # For an empty or a cut file the readers raise errors of many kinds; the user gets a `LogError`
+    # with the name of the file instead.
     try:
         names, arrays = read(path, columns)
     except (LogError, LogWarning):

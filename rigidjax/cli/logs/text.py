@@ -53,7 +53,7 @@ def _encoding_of_first_bytes(first_bytes: bytes) -> str:
 
 
 class Header(NamedTuple):
-    """Hold the header of a text.
+    """Hold the header of a text log.
 
     **Fields:** `names` the names of the columns; `separator` the separator of cells; `line` the
     number of the header's line; `after` the lines that were read after the header.
@@ -144,8 +144,8 @@ def read_columns(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dic
 
 
 class _NumberReader:
-    """Read cells as numbers; the first decimal sign decides whether all decimals of the log have a
-    point or a comma.
+    """Read the cells of a text log as numbers; the first decimal sign in the log decides whether
+    all its decimals have a point or a comma.
     """
 
     def __init__(self, separator: str):
@@ -180,7 +180,8 @@ class _NumberReader:
         """
         if "." in cell or self.decimal == ".":
             raise ValueError(f"{cell!r} is not a number; the decimals above have the other sign")
-        # Between tabs, 1,200 may mean a thousand and two hundred.
+        # In a text with tabs between its cells, the cell 1,200 may mean 1200 or 1.2, as long as no
+        # earlier cell has shown which sign marks the decimals.
         if self.decimal is None and self.separator == "\t" and _THOUSANDS.fullmatch(cell):
             raise ValueError(f"{cell!r} is not a number; does its comma mark thousands?")
         if "," in cell:

@@ -12,8 +12,8 @@ from rigidjax.cli.logs.units import TIME_UNITS, UNITS
 _RESTART = 5
 # A log must have at least this number of rows.
 _FEWEST = 4
-# The first range holds the steps, s, that loggers of moving bodies have; a step outside of the
-# second range is doubtful.
+# The range _USUAL_STEPS holds the steps between two times, s, that loggers of moving bodies have; a
+# step outside of the range _ODD_STEPS is doubtful.
 _USUAL_STEPS = (1e-5, 1.0)
 _ODD_STEPS = (1e-7, 1e3)
 # A gap longer than this many median steps means that the clock was set, or that the logger was off.
@@ -71,7 +71,8 @@ def rows_to_use(
     if window is not None and not window[0] < window[1]:
         raise LogError(f"{path}: window: wanted FROM below TO, got {window[0]:g} {window[1]:g}")
     finite = np.isfinite(t)
-    # A row without a time is in the window if the row before it is.
+    # A row whose time is missing (NaN) is in the window if the last row with a time before it is in
+    # the window.
     place = np.maximum.accumulate(np.where(finite, np.arange(t.size), 0))
     near = t[place] if t.size else t
     inside = np.ones(t.shape, bool)
@@ -118,8 +119,8 @@ def _refuse_clock_set_back(
     bad = np.flatnonzero(~is_kept)
     for run in np.split(bad, np.flatnonzero(np.diff(bad) > 1) + 1):
         if run.size >= _RESTART and (np.diff(t[rows[run]]) > 0).all():
-            # The bad rows are either the end of the first series or the beginning of the second
-            # series.
+            # The rows with bad times are either the end of the series before the clock was set
+            # back, or the beginning of the series after it.
             first, after = run[0], run[-1] + 1
             row = rows[first if first and t[rows[first]] <= t[rows[first - 1]] else after]
             raise LogError(

@@ -14,8 +14,8 @@ def read_ulog(path: Path, columns: Sequence[str]) -> Columns:
     A field of the second instance of a topic has the name `topic#1.field`. Times are in µs.
     """
     reader, arrays = _checks.import_library("pyulog", "ulog", str(path)).ULog, {}
-    # The file is opened here, since the library does not close a file that it opened and cannot
-    # read.
+    # The file is opened here, since the library pyulog does not close a file that it opened and
+    # cannot read.
     with path.open("rb") as file:
         topics = reader(file).data_list
     for data in topics:

@@ -13,7 +13,8 @@ UNITS = {
     "rpm": math.pi / 30,
 }  # fmt: skip
 TIME_UNITS = ("s", "ms", "us", "ns")
-# Each unit has these spellings, in small letters; powers are without `^`, `**` or raised digits.
+# Each unit has the spellings in this table, in small letters; powers are without `^`, `**` or
+# raised digits.
 _SPELLINGS = {
     "s": "s sec secs second seconds",
     "ms": "ms msec millisecond milliseconds",
@@ -29,8 +30,8 @@ _SPELLINGS = {
 }
 _UNIT_OF = {word: unit for unit, words in _SPELLINGS.items() for word in words.split()}
 _IN_BRACKETS = re.compile(r"[(\[]([^()\[\]]*)[)\]]\s*$")
-# This pattern finds words in brackets that are meant as a unit; other words in brackets are an axis
-# or an index.
+# This pattern finds words in brackets, in the name of a column, that are meant as a unit, though as
+# an unknown one; other words in brackets are an axis or an index.
 _UNKNOWN = re.compile(r"[/°]|dps|lsb|count|raw", re.IGNORECASE)
 # This table replaces characters that have several spellings by one spelling, and removes signs of
 # powers and products.
@@ -100,7 +101,8 @@ def unit_of_columns(
                 f"{message_start}: column {name!r} is in {unit} by its name, and {stated_unit} is "
                 "stated: which one? state the same unit, or none"
             )
-    # One column is kept for each unit, so that the message can name it.
+    # For each unit in the names the dict has one column with this unit, so that a message about
+    # different units can name two columns.
     by_unit = {unit: name for name, unit in in_names.items()}
     if len(by_unit) > 1:
         (one, first), (other, second) = list(by_unit.items())[:2]

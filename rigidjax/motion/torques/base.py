@@ -50,17 +50,18 @@ class Wrench(eqx.Module):
 class AbstractTorque(eqx.Module):
     """Define a torque on a body: a function of time, state and body, in N m, body axes.
 
-    Subclass it, or write any callable Module in its place. `feels` is the smallest state with the
-    parts that the torque reads: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also
-    `.x`, `.v`); a torque with `feels = HasPose` may return a `Wrench`, a force as well as a torque.
-    A torque gets the `body` that was given to `simulate`: an `Inertia`, or `MassProperties` for
-    `Rigid`.
+    Subclass it, or give any callable with the arguments `(t, state, body)` in its place, best an
+    `equinox.Module`. `feels` is the smallest state with the parts that the torque reads: `HasSpin`
+    (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also `.x`, `.v`); a torque with `feels =
+    HasPose` may return a `Wrench`, a force as well as a torque. A torque gets the `body` that was
+    given to `simulate`: an `Inertia`, or `MassProperties` for `Rigid`.
 
     Optional members:
 
-    - `rate_free`: true if the torque does not depend on the body rate;
-      `rigidjax.solvers.Splitting4` and others can then be used.
-    - `jump_times` (n,), s: the times at which the torque jumps or has a kink.
+    - `rate_free`: true if the torque does not depend on the body rate; the splitting methods of
+      `rigidjax.solvers`, such as `Splitting4`, can then be used.
+    - `jump_times` (n,), s: the times at which the torque jumps or has a kink; `simulate` ends a
+      step at each of these times.
     - `energy(t, state, body)`, J, a method of a torque with a potential. This member and the next
       three are for `rigidjax.conserved`.
     - `steady`: true if the torque does not depend on time.
@@ -91,12 +92,15 @@ class AbstractTorque(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, t: ScalarLike, state: PyTree, body: Body) -> Vec3:
-        """Return the torque (3,), N m, body frame."""
+        """Return the torque (3,), N m, body frame, at the time `t`, s, on a `body` (an `Inertia` or
+        `MassProperties`) in the state of motion `state`.
+        """
 
 
 class AbstractForce(eqx.Module):
-    """Define a force on a `Rigid` with `MassProperties`: like `AbstractTorque`, but the value is a
-    `Wrench`.
+    """Define a force on a body whose state is a `Rigid` (with position and velocity) and whose mass
+    is known (`MassProperties`): like `AbstractTorque`, but the value is a `Wrench`, a force and a
+    torque.
     """
 
     feels: eqx.AbstractVar[type]
@@ -104,7 +108,7 @@ class AbstractForce(eqx.Module):
     @abc.abstractmethod
     def __call__(self, t: ScalarLike, state: PyTree, body: MassProperties) -> Wrench:
         """Return the force (3,), N, world frame, and the torque (3,), N m, body frame, about the
-        centre of mass.
+        centre of mass, on a `body` in the state of motion `state` at the time `t`, s.
         """
 
 
@@ -113,8 +117,8 @@ class AbstractTimeTorque(AbstractTorque):
 
     @property
     def steady(self) -> bool:
-        """Return whether the torque is the same at all times: none of the vectors in its fields is
-        a function of time.
+        """Return whether the torque does not depend on time: none of the vectors in its fields is a
+        function of time.
         """
         return not any(callable(part) for part in vars(self).values())
 
@@ -126,7 +130,8 @@ class AbstractTimeTorque(AbstractTorque):
         return jump_times_of_fields(self)
 
 
-# Any callable is a torque: a user's own Module need not subclass anything.
+# An argument with this type takes any callable `(t, state, body)` as a torque: the class of a
+# user's own torque need not be a subclass of `AbstractTorque`.
 Torque = AbstractTorque | AbstractForce | Callable[[Any, Any, Any], Any]
 
 # The type of a state, as a torque declares it in `feels`.
@@ -159,7 +164,8 @@ def require_torque(torque: object, name: str = "torque") -> None:
             f"{name}: wanted a torque or force of rigidjax.torques, or a callable (t, state, "
             f"body), got {type(torque).__name__}{advice}"
         )
-    # The arguments of a Module are not checked: a torque with states of its own takes them as well.
+    # Only the arguments of a plain function are checked. The arguments of a Module are not: if it
+    # has states of its own, it is called with these states as a fourth argument.
     if not isinstance(torque, eqx.Module):
         _checks.require_function(torque, name, "(t, state, body) → torque (3,), N m, body frame")
 
@@ -251,8 +257,9 @@ def force_and_torque(
     dtype = state.omega.dtype
     t = _checks.array_of_shape(t, (), "t").astype(dtype)
     name = f"torque {getattr(model, 'law_name', type(model).__name__)}"
-    # A table in float64 must not turn a float32 solve into a float64 solve, nor stop the solve
-    # under strict promotion.
+    # All arrays of the torque and of the body are converted to the precision of the state: a
+    # float64 table in a torque must not turn a float32 solve into a float64 solve, nor raise an
+    # error under JAX's strict promotion of dtypes.
     try:
         result = in_precision(model, dtype)(t, state, in_precision(body, dtype))
     except AttributeError as error:
@@ -271,7 +278,8 @@ def force_and_torque(
     return None, value.astype(dtype)
 
 
-# For each field that a state of motion may lack: the name of the quantity, and a state that has it.
+# For each field that a state of motion may lack, this table has two texts for messages: the name of
+# the quantity, and a class of states that has it.
 _QUANTITY_AND_STATE_OF_FIELD = {
     "q": ("attitude", "Attitude(q, omega)"),
     "x": ("position", "Rigid(x, v, q, omega)"),

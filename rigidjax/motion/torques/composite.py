@@ -20,7 +20,9 @@ from rigidjax.rotation.linalg3 import apply, components, cross, dot, solve
 
 
 class Sum(eqx.Module):
-    """Add several torques and forces; the sum needs the largest of the states that the parts need.
+    """Add several torques and forces. The state of motion must have each part (body rate, attitude,
+    position) that any of these torques and forces reads, as their attributes `feels` declare;
+    `feels` of the sum is the smallest such state.
 
     **Arguments:** `*parts` torques, forces, your own callables. **Raises:** `TypeError` for a part
     that cannot be called; `ValueError` for an empty sum.
@@ -46,19 +48,25 @@ class Sum(eqx.Module):
 
     @property
     def feels(self) -> base.StateType:
-        """Return the type of the largest state that a part needs, such as `HasAttitude`."""
+        """Return the type of the smallest state of motion with all parts that the torques in this
+        sum declare to read, such as `HasAttitude`.
+        """
         types = base.STATE_TYPES_BY_SIZE
         needed = [getattr(part, "feels", types[0]) for part in self.parts]
         return max(needed, key=lambda kind: types.index(kind) if kind in types else len(types))
 
     @property
     def rate_free(self) -> bool:
-        """Return whether the sum does not depend on the body rate, because no part does."""
+        """Return whether this sum of torques does not depend on the body rate: true if no torque in
+        the sum depends on it.
+        """
         return all(not base.may_read_rate(part) for part in self.parts)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times (n,), s, at which any part jumps or has a kink, in ascending order."""
+        """Return the times (n,), s, at which any torque in this sum jumps or has a kink, in
+        ascending order.
+        """
         return base.sorted_jump_times_of(*self.parts)
 
     def __call__(self, t: ScalarLike, state: PyTree, body: Body) -> Vec3 | base.Wrench:
@@ -132,8 +140,8 @@ class ChangingInertia(eqx.Module):
 
     @property
     def feels(self) -> base.StateType:
-        """Return the type of the smallest state with all parts that the inertia and the torque of
-        this object read, such as `HasAttitude`.
+        """Return the type of the smallest state of motion with all parts that the fields `inertia`
+        and `torque` of this `ChangingInertia` read, such as `HasAttitude`.
         """
         needed = [getattr(part, "feels", HasSpin) for part in (self.inertia, self.torque)]
         return max(needed, key=base.STATE_TYPES_BY_SIZE.index)
@@ -160,9 +168,9 @@ class ChangingInertia(eqx.Module):
             now = tensor_or_nan(self.tensor(t, here, body).astype(omega.dtype))
             return apply(now, omega), now
 
-        # Ω̇ is not known yet, but d(IΩ)/dt is linear in Ω̇. One linearisation of IΩ gives a linear
-        # system for Ω̇; it is evaluated along four directions: t and q together, and the three
-        # components of Ω one by one.
+        # The derivative Ω̇ of the body rate is not known yet, but d(IΩ)/dt is linear in Ω̇. One
+        # linearisation of IΩ gives a linear system for Ω̇; it is evaluated along four directions: t
+        # and q together, and the three components of Ω one by one.
         (held, now), along = jax.linearize(momentum, t, q, omega)
         still, first = jnp.zeros((1, 3), omega.dtype), jnp.eye(4, 1, dtype=omega.dtype)
         turns = None if q is None else first * quaternion.rate(q, omega)[None]
@@ -193,9 +201,11 @@ class Tide(eqx.Module):
     deform.
 
     `I = I₀ − κ (μ/r³)(u uᵀ − ⅓) + ⅓ κ (Ω Ωᵀ − ⅓ Ω² − n² (e_z e_zᵀ − ⅓))`, with the inertia I₀ of
-    the body given to `simulate`, the body rate Ω, and the direction `u = Rᵀr/r` of the point mass
-    in body axes. The attitude R and the position r in u are those at the earlier time t − `delay`.
-    Pass a tide to `ChangingInertia`, which computes İΩ: `ChangingInertia(Tide(…), torque)`.
+    the body given to `simulate`, the body rate Ω, the direction `u = Rᵀr/r` of the point mass in
+    body axes, and the unit vector e_z along the z axis of the body; a scalar that is added to a
+    matrix stands for this scalar times the unit matrix. The attitude R and the position r in u are
+    those at the earlier time t − `delay`. Pass a tide to `ChangingInertia`, which computes İΩ:
+    `ChangingInertia(Tide(…), torque)`.
 
     **Arguments:**
 
@@ -204,7 +214,7 @@ class Tide(eqx.Module):
     - `delay`: s, the time by which the deformation lags behind the attraction of the point mass.
     - `mu`: μ, m³/s², G times the mass of the point mass.
     - `position`: r (3,), in metres, world frame, from the body to the point mass: constant, or a
-      callable Module of time.
+      function of time, t → (3,), such as a `Chebyshev`.
     - `mean_rate`: n, rad/s, about the z axis of the body: the spin whose deformation is already in
       I₀.
 

@@ -38,7 +38,9 @@ class UniformGravity(base.AbstractForce):
     )
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
-        """Return the potential energy, J: `U = −m g·x`, which is zero at the world's origin."""
+        """Return the potential energy, J: `U = −m g·x`, with the mass m of the body, gravity g and
+        the position x of the centre of mass; it is zero at the world's origin.
+        """
         return -body.mass * dot(self.gravity, state.x)
 
     def internal_momentum(self, t: ScalarLike) -> Vec3:
@@ -73,14 +75,17 @@ class CentralGravity(base.AbstractForce):
     mu: Float[Array, ""] = eqx.field(converter=base.number_converter("mu"))
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
-        """Return the potential energy U of the body, J, which is zero at infinity."""
+        """Return the potential energy of the body in the gravity of the centre, J, which is zero at
+        an infinite distance from the centre.
+        """
         r, up, pull, trace = _distance_direction_inertia_and_trace(state, body.inertia.tensor)
         return -(self.mu / r) * (body.mass + 0.5 * (trace - 3 * dot(up, pull)) / r / r)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         r, up, pull, trace = _distance_direction_inertia_and_trace(state, body.inertia.tensor)
         strength, along = self.mu / r / r, dot(up, pull)
-        # The force is −∂U/∂x in body axes: the sum of a vector along r̂ and a vector along I r̂.
+        # In body axes the force, minus the gradient of the potential energy, is the sum of two
+        # vectors: one along r̂, and one along I r̂.
         radial = -strength * (body.mass + 1.5 * (trace - 5 * along) / r / r)
         force = radial * up - 3 * strength / r / r * pull
         return base.Wrench(quaternion.rotate(state.q, force), cross(3 * strength / r * up, pull))
@@ -149,8 +154,8 @@ class Rotors(base.AbstractForce):
       turns in the opposite sense.
     - `thrust`: k, N s²/rad², one number or (R,).
     - `drag`: c, N m s²/rad², one number or (R,).
-    - `speeds`: n (R,), rad/s: constant, a callable Module of time such as `Held(times, values)`, or
-      `Input("speeds")`.
+    - `speeds`: n (R,), rad/s: constant, a function of time such as `Held(times, values)`, or
+      `Input("speeds")`, whose values are given when a motion is computed.
 
     Source: Mahony, Kumar and Corke 2012, Multirotor aerial vehicles, eqs 4–6,
     doi:10.1109/MRA.2012.2206474.

@@ -35,7 +35,9 @@ class Input(eqx.Module):
     name: str = eqx.field(static=True)
 
     def __call__(self, t: ScalarLike) -> Any:
-        """Raise `ValueError`, since an input has no value before `bind`."""
+        """Raise `ValueError`: an input has no value until `bind` puts a value or a function of time
+        in its place.
+        """
         raise ValueError(
             f"Input({self.name!r}) has no value: give inputs={{{self.name!r}: …}} to "
             "rigidjax.batch.rollout, or put a function of time in its place with "
@@ -47,8 +49,8 @@ class _ConstantFunction(eqx.Module):
     """Return one `value` at every time.
 
     An `Input` is a signal that a torque reads by name and whose values the caller gives. This
-    function of time takes its place while the value of the signal is constant, such as during one
-    step.
+    object, a function of time, replaces an `Input` while the value of the signal is constant, such
+    as during one step of an integrator.
     """
 
     value: Array
@@ -64,12 +66,13 @@ class Delayed(eqx.Module):
     `delay` s, one number, which may be free in a fit; a negative delay shifts the function to
     earlier times.
 
-    The `jump_times` move with the delay. `simulate` ends steps at these times, so that the
-    derivative of a motion with respect to the delay is correct although the source jumps.
-    `rigidjax.batch.rollout` and `identify.fit` hold each sample of an input constant over one step.
-    A delayed input changes inside a step: the step is therefore split in two at the change, and the
-    derivative with respect to the delay is correct as well. The first sample also holds before its
-    own time, and the last sample after its own time. `Linear` and `Series` can be delayed, too.
+    The times at which the source jumps (its attribute `jump_times`) move with the delay. `simulate`
+    ends steps at these times, so that the derivative of a motion with respect to the delay is
+    correct although the source jumps. `rigidjax.batch.rollout` and `identify.fit` hold each sample
+    of an input constant over one step. A delayed input changes inside a step: the step is therefore
+    split in two at the change, and the derivative with respect to the delay is correct as well. The
+    first sample also holds before its own time, and the last sample after its own time. `Linear`
+    and `Series` can be delayed, too.
 
     **Raises:** `TypeError` for a source that has states of its own (delay the input of the source
     instead, as in `Lagged(Delayed(u, delay), time)`); `ValueError` for a delay that is not shorter
@@ -104,8 +107,8 @@ class Delayed(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times (n,), s, at which the value jumps or has a kink: those of the source
-        plus the delay.
+        """Return the times (n,), s, at which this delayed function jumps or has a kink: each such
+        time of its source, plus the delay.
         """
         times = jump_times_of(self.source)
         return times + self.delay.astype(times.dtype)
@@ -156,7 +159,9 @@ class Lagged(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times (n,), s, at which the source jumps and the lagged signal has a kink."""
+        """Return the times (n,), s, at which the lagged signal has a kink, because its source jumps
+        or has a kink.
+        """
         return jump_times_of(self.source)
 
     def state0(self, t: ScalarLike, state: PyTree, body: Body) -> Array:
@@ -229,7 +234,8 @@ class InputRow(NamedTuple):
 
 
 def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
-    """Return the torque with values in place of each `Input`.
+    """Return the torque with values in place of each `Input`, which is a signal that a torque reads
+    by name.
 
     **Arguments:**
 

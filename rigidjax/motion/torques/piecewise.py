@@ -52,7 +52,9 @@ class Linear(_Table):
     """
 
     def __call__(self, t: ScalarLike) -> Array:
-        """Return the value at the time `t`, s; its shape (*k) is that of a row of `values`."""
+        """Return the value, interpolated between the rows of `values`, at the time `t`, s; its
+        shape (*k) is that of one row.
+        """
         t = jnp.asarray(t, self.times.dtype)
         return _interpolate_linearly(
             self.times, self.values, jnp.clip(t, self.times[0], self.times[-1])
@@ -64,16 +66,18 @@ class Held(_Table):
 
     **Arguments:** `times` (n,) s, increasing; `values` (n, *k), where row i holds from time i until
     time i + 1, the first row also before its time, and the last row for all later times. Both may
-    be traced. The value jumps at `times`; these times are the `jump_times` also of a torque that
-    reads the value, and adaptive steps end at them. For fixed steps give the samples to
-    `rigidjax.batch.rollout` as `inputs`. **Raises:** as `Linear`.
+    be traced. The value jumps at `times`. So does a torque that reads it: its attribute
+    `jump_times` contains these times, and adaptive steps end at them. For fixed steps give the
+    samples to `rigidjax.batch.rollout` as `inputs`. **Raises:** as `Linear`.
 
     >>> Held([0.0, 1.0, 2.0], [[5.0], [6.0], [7.0]])(1.5)
     Array([6.], dtype=float64)
     """
 
     def __call__(self, t: ScalarLike) -> Array:
-        """Return the value at the time `t`, s; its shape (*k) is that of a row of `values`."""
+        """Return the value at the time `t`, s: the row of `values` that is held at this time, of
+        the shape (*k).
+        """
         i = _index_of_row_at(self.times, jnp.asarray(t, self.times.dtype))
         return self.values[jnp.clip(i, 0, self.times.shape[0] - 1)]
 
@@ -105,7 +109,9 @@ class Tabulated(AbstractTorque):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times (n,) of the rows, s, at each of which the torque jumps or has a kink."""
+        """Return the times (n,) of the rows of the table, s, at each of which the torque jumps or
+        has a kink.
+        """
         return self.times
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
@@ -123,9 +129,9 @@ class Pulses(AbstractTorque):
     edge i until edge i + 1. One pulse: `Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]])`. **Raises:**
     `ValueError` for another number of edges, edges that do not increase, NaN.
 
-    The value of the torque at one time has no derivative with respect to the edges. A motion has
-    this derivative if the solver ends steps at `jump_times`, as `simulate` does. The derivative of
-    `impulse` is exact.
+    The value of the torque at one time has no derivative with respect to the edges, but a motion
+    under the torque has this derivative if the solver ends steps at `jump_times`, as `simulate`
+    does. The derivative of `impulse` is exact.
 
     >>> Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]]).impulse
     Array([0. , 0. , 1.5], dtype=float64)
@@ -148,7 +154,9 @@ class Pulses(AbstractTorque):
 
     @property
     def impulse(self) -> Vec3:
-        """Return the angular impulse of all pieces together, ∫ τ dt, (3,), N m s, body frame."""
+        """Return the angular impulse of all pulses together, the integral ∫ τ dt of the torque τ
+        over time, (3,), N m s, body frame.
+        """
         return jnp.sum((self.edges[1:] - self.edges[:-1])[:, None] * self.torques, axis=0)
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
@@ -166,8 +174,9 @@ def _index_of_row_at(times: Float[Array, " n"], t: Scalar) -> Int[Array, ""]:
 
     - `times`: (n,) s, increasing, the times of the rows
     """
-    # For a short table a comparison with all rows stays inside the solver's one kernel; a binary
-    # search would be a loop of its own.
+    # The row is found by a comparison of t with the times of all rows in a short table, since XLA
+    # compiles this comparison into the one kernel of the solver; a binary search would be a loop of
+    # its own.
     method = "compare_all" if times.shape[0] <= 128 else "scan"
     return jnp.searchsorted(times, t, side="right", method=method) - 1
 

@@ -49,8 +49,8 @@ class HeavyTop(base.AbstractTorque):
 
     @property
     def axis(self) -> base.AxisWithoutTorque:
-        """Return a vector (3,), world frame, along which the torque has no component: gravity g,
-        m/s².
+        """Return a vector (3,), world frame, along which the torque of gravity has no component:
+        the vector g of gravity, m/s².
         """
         return self.gravity
 
@@ -81,13 +81,13 @@ class GravityGradient(base.AbstractTimeTorque):
     harmonic of degree n of the body's own gravity, `Σ ρⁿ Pₙₘ (C cos mλ + S sin mλ)`, a sum over m =
     0, …, n, at a point with the distance ρ from the centre of mass and the longitude λ; Pₙₘ is an
     associated Legendre function of the sine of the latitude. The potential energy is `U = (μ/2r³)(3
-    u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`, MacCullagh's formula and its next terms. The torque does not
-    change the orbit. **Arguments:**
+    u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`, MacCullagh's formula and its next terms. The orbit is given by
+    `position`; the torque does not change it. **Arguments:**
 
     - `mu`: μ, m³/s², the constant of gravitation times the mass of the point mass.
     - `position`: the vector (3,), in metres, world frame, from the body to the point mass:
-      constant, or a callable Module of time, t → (3,), for an orbit. Without `harmonics` its sign
-      does not matter.
+      constant, or a function of time, t → (3,), for an orbit. Without `harmonics` its sign does not
+      matter.
     - `harmonics`: the coefficients C and S of Hₙ, an array (2n + 1,) for each degree n = 3, 4, …,
       in kg times metreⁿ and in body axes. They are the mass of the body times the n-th power of its
       reference radius times its Stokes coefficients (Cn0, Cn1, Sn1, Cn2, Sn2, …), not normalised.
@@ -189,9 +189,9 @@ def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]
     """
     x, y, z = components(u)
     zero = jnp.zeros_like(z)
-    # In the loop, `here` holds the real and imaginary parts of the solid harmonics rᵏ Pₖₘ exp(imλ)
-    # of the degree k = n − 1 for m = 0 … k + 1, and `before` holds those of the degree n − 2.
-    # Harmonics with m above their degree are zero.
+    # For each degree n of the loop below, `here` holds the real and imaginary parts of the solid
+    # harmonics rᵏ Pₖₘ exp(imλ) of the degree k = n − 1 for m = 0 … k + 1, and `before` holds those
+    # of the degree n − 2. Harmonics with m above their degree are zero.
     before, here = [(zero, zero)] * 2, [(jnp.ones_like(z), zero), (zero, zero)]
     out = []
     for n in range(1, len(harmonics) + 3):
@@ -242,8 +242,8 @@ class MagneticDipole(base.AbstractTimeTorque):
     `τ = m × RᵀB`, with the potential energy `U = −m·RᵀB`; R is the attitude.
 
     **Arguments:** `moment` m (3,), in ampere metre², body frame; `field` B, in tesla, world frame:
-    (3,), or a callable Module of time, t → (3,), for a field that changes along an orbit. Source:
-    Jackson, Classical Electrodynamics, eqs 5.71, 5.72.
+    (3,), or a function of time, t → (3,), for a field that changes along an orbit. Source: Jackson,
+    Classical Electrodynamics, eqs 5.71, 5.72.
 
     >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> MagneticDipole([0.0, 0.0, 2.0], [3.0, 0.0, 0.0])(0.0, state, None).tolist()  # z × x = y
@@ -284,10 +284,10 @@ class MagneticDipole(base.AbstractTimeTorque):
 class FromPotential(base.AbstractTorque):
     """Apply the torque of any potential `U(q)` of the attitude, by differentiation.
 
-    **Arguments:** `potential` a callable Module that returns the potential energy U, J, from the
-    unit quaternion q (4,), body → world. The torque about body axis i is `τ_i = −∂U/∂q · ½ q ⊗
-    e_i`: minus the derivative of U with respect to the angle of a turn about this axis. Source:
-    Landau and Lifshitz, Mechanics, §34.
+    **Arguments:** `potential` a function of the unit quaternion q (4,), body → world, that returns
+    the potential energy U, J. The torque about body axis i is `τ_i = −∂U/∂q · ½ q ⊗ e_i`: minus the
+    derivative of U with respect to the angle of a turn about this axis. Source: Landau and
+    Lifshitz, Mechanics, §34.
 
     >>> class Spring(eqx.Module):
     ...     k: Array
@@ -307,7 +307,9 @@ class FromPotential(base.AbstractTorque):
         self.potential = _checks.require_function(potential, "potential", "q → U, J")
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
-        """Return the potential energy U(q), J, at the attitude q of `state`."""
+        """Return the potential energy, J: the value of the user's function `potential` at the
+        attitude of `state`.
+        """
         return self._potential_energy_at(state.q)
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:

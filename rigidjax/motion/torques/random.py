@@ -45,9 +45,10 @@ class CorrelatedTorque(AbstractTorque):
     positive: the correlation time. About each body axis `E[τ(t) τ(t′)] = density/(2T) exp(−|t −
     t′|/T)` for any two times t and t′: for T → 0 this is a `RandomTorque` with an equal density.
 
-    `simulate` and a fit use the mean of the torque, which is zero; see `RandomTorque`. The state of
-    a filter contains the torque. Source: Uhlenbeck and Ornstein 1930, doi:10.1103/PhysRev.36.823.
-    **Raises:** `ValueError` for a density below zero, a time that is not positive.
+    `simulate` and a fit use the mean of the torque, which is zero; see `RandomTorque`. A filter
+    estimates this torque as a part of its state, because its noise is correlated in time. Source:
+    Uhlenbeck and Ornstein 1930, doi:10.1103/PhysRev.36.823. **Raises:** `ValueError` for a density
+    below zero, a time that is not positive.
 
     >>> CorrelatedTorque(2e-4, 0.5).deviation
     Array([0.01414214, 0.01414214, 0.01414214], dtype=float64)

@@ -22,8 +22,9 @@ Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
 class Series(eqx.Module):
     """Interpolate evenly spaced samples by a cubic spline; it is constant beyond the ends.
 
-    A division finds the interval of a time, so that the spline costs little in a solver; the
-    derivative of the spline is continuous, so that a step may pass over a sample.
+    The spline costs little in a solver: the samples are evenly spaced, so that one division finds
+    the two samples before and after a time. The derivative of the spline is continuous, so that a
+    step of a solver may pass over a sample.
 
     **Arguments:** `times` (n,) s, evenly spaced, with an error of at most 1e-6 of a step plus the
     round-off of the times, which is large for times such as 1.7e9 s; `values` (n,) or (n, k). Both
@@ -70,7 +71,9 @@ class Series(eqx.Module):
         )
 
     def __call__(self, t: ScalarLike) -> Any:
-        """Return the value at the time `t`, s; its shape, () or (k,), is that of one sample."""
+        """Return the value of the spline at the time `t`, s; its shape, () or (k,), is that of one
+        sample.
+        """
         n = self.values.shape[0]
         place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
         # `jnp.where` is used, not `jnp.clip`: exactly at an end, `jnp.clip` has half the
@@ -82,7 +85,9 @@ class Series(eqx.Module):
         # Without the barrier, XLA on CPU reads the table again for every number that is computed
         # from the rows.
         s, (left, right, out, into) = barrier((s, rows))
-        # The cubic polynomial in Hermite form, expanded at the left sample.
+        # The cubic polynomial between two samples is determined by their values, `left` and
+        # `right`, and by their slopes, `out` and `into`; it is written here as a Taylor series at
+        # the left sample.
         bend = 3.0 * (right - left) - 2.0 * out - into
         twist = 2.0 * (left - right) + out + into
         return left + s * (out + s * (bend + s * twist))
@@ -105,7 +110,8 @@ def _spline_slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *chan
     """Return the slope of a cubic spline at each of n evenly spaced samples, as the change for one
     step between samples, in the shape of `values`.
 
-    - `values`: (n, *channels), the samples, each a number or an array of the shape (*channels)
+    - `values`: (n, *channels), the samples, each of them a number or an array of the shape
+      (*channels)
 
     With vᵢ the sample and sᵢ the slope at sample i, the slopes solve sᵢ₋₁ + 4 sᵢ + sᵢ₊₁ = 3
     (vᵢ₊₁ − vᵢ₋₁): the second derivative of the spline is then continuous. At the two ends the
@@ -133,8 +139,7 @@ class Wheel(eqx.Module):
 
     - `inertia`: J, kg m², about the axis.
     - `axis`: a (3,), a unit vector, body frame.
-    - `speed`: w, rad/s, relative to the body, a callable Module of time such as `Series(times,
-      speeds)`.
+    - `speed`: w, rad/s, relative to the body, a function of time such as `Series(times, speeds)`.
     - `delay`: s, the time by which the log is late: the value that it holds for the time t is the
       speed at t − delay. `None` means no delay.
     - `tilt`: (2,), the tangents of the two angles by which the axis is tilted towards two
@@ -185,8 +190,8 @@ class Wheel(eqx.Module):
         """
         if self.tilt is None:
             return self.axis
-        # The coordinate axis that is nearest to the axis of the wheel determines the two directions
-        # across it.
+        # The wheel is tilted towards two directions across its axis. The body axis that is nearest
+        # to the axis of the wheel determines these directions (see the argument `tilt`).
         next_one = jnp.roll(jnp.eye(3, dtype=self.axis.dtype), 1, axis=1)
         first = next_one[jnp.argmax(jnp.abs(self.axis))]
         first = first - dot(first, self.axis) * self.axis

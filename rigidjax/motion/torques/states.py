@@ -38,8 +38,8 @@ class FrozenLaw(eqx.Module):
 
     def __getattr__(self, name: str) -> Any:
         # All members of the torque (`feels`, `jump_times`, …) are members of this object as well,
-        # except `state0` and `rate`: the values of the states are fixed here, so that no integrator
-        # must find states in this object.
+        # except `state0` and `rate`: this object holds fixed values of the states, so that an
+        # integrator must not take it for a torque with states to integrate.
         if name.startswith("_") or name in ("law", "own", "state0", "rate"):
             raise AttributeError(name)
         attribute = getattr(self.law, name)

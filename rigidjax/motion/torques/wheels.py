@@ -20,7 +20,9 @@ from rigidjax.motion.torques.inputs import require_no_jumps
 from rigidjax.motion.torques.states import contains_own_states
 from rigidjax.rotation.linalg3 import cross
 
-# The torque of a motor falls to zero over this fraction of the top speed of the wheel.
+# A torque that would bring a wheel beyond its top speed falls to zero over the last part of the
+# speeds below the top speed; this number is the length of that part, as a fraction of the top
+# speed.
 _FADE = 0.05
 
 
@@ -28,8 +30,8 @@ class Flywheel(base.AbstractTimeTorque):
     """Apply the torque of internal wheels to the body: `τ = h × Ω − dh/dt`.
 
     **Arguments:** `momentum` h, N m s, body frame, the sum over all wheels: (3,) for wheels of
-    constant speed, or a callable Module of time, t → (3,), such as `Linear(times, values)`, but not
-    a function that jumps (`Held`, samples of an `Input`), because dh/dt acts on the body.
+    constant speed, or a function of time, t → (3,), such as `Linear(times, values)`, but not a
+    function that jumps (`Held`, samples of an `Input`), because dh/dt acts on the body.
 
     The inertia I of the body and h must belong together. If I is the inertia of the body with its
     wheels locked, h is the momentum of the wheels relative to the body. If the moments of inertia J
@@ -62,7 +64,9 @@ class Flywheel(base.AbstractTimeTorque):
         return base.vector_at(self.momentum, t, "momentum")
 
     def energy(self, t: ScalarLike, state: HasSpin, body: object) -> Scalar:
-        """Return the potential energy of the wheels, J, which is zero: h × Ω does no work."""
+        """Return the potential energy of the wheels, J, which is zero: their torque h × Ω, with
+        their momentum h and the body rate Ω, does no work on the body.
+        """
         return jnp.zeros((), state.omega.dtype)
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
