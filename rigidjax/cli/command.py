@@ -156,9 +156,9 @@ def _keep_compiled_programs() -> None:
         folder = _cache_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         held = folder.stat()
-        # Compiled programs in the folder are run. The folder must therefore be writable by this
-        # user alone, so that nobody else can put a program there. On Windows the folder of a user
-        # belongs to the user already.
+        # JAX runs the compiled programs that it finds in this folder. The folder must therefore be
+        # writable by this user alone, so that nobody else can put a program there. On Windows the
+        # folder of a user belongs to the user already.
         if hasattr(os, "getuid"):
             if held.st_uid != os.getuid() or held.st_mode & 0o022:
                 words = "is not yours alone: it is not used, and starts are slower; delete it"

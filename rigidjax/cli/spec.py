@@ -193,7 +193,8 @@ def read_log(
     zero.
     """
     unit = unit_of_time(path, time, time_unit)
-    # Each column is read once, since two wheels may have their speeds in the same column.
+    # The dict has each column once: two wheels may have their speeds in the same column, and
+    # `read_table` refuses a column that is wanted twice.
     turning = dict.fromkeys(w.column for w in wheels)
     names = [time, *(c for one in channels for c in one.columns), *turning]
     table = read_table(path, names, flight=flight)

@@ -30,8 +30,8 @@ class InFrame(AbstractScene):
     - `potential`: a function of the position x' in S', `(3,) → ()`, that returns the potential V
       per mass, m²/s²; the force per mass −∇V is computed by automatic differentiation.
 
-    If the rotation of the frame is a `frames.Uniform`, and its `origin`, `inside` and `outside` are
-    `None`, `conserved` returns the Jacobi integral.
+    If the rotation of the frame is a `frames.Uniform` (a constant angular velocity), and its
+    `origin`, `inside` and `outside` are `None`, `conserved` returns the Jacobi integral.
 
     >>> scene = InFrame(MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0])))
     >>> scene.acceleration(0.0, rj.frames.Point([2.0, 0, 0], [0.0, 0, 0])).tolist()
@@ -103,7 +103,8 @@ def scene_of_force(force: object) -> AbstractScene:
 
 
 class FrameWrench(eqx.Module):
-    """Hold the force and the torque on a body in a moving frame S'.
+    """Hold a force and a torque on a body, relative to a moving frame S': the value that the torque
+    model `BodyInFrame` returns for a `Rigid` state.
 
     **Fields:** `force` (3,) on the centre of mass, N, axes of S'; `torque` (3,) about the centre of
     mass, N m, body axes.
@@ -157,7 +158,9 @@ class BodyInFrame(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times (n,), s, at which the real `torque` jumps or has a kink."""
+        """Return the times (n,), s, at which the field `torque`, the real torque or force on the
+        body without the fictitious ones, jumps or has a kink.
+        """
         return jump_times_within(self.torque)
 
     def __call__(self, t: ScalarLike, state: PyTree, body: _inertia.Body) -> Vec3 | FrameWrench:

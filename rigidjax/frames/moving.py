@@ -25,9 +25,9 @@ class MovingFrame(eqx.Module):
     - `rotation`: a function of the time, s, that returns the matrix M (3, 3), S' → S, or the unit
       quaternion (4,) of M. For a frame that is fixed in a body, the function returns the state of
       the body, with `q` and `omega`; a solution of `simulate` (its method `evaluate` is called) or
-      a `FreeBody` is such a function. Derivatives through a solution of `simulate` are in forward
-      mode only. A Module such as `frames.Uniform` may get other numbers without a new compilation;
-      a new `lambda` is compiled again.
+      a `FreeBody` (the exact motion of a free body) is such a function. Derivatives through a
+      solution of `simulate` are in forward mode only. A Module such as `frames.Uniform` may get
+      other numbers without a new compilation; a new `lambda` is compiled again.
     - `origin`: a function of the time that returns the origin X (3,) of S', m, axes of S; `None` if
       the origins of S and S' coincide.
     - `rate`: a function of the time that returns the angular velocity Ω (3,), rad/s, **axes of

@@ -84,8 +84,9 @@ def with_forward_mode_adjoints(rotation: PyTree) -> PyTree:
     """Return the function of time `rotation` with each `diffrax.RecursiveCheckpointAdjoint` in it
     replaced by `diffrax.ForwardMode`.
 
-    The derivative of a frame's angular velocity is computed in forward mode, which is not possible
-    through a `diffrax.RecursiveCheckpointAdjoint`.
+    If `rotation` is a solution of `simulate`, it contains such an object, which says how diffrax
+    differentiates the solve. The derivative of a frame's angular velocity is computed in forward
+    mode, which is not possible through a `diffrax.RecursiveCheckpointAdjoint`.
     """
 
     def reverse(part: PyTree) -> bool:

@@ -92,8 +92,9 @@ def minus_small(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
     """Return the change (n,) from `reference` to a state near it, `state ⊖ reference`, computed
     without an arctangent.
 
-    For two quaternions that differ by a turn of the angle θ, the vector returned therefore has the
-    length 2 sin(θ/2), not θ.
+    For two quaternions that differ by a turn of the angle θ, the three numbers of the change form a
+    vector of the length 2 sin(θ/2), which is near θ for a small turn; the vector of `minus` has the
+    length θ.
 
     - `state`, `reference`: two trees of arrays with one structure
     """

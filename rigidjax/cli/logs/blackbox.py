@@ -26,7 +26,8 @@ from rigidjax.cli.logs.errors import LogError, warn
 # counters of iteration and time have 32 bits, so that they start again from zero where they would
 # reach _WRAP.
 _LONGEST_FRAME, _ITERATION_JUMP, _TIME_JUMP, _WRAP = 256, 5_000, 10_000_000, 2**32
-# This maps each kind of event to the number of integers of variable length that follow the kind.
+# An event is a record of the log without readings. For each kind of event this table has the number
+# of integers of variable length that follow the kind in the log.
 _EVENT_NUMBERS = {0: 1, 14: 2, 15: 1, 30: 2}
 _RESUME, _ADJUSTMENT, _LOG_END = 14, 13, 255
 _END_MARK = b"End of log\0"
@@ -123,7 +124,7 @@ class _Flight:
     def wrap_to_32_bits(self, name: str, values: np.ndarray) -> np.ndarray:
         """Return the `values` of the field `name` as the 32-bit integers that the flight controller
         had: sums of many differences may lie outside of the range of such integers. The time, and
-        the fields of slow frames and GPS frames (records of other quantities than I and P frames),
+        the fields of slow frames and GPS frames (which hold other quantities than I and P frames),
         are returned unchanged.
         """
         if name not in self.main or name == "time":
@@ -173,8 +174,9 @@ class _Flight:
                 values = ()
             size = stream.place - begin
             if not values or size > _LONGEST_FRAME or not self._is_frame_or_end_at(stream.place):
-                # The decoder may have read beyond the letter of the next frame. Reading begins
-                # again after the letter of this frame.
+                # This frame is damaged, so that its decoder may have read beyond the letter with
+                # which the next frame begins. Reading therefore begins again after the letter of
+                # this frame.
                 stream.place, order.is_valid = begin, False
                 self.left_out += is_main
             elif not is_main:
@@ -219,7 +221,7 @@ class _Flight:
         return stream.place == len(self.data) or self.data[stream.place] in self.kinds
 
     def _header_size_in_bytes(self) -> int:
-        """Return the index of the first byte after the header."""
+        """Return the index of the first byte after the header of this flight in the data."""
         place = 0
         while self.data.startswith(b"H ", place):
             place = self.data.index(b"\n", place) + 1
@@ -286,7 +288,8 @@ class _Order:
 
     def resume_after_pause(self, iteration_and_time: Sequence[int]) -> None:
         """Set the iteration and the time of the last frame to those of the event that ends a pause
-        of the logging.
+        of the logging: the next frame is compared with this event, not with the last frame before
+        the pause.
         """
         self.last = self.last_key = tuple(iteration_and_time)
         self.is_resumed = True
@@ -314,16 +317,17 @@ class _Order:
             self.is_valid = self.is_valid and _closely_follows_frame(self.last, values)
         if self.is_valid:
             if is_i_frame:
-                # Time is measured from the last I frame, since a wrong time of a P frame must not
-                # shift later groups.
+                # The time of a frame is computed from the time of the last I frame, since a wrong
+                # time of one P frame must not shift the times of all later frames.
                 elapsed = (values[1] - self.key_time) % _WRAP
                 self.key_time = self.key_time + elapsed if self.groups else values[1]
                 self.groups += 1
             self.time = self.key_time + (values[1] - self.key_time) % _WRAP
             self.last = values
         if is_i_frame:
-            # If two successive I frames do not fit together, either may be damaged. The next I
-            # frame is compared with the later of the two.
+            # The new I frame becomes the last I frame even if it does not closely follow the I
+            # frame before it: either of the two may be damaged, so that the next I frame is
+            # compared with the later of the two.
             self.last_key, self.is_resumed = values, False
         return self.is_valid
 

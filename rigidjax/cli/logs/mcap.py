@@ -13,8 +13,8 @@ from rigidjax.cli.logs.columns import Columns
 
 
 def read_mcap(path: Path, columns: Sequence[str]) -> Columns:
-    """Return two things: the names of all fields of JSON and ROS 2 messages, such as
-    `/imu.angular_velocity.x`; and a dict of the fields that `columns` name.
+    """Return two things: the names of all fields of the JSON and ROS 2 messages in an MCAP log,
+    such as `/imu.angular_velocity.x`; and a dict of the fields that `columns` name.
 
     The fields `topic.log_time` and `topic.stamp` (from the header of a message) are times in s
     since the first message of the file.

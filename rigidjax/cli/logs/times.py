@@ -8,7 +8,8 @@ import numpy as np
 from rigidjax.cli.logs.errors import LogError, warn
 from rigidjax.cli.logs.units import TIME_UNITS, UNITS
 
-# This number of successive rows with bad times means that the clock was set back.
+# If at least this number of successive rows do not fit into the increasing times of the log, but
+# have increasing times themselves, the clock was set back.
 _RESTART = 5
 # A log must have at least this number of rows.
 _FEWEST = 4

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from rigidjax.cli.logs.errors import LogError, warn
 
-# The product of a value in a unit and this factor is the value in SI units.
+# This table has a factor for each unit: the product of a value in the unit and the factor is the
+# value in SI units.
 UNITS = {
     "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "mm": 1e-3, "m/s2": 1.0, "g": 9.80665,
     "1": 1.0, "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180,

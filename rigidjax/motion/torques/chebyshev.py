@@ -54,13 +54,15 @@ class Chebyshev(eqx.Module):
         self.step = _checks.require_positive(step, "step", "a positive length, s").astype(dtype)
 
     def __call__(self, t: ScalarLike) -> Any:
-        """Return the value (k,) at the time `t`, s; NaN outside of the intervals."""
+        """Return the value (k,) of the Chebyshev series at the time `t`, s; NaN if t is outside of
+        all intervals.
+        """
         count, _, terms = self.coefficients.shape
         place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
         i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 1)
         x = 2 * (place - i.astype(place.dtype)) - 1
-        # Without the barrier, XLA on CPU reads the table again for every number that is computed
-        # from the row.
+        # Without this optimisation barrier, XLA on CPU reads the table again for every number that
+        # is computed from the row.
         x, row = barrier((x, self.coefficients[i]))
         value, before = jnp.zeros_like(row[:, 0]), jnp.zeros_like(row[:, 0])
         for n in range(terms - 1, 0, -1):

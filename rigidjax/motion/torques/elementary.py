@@ -35,9 +35,10 @@ class ConstantTorque(base.AbstractTorque):
 class InSpace(base.AbstractTimeTorque):
     """Apply a torque given in the world frame: `τ = Rᵀ τ_w`, with the attitude R of the body.
 
-    **Arguments:** `torque` τ_w, N m, world frame: (3,), or a function of time, t → (3,), such as
-    `Linear(times, values)`. In a time t a constant τ_w adds τ_w t to the angular momentum in the
-    world frame; the component of this momentum normal to τ_w is conserved.
+    **Arguments:** `torque` τ_w, N m, world frame: (3,), or a function of time, t → (3,), that is an
+    `equinox.Module`, such as `Linear(times, values)`, straight lines between samples. In a time t a
+    constant τ_w adds τ_w t to the angular momentum in the world frame; the component of this
+    momentum normal to τ_w is conserved.
 
     >>> turned = rj.Attitude([0.0, 1.0, 0.0, 0.0], [0.0, 0, 0])  # half a turn about x
     >>> InSpace([0.0, 0.0, 1.0])(0.0, turned, None).tolist()  # in body axes

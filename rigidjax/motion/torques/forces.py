@@ -154,8 +154,8 @@ class Rotors(base.AbstractForce):
       turns in the opposite sense.
     - `thrust`: k, N s²/rad², one number or (R,).
     - `drag`: c, N m s²/rad², one number or (R,).
-    - `speeds`: n (R,), rad/s: constant, a function of time such as `Held(times, values)`, or
-      `Input("speeds")`, whose values are given when a motion is computed.
+    - `speeds`: n (R,), rad/s: constant, a function of time that is an `equinox.Module`, such as
+      `Held(times, values)`, or `Input("speeds")`, whose values are given when a motion is computed.
 
     Source: Mahony, Kumar and Corke 2012, Multirotor aerial vehicles, eqs 4–6,
     doi:10.1109/MRA.2012.2206474.

@@ -62,9 +62,10 @@ class _ConstantFunction(eqx.Module):
 class Delayed(eqx.Module):
     """Delay a function of time: `t → source(t − delay)`.
 
-    **Arguments:** `source` a function of time such as `Held(times, values)`, or `Input("u")`;
-    `delay` s, one number, which may be free in a fit; a negative delay shifts the function to
-    earlier times.
+    **Arguments:** `source` a function of time such as `Held(times, values)` (samples, each of which
+    holds until the next), or `Input("u")` (a signal whose values are given when a motion is
+    computed); `delay` s, one number, which may be free in a fit; a negative delay shifts the
+    function to earlier times.
 
     The times at which the source jumps (its attribute `jump_times`) move with the delay. `simulate`
     ends steps at these times, so that the derivative of a motion with respect to the delay is
@@ -127,7 +128,8 @@ class Lagged(eqx.Module):
 
     **Arguments:**
 
-    - `source`: u, a function of time such as `Held(times, values)`, or `Input("u")`.
+    - `source`: u, a function of time such as `Held(times, values)` (samples, each of which holds
+      until the next), or `Input("u")` (a signal whose values are given when a motion is computed).
     - `time`: the time constant T, s, > 0, one number or one for each channel of u; it may be free
       in a fit.
     - `start`: the value of y at the start of the motion, or `None` for the value of u at the start.

@@ -40,12 +40,13 @@ class Linear(_Table):
     beyond the ends.
 
     **Arguments:** `times` (n,) s, increasing; `values` (n, *k), any number of channels: (n, 3) for
-    `InSpace`, `Flywheel`, `MagneticDipole`, `GravityGradient`, (n, R) for `Rotors`, (n, 3, 3) for
-    `ChangingInertia`. Both may be traced. The derivative at a row is the slope of the line after
-    this row. `Series` is a cubic spline through evenly spaced rows, which has no kinks.
+    a vector in the torques `InSpace`, `Flywheel`, `MagneticDipole` and `GravityGradient`, (n, R)
+    for the speeds of R rotors in `Rotors`, (n, 3, 3) for the inertia in `ChangingInertia`. Both may
+    be traced. The derivative at a row is the slope of the line after this row. `Series` is a cubic
+    spline through evenly spaced rows, which has no kinks.
 
-    **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
-    increase, NaN.
+    **Raises:** `ValueError` for fewer than two rows, numbers of times and rows that differ, times
+    that do not increase, or NaN.
 
     >>> Linear([0.0, 2.0], [[0.0, 0, 0], [0.0, 0, 4]])(1.0)
     Array([0., 0., 2.], dtype=float64)

@@ -86,8 +86,8 @@ class GravityGradient(base.AbstractTimeTorque):
 
     - `mu`: μ, m³/s², the constant of gravitation times the mass of the point mass.
     - `position`: the vector (3,), in metres, world frame, from the body to the point mass:
-      constant, or a function of time, t → (3,), for an orbit. Without `harmonics` its sign does not
-      matter.
+      constant, or, for an orbit, a function of time, t → (3,), that is an `equinox.Module`, such as
+      a `Chebyshev`. Without `harmonics` its sign does not matter.
     - `harmonics`: the coefficients C and S of Hₙ, an array (2n + 1,) for each degree n = 3, 4, …,
       in kg times metreⁿ and in body axes. They are the mass of the body times the n-th power of its
       reference radius times its Stokes coefficients (Cn0, Cn1, Sn1, Cn2, Sn2, …), not normalised.
@@ -242,8 +242,9 @@ class MagneticDipole(base.AbstractTimeTorque):
     `τ = m × RᵀB`, with the potential energy `U = −m·RᵀB`; R is the attitude.
 
     **Arguments:** `moment` m (3,), in ampere metre², body frame; `field` B, in tesla, world frame:
-    (3,), or a function of time, t → (3,), for a field that changes along an orbit. Source: Jackson,
-    Classical Electrodynamics, eqs 5.71, 5.72.
+    (3,), or, for a field that changes along an orbit, a function of time, t → (3,), that is an
+    `equinox.Module`, such as `Linear(times, values)`. Source: Jackson, Classical Electrodynamics,
+    eqs 5.71, 5.72.
 
     >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> MagneticDipole([0.0, 0.0, 2.0], [3.0, 0.0, 0.0])(0.0, state, None).tolist()  # z × x = y

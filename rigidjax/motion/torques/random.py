@@ -66,7 +66,9 @@ class CorrelatedTorque(AbstractTorque):
 
     @property
     def deviation(self) -> Vec3:
-        """Return the standard deviation (3,) of the torque at any time, N m."""
+        """Return the standard deviation (3,), N m, of this torque noise at any time, about each
+        body axis.
+        """
         return jnp.sqrt(0.5 * self.density / self.time)
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:

@@ -82,8 +82,8 @@ class Series(eqx.Module):
         i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, n - 2)
         s = place - i.astype(place.dtype)
         rows = self.values[i], self.values[i + 1], self.slopes[i], self.slopes[i + 1]
-        # Without the barrier, XLA on CPU reads the table again for every number that is computed
-        # from the rows.
+        # Without this optimisation barrier, XLA on CPU reads the table again for every number that
+        # is computed from the rows.
         s, (left, right, out, into) = barrier((s, rows))
         # The cubic polynomial between two samples is determined by their values, `left` and
         # `right`, and by their slopes, `out` and `into`; it is written here as a Taylor series at
@@ -134,8 +134,9 @@ class Wheel(eqx.Module):
     """Describe the momentum of a wheel whose speed was logged: `h = J w(t) a`, about an axis a that
     is fixed in the body.
 
-    Pass a wheel to `Flywheel`: if the momentum of a wheel is known, a fit determines the absolute
-    inertia of a body, not only ratios of moments of inertia. **Arguments:**
+    Pass a wheel to `Flywheel`, the torque of wheels inside a body: if the momentum of a wheel is
+    known, a fit determines the absolute inertia of a body, not only ratios of moments of inertia.
+    **Arguments:**
 
     - `inertia`: J, kg m², about the axis.
     - `axis`: a (3,), a unit vector, body frame.

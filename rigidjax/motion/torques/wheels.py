@@ -30,8 +30,9 @@ class Flywheel(base.AbstractTimeTorque):
     """Apply the torque of internal wheels to the body: `τ = h × Ω − dh/dt`.
 
     **Arguments:** `momentum` h, N m s, body frame, the sum over all wheels: (3,) for wheels of
-    constant speed, or a function of time, t → (3,), such as `Linear(times, values)`, but not a
-    function that jumps (`Held`, samples of an `Input`), because dh/dt acts on the body.
+    constant speed, or a function of time, t → (3,), that is an `equinox.Module`, such as
+    `Linear(times, values)` (straight lines between samples), but not a function that jumps, such as
+    `Held` (samples, each of which holds until the next), because dh/dt acts on the body.
 
     The inertia I of the body and h must belong together. If I is the inertia of the body with its
     wheels locked, h is the momentum of the wheels relative to the body. If the moments of inertia J
@@ -88,7 +89,8 @@ class ReactionWheels(base.AbstractTorque):
     - `axes` a (R, 3), body frame, unit; `inertia` J (R,) kg m² about them; `speeds` s (R,) rad/s
       relative to the body, at the start.
     - `motor`: the torque of each motor on its wheel (R,), N m, positive if it increases s:
-      constant, a function of time such as `Held(times, values)`, `Input("motor")`, or `None`.
+      constant, a function of time such as `Held(times, values)`, `Input("motor")` (a signal whose
+      values are given when a motion is computed), or `None`.
     - `feedback`: a function `(t, state, speeds) → (R,)`, N m, added to `motor`; or `None`.
     - `max_torque` N m, `max_speed` rad/s, each one number, (R,), or `None` for no limit. The torque
       of motor and feedback is limited to `max_torque`. A torque that would bring a wheel beyond
