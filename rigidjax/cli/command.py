@@ -47,8 +47,8 @@ def main(arguments: list[str] | None = None) -> int:
     if options.command is None:
         parser.print_help()
         return 0
-    # A library must not change this setting of JAX. Here it may be changed, since this is a program
-    # of its own.
+    # JAX computes in float64 from here on. A library must not change this setting of JAX, but this
+    # is a program of its own.
     jax.config.update("jax_enable_x64", True)
     if options.command == "identify" and options.demo == bool(options.logs):
         parser.error("identify: give either log FILES or --demo")
@@ -294,8 +294,8 @@ def _make_parser() -> argparse.ArgumentParser:
 
 
 def _run_demo(options: argparse.Namespace) -> int:
-    """Run the demo, the fit of asteroid Toutatis, with the `options` of the command line, and
-    return the exit code.
+    """Run the demo with the `options` of the command line, and return the exit code. The demo fits
+    the motion of the tumbling asteroid Toutatis to radar observations.
     """
     from rigidjax.datasets import toutatis
 

@@ -198,8 +198,8 @@ def read_log(
     turning = dict.fromkeys(w.column for w in wheels)
     names = [time, *(c for one in channels for c in one.columns), *turning]
     table = read_table(path, names, flight=flight)
-    # Times are taken since the first stamp: in seconds or nanoseconds since 1970 they would have
-    # few digits left for the steps.
+    # The times are counted from the first time stamp: times since 1970, in seconds or nanoseconds,
+    # are so large that float64 has few digits left for the steps between them.
     t = (table[time] - _first_finite_time(table[time])) * UNITS[unit]
     kept = rows_to_use(path, t, time, window)
     # A slice is used if all rows are kept, since indexing with a slice makes no copy of a large
@@ -352,8 +352,8 @@ def _wheel_speed_series(
     - `wheels`: the wheels, with the column and the unit of their speeds.
     """
     speeds = {}
-    # Speeds outside of the window are kept as well, since a delayed speed is from a time before the
-    # reading.
+    # The speeds of the wheels are kept also at times outside of the window, since a delayed speed
+    # is from a time before that of the reading.
     kept = mask_of_increasing(t) if wheels else slice(None)
     for name, one in zip(names_of_wheel_speeds(wheels), wheels, strict=True):
         unit = unit_of_columns([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))

@@ -105,7 +105,9 @@ class Force(AbstractScene):
 
 
 def checked_force_per_mass(value: NumbersLike, force: object) -> Vec3:
-    """Return `value`, the value of a user's `force`, after a check that its shape is (3,)."""
+    """Return `value`, a value of the function `force` that a user gave, after a check that its
+    shape is (3,).
+    """
     name = getattr(force, "__name__", type(force).__name__)
     return _checks.array_of_shape(value, (3,), f"force {name}", hint="force per mass, m/s²")
 

@@ -58,9 +58,11 @@ class Earth(AbstractScene):
         return {"jacobi": self.jacobi_integral(state)}
 
     def jacobi_integral(self, state: Point) -> Scalar:
-        """Return the Jacobi integral ½|v'|² + g z − ½|Ω × x'|², m²/s², conserved along the motion.
+        """Return the Jacobi integral ½|v'|² + g z − ½|Ω × x'|², m²/s², which free fall on the
+        turning Earth conserves.
 
-        Here x' and v' are the position and velocity of `state`, z is the height, and g `gravity`.
+        Here x' and v' are the position and velocity of `state`, in the axes east, north, up; z is
+        the height, g the field `gravity`, and Ω the Earth's angular velocity.
         """
         require_point(state)
         x, v = components(state.x), components(state.v)
@@ -210,8 +212,8 @@ class Foucault(AbstractScene):
         return Point(jnp.stack([ex, ey, -self.length.astype(t.dtype)]), jnp.stack([wx, wy, zero]))
 
     def precession_rate(self) -> Scalar:
-        """Return the rate at which the plane of small swings turns, rad/s: −Ω sin λ, with the rate
-        Ω of the Earth and the latitude λ.
+        """Return the rate at which the plane of small swings of the pendulum turns, rad/s: −Ω sin
+        λ, with the rate Ω of the Earth and the latitude λ.
 
         Seen from above, the plane turns clockwise in the northern hemisphere, where λ > 0.
 

@@ -74,8 +74,8 @@ def plus(state: PyTree, change: Float[Array, " n"]) -> PyTree:
 
 
 def minus(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
-    """Return the change (n,) from one state to another, `state ⊖ reference`: the vector with
-    `plus(reference, change) = state`.
+    """Return the change (n,) from one state to another, `state ⊖ reference`: the vector `change`
+    for which `plus(reference, change)` is `state`.
 
     - `state`, `reference`: two trees of arrays with one structure; the quaternions of the two may
       differ by a turn of up to π
@@ -123,7 +123,7 @@ def tangent_to_vector(state: PyTree, tangent_vector: PyTree) -> Float[Array, " n
     inverse of `vector_to_tangent`.
 
     - `state`: a tree of arrays
-    - `tangent_vector`: a tree like `state`, with the derivative of each leaf; dq (4,) for a
+    - `tangent_vector`: a tree like `state`, with the derivative of each leaf, such as dq (4,) for a
       quaternion q
     """
     return _concatenate_over_leaves(

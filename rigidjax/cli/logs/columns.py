@@ -2,5 +2,6 @@
 
 from typing import Any
 
-# A reader returns the names of all columns, and the arrays of the wanted columns by name.
+# The function that reads logs of one format returns this pair: the names of all columns of the log,
+# and a dict of the arrays of the wanted columns by name.
 Columns = tuple[list[str], dict[str, Any]]

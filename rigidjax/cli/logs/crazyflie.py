@@ -39,11 +39,12 @@ def read_crazyflie(path: Path, columns: Sequence[str]) -> Columns:
         size, at = struct.unpack_from("<H", data, at)[0], at + 2
         names, kinds = ["timestamp"], "I" if version == 1 else "Q"
         for _ in range(size):
-            # Each word is a name and the type of its number, such as `gyro.x(f)`.
+            # In the header of the log each variable of an event is one word: its name and the type
+            # of its numbers, such as `gyro.x(f)`.
             word, at = text(at)
             names, kinds = [*names, word[:-3]], kinds + word[-2]
         events[key] = names, struct.Struct("<" + kinds), array("d")
-    # The last four bytes are a check sum.
+    # The last four bytes of the log are a check sum, not data.
     while at < len(data) - 4:
         _, form, rows = events[struct.unpack_from("<H", data, at)[0]]
         rows.extend(form.unpack_from(data, at + 2))

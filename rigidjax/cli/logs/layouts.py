@@ -36,8 +36,9 @@ _UNITS[".bfl"] = _UNITS[".bbl"]
 
 
 def known_unit_of_column(path: str | Path, column: str) -> str | None:
-    """Return the unit that a column has in every log of this format, or `None` if the format does
-    not determine the unit; the ending of `path` tells the format.
+    """Return the unit that the column named `column` has in every log of one format, or `None` if
+    the format does not determine the unit. The format is that of the log at `path`, and follows
+    from the ending of this name.
     """
     units = _UNITS.get(lowercase_file_ending(Path(path)), {})
     return next((units[part] for part in re.split(r"[.\[]", column) if part in units), None)
@@ -51,8 +52,8 @@ def imu_columns_of(path: str | Path) -> ImuColumns:
     writes the same units in all languages, but not the same words.
     """
     path = Path(path)
-    # Errors are suppressed here, since the reader of the log raises them later with better
-    # messages.
+    # Errors of a log that cannot be read are suppressed here, since the function that reads the log
+    # raises them later with better messages.
     with contextlib.suppress(Exception):
         if lowercase_file_ending(path) in BINARY:
             return _imu_columns_of_binary(path) or USUAL

@@ -69,12 +69,14 @@ class AbstractTorque(eqx.Module):
     - `internal_momentum(t)` (3,), N m s, body frame, a method that returns the momentum of parts
       inside the body, such as wheels. A torque with this method is not an external torque.
 
-    **States of its own** (a motor's speed, a wheel, a bias that drifts): give the torque `state0`,
-    a tree of arrays or a method `(t, state, body)` that returns one, and a method `rate(t, own,
-    state, body)`, the derivative of these states. The torque is then called as `(t, state, body,
-    own)`. `simulate` (`sol.own`), `batch.rollout`, `batch.simulate` and `identify.fit` integrate
-    the states of the torque with the body's state. A function of time inside a torque may have
-    states, too (`Lagged`); it is called as `(t, own)`. No base class is needed:
+    **States of its own** (such as the speed of a motor, or a bias that drifts): give the torque two
+    more members. `state0` is a tree of arrays with the initial values of these states, or a method
+    `(t, state, body)` that returns such a tree; the method `rate(t, own, state, body)` returns the
+    derivatives with respect to time of the states, whose values are in `own`. The torque is then
+    called as `(t, state, body, own)`. `simulate` (which returns the states as `sol.own`),
+    `batch.rollout`, `batch.simulate` and `identify.fit` integrate the states of the torque with the
+    body's state. A function of time inside a torque, such as the delayed response `Lagged` of a
+    motor, may have states, too; it is called as `(t, own)`. No base class is needed:
 
     >>> import equinox as eqx
     >>> class Fading(eqx.Module):
@@ -113,7 +115,9 @@ class AbstractForce(eqx.Module):
 
 
 class AbstractTimeTorque(AbstractTorque):
-    """Define a torque with vectors as fields, each of which may be a function of time."""
+    """Define a torque with vectors as fields, such as a magnetic field, each of which is constant
+    or a function of time.
+    """
 
     @property
     def steady(self) -> bool:
@@ -134,13 +138,16 @@ class AbstractTimeTorque(AbstractTorque):
 # user's own torque need not be a subclass of `AbstractTorque`.
 Torque = AbstractTorque | AbstractForce | Callable[[Any, Any, Any], Any]
 
-# The type of a state, as a torque declares it in `feels`.
+# This is the type of the attribute `feels` of a torque, which is a class: the smallest state of
+# motion that the torque can read.
 StateType = type
-# A vector (3,), world frame, along which a torque has no component.
+# This is the type of the attribute `axis` of a torque: a vector (3,), world frame, along which the
+# torque has no component.
 AxisWithoutTorque = Vec3
-# The types of the states that a torque may act on, the smallest state first.
+# These are the classes of states that a torque may declare in `feels`: with the body rate, also
+# with the attitude, also with position and velocity. A later class has all parts of an earlier one.
 STATE_TYPES_BY_SIZE = (HasSpin, HasAttitude, HasPose)
-# The advice at the end of a message about a wrong vector of gravity.
+# The message about a wrong vector of gravity ends with this advice.
 GRAVITY_HINT = "a vector in world axes, such as [0, 0, -9.81]"
 
 

@@ -23,7 +23,7 @@ class Chebyshev(eqx.Module):
     from −1 to 1 along the interval. All arguments may be traced.
 
     `GravityGradient` and `Tide` take such a function as the `position` of a point mass; the
-    position then has all digits of the table. The value is NaN outside of the intervals.
+    position then has the full precision of the table. The value is NaN outside of the intervals.
     **Raises:** `ValueError` for a step that is not positive. The sum is computed by Clenshaw's
     recurrence (1955, Mathematical Tables 9:118).
 

@@ -149,8 +149,9 @@ class ChangingInertia(eqx.Module):
     jump_times = property(base.jump_times_of_fields)
 
     def tensor(self, t: ScalarLike, state: PyTree = None, body: Body | None = None) -> Mat3:
-        """Return the inertia tensor I (3, 3), kg m², body frame, at the time `t`, s. If `inertia`
-        is a function of time, `state` and `body` are not used.
+        """Return the inertia tensor I (3, 3), kg m², body frame, at the time `t`, s. The arguments
+        `state` and `body` are not used if the field `inertia` of this `ChangingInertia` is a
+        function of time.
         """
         arguments = (t, state, body) if hasattr(self.inertia, "feels") else (t,)
         inertia = self.inertia(*arguments)
@@ -181,8 +182,9 @@ class ChangingInertia(eqx.Module):
         if self.torque is not None:
             force, torque = base.force_and_torque(self.torque, t, state, with_tensor(body, now))
             turning = turning + torque
-        # The equations of motion use the fixed inertia of `body`, not the changing inertia I. The
-        # torque that is returned is the torque with which these equations give the right Ω̇.
+        # Euler's equations, to which the returned torque is added, use the fixed inertia of `body`,
+        # not the changing inertia I. The torque is therefore computed such that Euler's equations
+        # with the fixed inertia give the right Ω̇.
         fixed = tensor_of(body)
         slope = solve(slopes[1:].T, turning)
         torque = apply(fixed, slope) - cross(apply(fixed, omega), omega)

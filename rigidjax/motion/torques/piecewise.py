@@ -29,8 +29,8 @@ class _Table(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times (n,) of the table, s, at each of which the quantity jumps or has a
-        kink.
+        """Return the times (n,) of the rows of this table, s, at each of which the tabulated
+        quantity jumps or has a kink.
         """
         return self.times
 
@@ -150,7 +150,9 @@ class Pulses(AbstractTorque):
 
     @property
     def jump_times(self) -> Float[Array, " edges"]:
-        """Return the edges (n + 1,), s, the times at which the torque jumps."""
+        """Return the times (n + 1,), s, at which this torque of n pulses jumps: the edges of the
+        pulses.
+        """
         return self.edges
 
     @property

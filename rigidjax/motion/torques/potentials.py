@@ -165,7 +165,8 @@ class GravityGradient(base.AbstractTimeTorque):
         """
         r = base.vector_at(self.position, t, "position")
         distance = jnp.sqrt(dot(r, r))
-        # r³ overflows in float32 beyond 7e12 m: divide by r three times instead.
+        # The strength μ/r³ is computed by three divisions by the distance r, because r³ overflows
+        # in float32 beyond r = 7e12 m.
         strength = self.mu / distance / distance / distance
         u = quaternion.rotate_inverse(state.q, r / distance)
         slopes, factor = [], strength

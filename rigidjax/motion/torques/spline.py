@@ -76,8 +76,8 @@ class Series(eqx.Module):
         """
         n = self.values.shape[0]
         place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
-        # `jnp.where` is used, not `jnp.clip`: exactly at an end, `jnp.clip` has half the
-        # derivative.
+        # `jnp.where` is used here, not `jnp.clip`: exactly at the first and the last sample the
+        # derivative of `jnp.clip` is ½, which would halve the derivative of the spline.
         place = jnp.where(place < 0.0, 0.0, jnp.where(place > n - 1.0, n - 1.0, place))
         i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, n - 2)
         s = place - i.astype(place.dtype)

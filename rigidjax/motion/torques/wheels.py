@@ -32,7 +32,8 @@ class Flywheel(base.AbstractTimeTorque):
     **Arguments:** `momentum` h, N m s, body frame, the sum over all wheels: (3,) for wheels of
     constant speed, or a function of time, t → (3,), that is an `equinox.Module`, such as
     `Linear(times, values)` (straight lines between samples), but not a function that jumps, such as
-    `Held` (samples, each of which holds until the next), because dh/dt acts on the body.
+    `Held` or an `Input` with samples that are held until the next one, because dh/dt acts on the
+    body.
 
     The inertia I of the body and h must belong together. If I is the inertia of the body with its
     wheels locked, h is the momentum of the wheels relative to the body. If the moments of inertia J
