@@ -268,7 +268,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def _make_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
+    """Return the parser of the command line, with all commands and their options."""
     parser = _EscapingParser(
         prog="python -m rigidjax",
         description="Differentiable rigid-body mechanics for JAX: identify inertia from data.",
@@ -419,8 +419,8 @@ def _print_or_raise_log_warnings(strict: bool) -> Iterator[None]:
 
 
 def _run_logs(options: argparse.Namespace) -> int:
-    """Fit the model to the logs that the `options` of the command line name, print and write the
-    report, and return the exit code.
+    """Fit the model that the `options` of the command line describe to the logs that they name,
+    print and write the report, and return the exit code.
     """
     try:
         with _print_or_raise_log_warnings(options.strict):

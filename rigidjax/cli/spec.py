@@ -307,8 +307,8 @@ def _sensor_and_readings(
 
 
 def names_of_wheel_speeds(wheels: Sequence[WheelColumn]) -> list[str]:
-    """Return the names of the inputs that hold the speeds of the wheels: `wheel` for one wheel,
-    `wheel 1`, `wheel 2`, … for several.
+    """Return the names of the inputs of a recording, which are signals that torques read by name,
+    that hold the speeds of the wheels: `wheel` for one wheel, `wheel 1`, `wheel 2`, … for several.
     """
     return [f"wheel {i + 1}" if len(wheels) > 1 else "wheel" for i in range(len(wheels))]
 

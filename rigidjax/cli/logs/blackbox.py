@@ -83,9 +83,10 @@ def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None)
 
 
 class _Bytes:
-    """Provide bytes one by one to the decoders of the package orangebox.
+    """Provide the bytes of a Blackbox log one by one to the package orangebox, which decodes the
+    numbers in such logs.
 
-    `place` is the index of the next byte.
+    The field `place` is the index of the byte that is read next.
     """
 
     def __init__(self, data: bytes, place: int):

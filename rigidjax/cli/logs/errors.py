@@ -8,7 +8,7 @@ from rigidjax import _checks
 
 
 class LogError(ValueError):
-    """Describe why a log cannot be read.
+    """Describe why a log, which is a file of measurements, cannot be read.
 
     The message names the file and, if they are known, the line and the column.
     """
@@ -21,7 +21,9 @@ class LogError(ValueError):
 
 
 class LogWarning(UserWarning):
-    """Describe which part of a log is left out, or why its units are doubtful."""
+    """Describe which part of a log (a file of measurements) is left out, or why the units of the
+    log are doubtful.
+    """
 
 
 def warn(words: str) -> None:

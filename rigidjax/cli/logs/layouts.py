@@ -11,10 +11,10 @@ from rigidjax.cli.logs.units import TIME_UNITS, unit_in_column_name
 
 
 class ImuColumns(NamedTuple):
-    """Hold the columns of time and rates of a log.
+    """Hold the names and units of the columns of a log with the times and the body rates.
 
-    **Fields:** `columns` the names of the columns of the time and of the three rates; `unit` the
-    unit of the rates; `time_unit` the unit of the time.
+    **Fields:** `columns` four names: of the column of the times, and of the columns of the body
+    rates about x, y and z; `unit` the unit of the rates; `time_unit` the unit of the times.
     """
 
     columns: tuple[str, str, str, str]
@@ -45,8 +45,8 @@ def known_unit_of_column(path: str | Path, column: str) -> str | None:
 
 
 def imu_columns_of(path: str | Path) -> ImuColumns:
-    """Return the columns of time and rates of a log, or the usual columns t, wx, wy, wz if they are
-    not known.
+    """Return the columns of the times and the body rates of a log, or the usual columns t, wx, wy,
+    wz if the columns of this log are not known.
 
     The columns of a text log are found by the units in their names: the app phyphox, for example,
     writes the same units in all languages, but not the same words.
@@ -63,8 +63,8 @@ def imu_columns_of(path: str | Path) -> ImuColumns:
 
 
 def _imu_columns_by_units_in_names(column_names: list[str]) -> ImuColumns | None:
-    """Return the columns of a text log whose names contain the unit of a time or of a rate about x,
-    y or z.
+    """Return the columns of a text log whose names contain the unit of a time, or an axis x, y or z
+    and the unit of a body rate.
 
     The result is `None` unless there is exactly one such column for the time and one for the rate
     about each axis.
@@ -82,7 +82,9 @@ def _imu_columns_by_units_in_names(column_names: list[str]) -> ImuColumns | None
 
 
 def _imu_columns_of_binary(path: Path) -> ImuColumns | None:
-    """Return the columns of time and rates of a binary log, or `None` if it has no rates."""
+    """Return the columns of the times and the body rates of a binary log, with their units, or
+    `None` if the log has no body rates.
+    """
     columns = _time_and_rate_columns_of_binary(path)
     if columns is None:
         return None
@@ -93,8 +95,8 @@ def _imu_columns_of_binary(path: Path) -> ImuColumns | None:
 
 
 def _time_and_rate_columns_of_binary(path: Path) -> tuple[str, str, str, str] | None:
-    """Return the names of the time and of the rates in a binary log, or `None` if it has no
-    rates.
+    """Return the names of the fields of a binary log with the times and with the body rates about
+    x, y and z, or `None` if the log has no body rates.
     """
     kind = lowercase_file_ending(path)
     if kind in (".bbl", ".bfl"):

@@ -59,8 +59,8 @@ class _Json:
 
 
 def _named_numbers_in(content: object, name: str = "") -> Iterator[tuple[str, float]]:
-    """Yield a pair for each number in a message: the name of the place of the number, such as
-    `gyro.x`; and the number as a float.
+    """Yield a pair for each number in a message: the names of the fields that lead to the number,
+    such as `gyro.x`, or `gyro[0]` for the first number of an array; and the number as a float.
 
     - `content`: the message, or a field inside it
     - `name`: the name of this field, empty for the message
