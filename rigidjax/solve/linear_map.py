@@ -80,10 +80,11 @@ def _array_with_derivatives_of_jvp(
 def nan_derivatives_where_not_finite(tree: PyTree, inputs: PyTree) -> PyTree:
     """Return the arrays of `tree`, in which each number that is not finite gets NaN derivatives.
 
-    The derivatives are with respect to all numbers in the tree `inputs`, in forward and in reverse
-    mode. They are needed because a run sets a state that it did not reach to NaN by `jnp.where`,
-    which would give this state the wrong derivative 0. If later code does not use a number that is
-    not finite, the cotangent of this number is 0, and the number does not change the gradient.
+    The derivatives of such a number with respect to all numbers in the tree `inputs` are NaN, in
+    forward and in reverse mode. A run uses this function because it sets a state that it did not
+    reach to NaN by `jnp.where`, which gives this state the wrong derivative 0. If later code does
+    not use a number that is not finite, the cotangent of this number is 0, and the number does not
+    change the gradient.
     """
     smooth, rest = eqx.partition(tree, eqx.is_inexact_array)
     outs, structure = jax.tree.flatten(smooth)

@@ -65,9 +65,9 @@ def momentum_change_and_turn(
         for a, b, c, d in zip(left, between, right, cross(left, right), strict=True)
     )
     half = barrier(half)
-    # These are short power series of cos a − 1 and (sin a)/a, where a is half of the angle of the
-    # turn. They lose digits only if the step turns the body by more than a radian; then the method
-    # itself has no correct digits.
+    # The numbers `c` and `s` are short power series of cos a − 1 and (sin a)/a, where a is half of
+    # the angle by which the body turns in the step, and `x` is a². The series lose digits only if
+    # this angle is more than a radian; then the method itself has no correct digits.
     x = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
     c = x * (-1 / 2 + x * (1 / 24 + x * (-1 / 720 + x * (1 / 40320))))
     s = 1.0 + x * (-1 / 6 + x * (1 / 120 + x * (-1 / 5040 + x * (1 / 362880))))

@@ -53,10 +53,10 @@ class _EquationsUnderChangingInertia(eqx.Module):
 class ByMomentum(eqx.Module):
     """Compute the time derivative of the state of a body whose inertia changes with the time.
 
-    A state of the run has the rate Ω̃ = I₀⁻¹ p in the place of the body rate Ω. Here p = I(t) Ω is
-    the momentum, I(t) the inertia at the time t, and I₀ the inertia of the body that `simulate` was
-    given. The method `replace_rate_by_momentum` replaces Ω by Ω̃, and `restore_body_rate` replaces
-    Ω̃ by Ω.
+    While such a motion is integrated, its states have the rate Ω̃ = I₀⁻¹ p in the place of the body
+    rate Ω. Here p = I(t) Ω is the momentum, I(t) the inertia at the time t, and I₀ the inertia of
+    the body that `simulate` was given. When I(t) jumps, Ω jumps, too, but Ω̃ does not. The method
+    `replace_rate_by_momentum` replaces Ω by Ω̃, and `restore_body_rate` replaces Ω̃ by Ω.
     """
 
     field: Any  # an `_EquationsUnderChangingInertia`, or a `CoupledEquations` that contains it
@@ -128,7 +128,8 @@ def changing_inertia_of_torque(torque: Any) -> ChangingInertia | None:
     takes it in the place of a torque. If the torque is a `Sum` whose only part is a
     `ChangingInertia`, this part is returned.
     """
-    # The argument may also be a scene of particles or `None`, which are no torques.
+    # The argument `torque` may also be a scene of particles, another torque or `None`, which are
+    # not searched for parts.
     parts = parts_of(torque) if isinstance(torque, ChangingInertia | Sum) else ()
     return parts[0] if len(parts) == 1 and isinstance(parts[0], ChangingInertia) else None
 

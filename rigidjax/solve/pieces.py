@@ -25,9 +25,10 @@ from rigidjax.solve.batching import Arrays
 from rigidjax.solve.linear_map import linear_map
 from rigidjax.solve.stops import trace_program
 
-# An iteration of the loop has about `_LONG` operations, and at most `_MOST` steps. Measured: a
-# kernel twice as long takes four times as long to compile and is no faster; with a kernel half as
-# long the run takes a third longer.
+# The loop over the steps takes several steps in each iteration, which is one kernel on a GPU. An
+# iteration has about `_LONG` operations, and at most `_MOST` steps. Measured: a kernel twice as
+# long takes four times as long to compile and is no faster; with a kernel half as long the run
+# takes a third longer.
 _LONG, _MOST = 2800, 8
 
 
@@ -177,8 +178,8 @@ def take_equal_steps_on_gpu(
     start, tree = jax.tree.flatten(y)
     one = trace_program(lambda y, i: jax.tree.leaves(step(tree.unflatten(y), i)), start, first)
     turn = min(max(_LONG // len(one.closed.jaxpr.eqns), 1), _MOST)
-    # The number of steps in an iteration is a power of two, because the length of a piece is often
-    # a multiple of a power of two.
+    # `turn` is how many steps are taken in one iteration of the loop over the steps. It is a power
+    # of two, because the number of steps in a piece is often a multiple of a power of two.
     turn = 1 << (turn.bit_length() - 1)
     program, constants = _StepsInPieces(one.call, count, turn), one.jax_constants
     number = len(constants)

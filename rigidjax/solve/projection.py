@@ -77,8 +77,9 @@ class Projected(dfx.AbstractWrappedSolver):
     term_compatible_contr_kwargs = _make_property_of_member(
         "solver", "term_compatible_contr_kwargs"
     )
-    # Adjoints of diffrax set `scan_kind` on a Runge–Kutta method, and controllers set the members
-    # of the root finder on an implicit method; they look for these members on this wrapper.
+    # Adjoints of diffrax set `scan_kind` on a Runge–Kutta method, and step controllers set the
+    # members of the root finder on an implicit method. They look for these members on the
+    # `Projected`, which therefore passes on those of the solver inside it.
     scan_kind = _make_property_of_member("solver", "scan_kind")
     root_finder = _make_property_of_member("solver", "root_finder")
     root_find_max_steps = _make_property_of_member("solver", "root_find_max_steps")

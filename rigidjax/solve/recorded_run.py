@@ -28,10 +28,11 @@ def run_with_replayed_derivatives(
     """Run one body, with derivatives that repeat the recorded steps of the run.
 
     **Returns** two things: the states (K, n) at the K saved times `run.between`, and the state of
-    the loop at the end of the run. Each state has n numbers, which are NaN at times that the run
-    did not reach. The states have derivatives with respect to two kinds of inputs: the constants
-    that `smooth` selects, and the start, the stops, the saved times and the first state of the run.
-    The derivatives hold the lengths of the steps constant.
+    the loop over the steps at the end of the run. Each state has n numbers, which are NaN at times
+    that the run did not reach. The states have derivatives with respect to two kinds of inputs: the
+    constants that `smooth` selects; and four arrays of `run`, which are the time and the state at
+    the start, the saved times, and the stops (the times at which the field jumps, and the end of
+    the run). The derivatives hold the lengths of the steps constant.
 
     **Arguments:**
 
@@ -49,10 +50,11 @@ def run_with_replayed_derivatives(
     like = adaptive_loop.initial_loop_state(run._replace(state=controller_states))
     shapes = jax.eval_shape(adaptive_loop.pack_loop_state, like)
     trees = run_tree, state_tree
-    # `recorded` returns a list of arrays: the states at the saved times; the loop state at the end,
-    # packed into `size` arrays; and the record of the steps. The record is `size` arrays for the
-    # starts of its segments, one array for its rows and one for its counts. `states` are the
-    # indices of the arrays in the list that have derivatives. `answer` returns only the first
+    # The function `recorded` below runs the bodies, and returns a list of arrays: the states at the
+    # saved times; the state of the loop over the steps at the end, packed into `size` arrays; and
+    # the record of the steps. The record is `size` arrays for the starts of its segments, one array
+    # for its rows and one for its counts. `states` are the indices of the arrays in the list that
+    # have derivatives. The function `answer` below makes no record, and returns only the first
     # `head` arrays of the list.
     size = len(shapes)
     states, head = [0, 1, 1 + size, 1 + 2 * size], 1 + size
@@ -69,16 +71,19 @@ def run_with_replayed_derivatives(
         tangents: Sequence[Any],
         cotangents_of_inputs: Callable[..., Arrays] | None = None,
     ) -> tuple[Arrays, Arrays]:
-        """Return the results and the record of a run, and the tangents of the states in them.
+        """Return a list of the results and the record of a run, and the tangents of its states.
 
-        Results and record are one list of arrays.
+        The results are the states at the saved times and the state of the loop over the steps at
+        the end. The record holds the steps, so that derivatives can repeat them. The tangents are
+        those of the states at the saved times and of the state at the end.
 
         - `primals`: the inputs of the run, of which its constants are the first.
         - `tangents`: the tangents of the inputs; a symbolic zero for an input without a tangent.
         - `cotangents_of_inputs`: the function that computes the cotangents of the inputs in reverse
           mode. If it is `None`, reverse mode raises an error.
         """
-        # A number without a tangent needs no derivative.
+        # `there` says of each input whether it has a tangent. Derivatives with respect to the other
+        # inputs are not computed.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
         of_run = [t and i < SMOOTH for i, t in enumerate(there[number:])]
         has_tangent = [s and t for s, t in zip(smooth, there[:number], strict=True)], of_run
@@ -88,8 +93,8 @@ def run_with_replayed_derivatives(
         given = [*primals, *found[head:]]
         if cotangents_of_inputs is None:
             return found, linear_map(push, raise_for_missing_transpose, given, along)
-        # Of the arrays of `recorded`, only the states at the saved times and at the end have a
-        # transpose.
+        # Reverse mode takes only the first two results of `push`: the tangents of the states at the
+        # saved times, and those of the state at the end.
         back = partial(mapped, partial(cotangents_of_inputs, has_tangent), 2)
         return found, linear_map(lambda *args: push(*args)[:2], back, given, along)
 
@@ -129,9 +134,9 @@ def _batch_method_over_bodies(
     - `method`: the method of one body. Two of its functions take the constants as an argument:
       `halt(constants, t, y)`, the condition that ends the run, and `control(again, constants, …)`,
       the step control, where `again` says whether a recorded step is repeated for a derivative.
-    - `trees`: the tree structures by which lists of arrays are put together again: that of a `Run`
-      (the arrays with which a run starts), and that of the states of step controller and progress
-      meter.
+    - `trees`: a pair of tree structures. The first makes a `Run` (the arrays with which a run
+      starts) from a list of its arrays; the second makes the states of step controller and progress
+      meter from theirs.
     - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
@@ -174,9 +179,9 @@ def _run_bodies(
 
     - `return_record`: whether the record of the steps is returned, too.
     - `method`: the explicit method of one body, with the field and the step control.
-    - `trees`: the tree structures by which lists of arrays are put together again: that of a `Run`
-      (the arrays with which a run starts), and that of the states of step controller and progress
-      meter.
+    - `trees`: a pair of tree structures. The first makes a `Run` (the arrays with which a run
+      starts) from a list of its arrays; the second makes the states of step controller and progress
+      meter from theirs.
     - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
@@ -202,8 +207,8 @@ def _run_bodies(
     ]
 
 
-# Two lists of truth values: whether each constant has a tangent, and whether each array of a run
-# has a tangent.
+# A pair of lists of truth values. The first says of each constant whether it has a tangent; the
+# second says the same of each array of a run.
 HasTangent = tuple[list[bool], list[bool]]
 
 
@@ -221,9 +226,9 @@ def _unpack_recorded_run(
 
     - `has_tangent`: which constants, and which arrays of the run, have a tangent.
     - `method`: the explicit method of one body, with the field and the step control.
-    - `trees`: the tree structures by which lists of arrays are put together again: that of a `Run`
-      (the arrays with which a run starts), and that of the states of step controller and progress
-      meter.
+    - `trees`: a pair of tree structures. The first makes a `Run` (the arrays with which a run
+      starts) from a list of its arrays; the second makes the states of step controller and progress
+      meter from theirs.
     - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
@@ -272,9 +277,9 @@ def _tangents_of_states(
     - `has_tangent`: two lists of truth values: which constants, and which arrays of the run, have a
       tangent.
     - `method`: the explicit method of one body, with the field and the step control.
-    - `trees`: the tree structures by which lists of arrays are put together again: that of a `Run`
-      (the arrays with which a run starts), and that of the states of step controller and progress
-      meter.
+    - `trees`: a pair of tree structures. The first makes a `Run` (the arrays with which a run
+      starts) from a list of its arrays; the second makes the states of step controller and progress
+      meter from theirs.
     - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.
@@ -311,9 +316,9 @@ def _cotangents_of_inputs(
     - `has_tangent`: two lists of truth values: which constants, and which arrays of the run, get a
       cotangent.
     - `method`: the explicit method of one body, with the field and the step control.
-    - `trees`: the tree structures by which lists of arrays are put together again: that of a `Run`
-      (the arrays with which a run starts), and that of the states of step controller and progress
-      meter.
+    - `trees`: a pair of tree structures. The first makes a `Run` (the arrays with which a run
+      starts) from a list of its arrays; the second makes the states of step controller and progress
+      meter from theirs.
     - `layout`: which arrays have a last axis that runs over the bodies.
     - `constants`: the arrays that the functions of the method hold, then the states of controller
       and progress meter at the start.

@@ -106,8 +106,8 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         arrays, arrays_tree = jax.tree.flatten(lax.stop_gradient(arrays))
         given = lambda constants: arrays_tree.unflatten(constants[len(constants) - len(arrays) :])  # noqa: E731
         constants = constants + arrays
-        # A controller that takes no `args` and has the default norm may get the state as one
-        # vector.
+        # If no step controller reads `args`, and all have the default norm, they get the state as
+        # one vector of its numbers; else they get it in its own type.
         rows = plain and all(getattr(c, "norm", NORM) is NORM for c in controlled_by)
         method = Method(
             tableau=solver.tableau,
@@ -122,7 +122,8 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         )
         subs = _sub_save_ats(saveat)
         asked = jnp.concatenate([t0[None][:0], *(s.ts for s in subs if s.ts is not None)])
-        # Several sets of saved times are joined and sorted.
+        # If the `SaveAt` has several `SubSaveAt`s, each with saved times of its own, these times
+        # are joined and sorted.
         order = jnp.argsort(lax.stop_gradient(asked)) if len(subs) > 1 else None
         state = (init_state.controller_state, init_state.progress_meter_state)
         state = lax.stop_gradient(jax.tree.map(jnp.asarray, state))
@@ -131,7 +132,8 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             t0, _times_where_steps_end(controlled_by, t0, t1), between, y0,
             lax.stop_gradient(first), None if event is None else init_state.result,
         )  # fmt: skip
-        # The condition that ends a run has no derivative, nor has the controller.
+        # The first `count` constants are those of the field. Only they have derivatives: the
+        # condition that ends a run has none, nor has the controller.
         smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
         ys, end = run_with_replayed_derivatives(method, smooth, constants, state, run)
         if order is not None:
@@ -148,9 +150,11 @@ class _Control(NamedTuple):
     """
 
     static: Any  # controller, progress meter and `args`, without the arrays in them
-    # Selects the arrays of controller, progress meter and `args` from the constants of the run.
+    # A function that selects the arrays of controller, progress meter and `args` from the constants
+    # of the run.
     arrays: Callable[[Arrays], Any]
-    # Makes the state that the controller takes from the vector of the numbers of the state.
+    # A function that converts the vector of the numbers of a state to the form in which the
+    # controller gets the state: the state itself or, if the controller needs no more, the vector.
     tree: Callable[[Array], Any]
     order: Any  # the order of the error of a step
 
@@ -165,8 +169,8 @@ class _Control(NamedTuple):
 
         - `again`: whether a derivative repeats a recorded step; the progress meter then shows
           nothing.
-        - `constants`: the constants of the run, from which `arrays` selects the arrays of the
-          controller.
+        - `constants`: the constants of the run, from which the function `self.arrays` selects the
+          arrays of the controller.
         - `given`: a pair. The first item is the states of controller and progress meter; the second
           is four times: those at which the run begins and ends, and those at which the step begins
           and ends.
@@ -296,8 +300,9 @@ def _final_diffeqsolve_state(
             states.append(end.y[None])
         ts, states, there = (jnp.concatenate(a) for a in (ts, states, there))
         if sub.ts is not None:
-            # At a saved time that the run did not reach, `sub.fn` is called with the state at the
-            # start, for which it has a finite value; `masked` removes the result.
+            # `sub.fn` computes from a state what the user wants to save. At a saved time that the
+            # run did not reach, it is called with the state at the start, for which it has a finite
+            # value; `masked` then replaces the result by infinity.
             states = jnp.where(there[:, None], states, run.y0)
         out = jax.vmap(lambda t, y: sub.fn(t, make_state(y), args))(ts, states)
         if sub.ts is None:

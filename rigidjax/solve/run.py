@@ -145,8 +145,9 @@ def equations_of_motion(
 
     The states y have the type of `state0`.
 
-    **Arguments:** `body`, `state0` and `torque` are those of `simulate`. Under a torque with states
-    of its own `state0` is a `rigidjax.motion.coupled.Coupled`.
+    **Arguments:** `body`, `state0` and `torque` are those of `simulate`. If the torque has states
+    of its own, `state0` is a `rigidjax.motion.coupled.Coupled`, which joins them with the state of
+    the body.
 
     **Raises:** `TypeError` if body, state and torque do not fit together.
 
@@ -229,8 +230,8 @@ def solve(
     - the dict with the numbers of steps, which becomes the `stats` of the `Solution`;
     - the result of diffrax, which says that the run reached the last time, or why it did not.
     """
-    # One `jit` encloses everything, because a single operation outside of `jit` takes as long as a
-    # hundred steps.
+    # The whole function is under one `jit`, because a single operation outside of `jit` takes as
+    # long as a hundred steps.
     state0 = given = project_to_group(state0)
     if isinstance(setup, ClosedFormRun):
         ys, stats, result = _solve_in_closed_form(setup, state0, ts)

@@ -34,7 +34,10 @@ class Step(NamedTuple):
 
 
 class Stages(NamedTuple):
-    """Hold the s stages of a step, and the state at the end of the step."""
+    """Hold the s stages of a step, and the state at the end of the step.
+
+    A stage is a time and a state at which the step evaluates the field, and the value there.
+    """
 
     times: Array  # (s, *bodies) the times of the stages, in seconds
     places: Array  # (n, s, *bodies) the states at which the field is evaluated

@@ -47,14 +47,15 @@ class Sided(eqx.Module):
     sign: Any
 
     def __getattr__(self, name: str) -> Any:
-        # All other attributes, such as `feels` or `rate_free`, are read from the law.
+        # Attributes that a `Sided` does not have, such as `feels` or `rate_free`, are those of the
+        # law that it wraps.
         if name.startswith("__") or name in ("law", "jumps", "stops", "sign"):
             raise AttributeError(name)
         return getattr(self.law, name)
 
     @property
     def law_name(self) -> str:
-        """Return the name of the law's class."""
+        """Return the name of the class of the law that this `Sided` wraps."""
         return type(self.law).__name__
 
     def __call__(self, t: Any, *args: Any) -> Any:
@@ -96,7 +97,8 @@ class Constant(eqx.Module):
     time: Array
 
     def __getattr__(self, name: str) -> Any:
-        # All other attributes, such as `feels` or `rate_free`, are read from the law.
+        # Attributes that a `Constant` does not have, such as `feels` or `rate_free`, are those of
+        # the law that it wraps.
         if name.startswith("__") or name in ("law", "time"):
             raise AttributeError(name)
         return getattr(self.law, name)

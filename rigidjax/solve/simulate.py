@@ -36,7 +36,8 @@ from rigidjax.solve.splitting import AbstractSplitting
 # A torque must accept the type of the state, so that type checkers refuse gravity on a `Spin`.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 
-# These two objects are made only once, because building a Module takes as long as ten steps.
+# The solver `SOLVER` and the adjoint `ADJOINT` are made only once, because building a Module takes
+# as long as ten steps.
 SOLVER = Projected(dfx.Dopri8())
 ADJOINT = dfx.RecursiveCheckpointAdjoint()
 # `ReplayAdjoint` can do all that these adjoints of diffrax can, and is used instead of each of
@@ -311,7 +312,7 @@ def _solve_run(
     if setup.throw and "ended" in stats:
         ys = raise_if_scene_ended_run(setup.torque, ys, stats, times)
     motion, own = (ys.motion, ys.own) if isinstance(ys, Coupled) else (ys, None)
-    # The set-up is split into its arrays and the rest, so that `jax.jit` and `jax.vmap` can return
-    # it.
+    # The solution keeps the set-up of the run, split into its arrays and the rest, so that
+    # `jax.jit` and `jax.vmap` can return it.
     arrays, rest = eqx.partition(setup, eqx.is_array)
     return Solution(times, motion, stats, result, arrays, rest, event_time, event_state, own)

@@ -56,9 +56,9 @@ class Solution(eqx.Module, Generic[State]):
     stats: dict[str, Any]
     result: dfx.RESULTS
     _arrays: Any
-    # This is a tree and not a `PyTreeDef`. A `PyTreeDef` would hold the object with which Equinox
-    # marks a part that is left out, and after `pickle` this is another object, which Equinox does
-    # not recognise.
+    # `_rest` is the set-up of the run without its arrays, which are in `_arrays`. It is a tree and
+    # not a `PyTreeDef`. A `PyTreeDef` would hold the object with which Equinox marks a part that is
+    # left out, and after `pickle` this is another object, which Equinox does not recognise.
     _rest: Any = eqx.field(static=True)
     event_time: Float[Array, ""] | None = None
     event_state: Any = None
@@ -259,7 +259,9 @@ def _transition_matrix(
     quaternion the change is a rotation vector, rad. A row is one of the n numbers at a saved time,
     and a column is one of the n numbers at the start.
     """
-    # The run must not raise an error, and it must be differentiable in forward mode.
+    # The run is repeated below with a changed start. It must not raise an error, and it must be
+    # differentiable in forward mode: a run of diffrax that does not record its steps needs
+    # `ForwardMode` for this.
     plain = isinstance(setup, DiffraxRun) and not setup.records_steps_for_derivatives
     more = dict(adjoint=dfx.ForwardMode()) if plain else {}
     setup = dataclasses.replace(setup, throw=False, **more)
@@ -287,7 +289,8 @@ def _growth_of_small_errors(
     both = zip(each, jax.tree.leaves(ys), strict=True)
     sizes = jnp.concatenate([a.reshape(-1) * largest_length_in_run(b) for a, b in both])
     sizes = jnp.where(sizes > 0, sizes, 1)
-    # A turn by δθ changes q by half of δθ.
+    # A turn by the rotation vector δθ changes q by half of δθ. The size of δθ is therefore twice
+    # that of q.
     for turned in rotation_slices(start):
         sizes = sizes.at[turned].multiply(2)
     change = _transition_matrix(setup, ts, ys) * (sizes[None] / sizes[:, None])[None]

@@ -321,8 +321,8 @@ def change_in_splitting_step(
         )
         return add(change, tuple(weight * a for a in torque))
 
-    # The stages are computed in a loop, because up to twelve copies of the free motion would take
-    # long to compile.
+    # A stage is a free motion and the kick after it. The stages are computed in a loop, because up
+    # to eleven copies of the free motion would take long to compile.
     def stage(carry: Any, weights: tuple[Array, Array]) -> tuple[Any, None]:
         t, dq, change = carry
         drift, kick = weights

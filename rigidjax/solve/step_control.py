@@ -169,7 +169,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         # Near t = 0 the round-off of t vanishes. The size of t is therefore taken to be at least
         # `least`, the round-off of the length of the run.
         least = jnp.finfo(begin.dtype).eps * jnp.abs(end - begin)
-        # Steps of length 0 would be accepted without end, but a step of length NaN ends the run.
+        # The first step is at least the shortest that the time can resolve, because steps of length
+        # 0 would be accepted without end. If the start is not finite, the step has the length NaN,
+        # which ends the run.
         shortest = begin + self._shortest_resolvable_step(begin, least)
         first = jnp.where(sound, jnp.maximum(first, shortest), jnp.nan)
         return first.astype(begin.dtype), (inner, least)
@@ -215,8 +217,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         )
         unit = self._shortest_resolvable_step(left, least)
         stuck = ~keep & ~(right - left > unit)
-        # If even the shortest possible step gives NaN, a still shorter step might not give NaN. The
-        # result then says that no step is short enough.
+        # A run that is stuck after a step to NaN or infinity ends with `NONFINITE`. If this step
+        # was already the shortest possible one, a still shorter step might be finite: the result
+        # then is `dt_min_reached`, which says that no step is short enough.
         short = finite(y_error) | (t1 - t0 <= unit)
         why = dfx.RESULTS.where(short, dfx.RESULTS.dt_min_reached, NONFINITE)
         why = dfx.RESULTS.where(stuck & (result == dfx.RESULTS.successful), why, result)

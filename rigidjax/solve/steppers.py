@@ -126,10 +126,10 @@ def cheapest_method_of_order_4(field: Callable[..., Any]) -> Magnus4 | RungeKutt
 
 
 def _stepper_without_delays(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
-    """Return the object that takes fixed steps of a vector field by a method, without delays.
+    """Return the object that takes fixed steps of a vector field by a method, as a `Stepper`.
 
-    The caller adds the delays of the torque's inputs. Raise `TypeError` if the method cannot take
-    fixed steps of this field.
+    Its field `delays` is empty: the caller fills in the delays of the torque's inputs. Raise
+    `TypeError` if the method cannot take fixed steps of this vector field.
 
     - `solver`: a method of `rigidjax.solvers`; `None` stands for the one whose steps cost least.
     - `field`: the vector field `f(t, y, args)`.
@@ -371,8 +371,9 @@ def _change_to_unit_length(y: Atoms, change: Atoms, example_state: Any) -> Atoms
         for part in (jax.tree.map(jnp.add, y, change), change)
     )
     after, moved = components(after), components(moved)
-    # A rounding error of the excess |q|² − 1 only changes the length of q and does not turn the
-    # body.
+    # q is the quaternion after the step. The difference |q|² − 1, the excess, has few correct
+    # digits. Its rounding error is harmless, because it only changes the length of q and does not
+    # turn the body.
     excess = jnp.minimum(squared_quaternion_length(after) - 1.0, 1.0)
     # 1 − 1/√(1 + e), with the excess e, is computed by a series, because on a GPU a root and a
     # quotient take a third of the time of a step. The error e⁴/4 of the series is below round-off

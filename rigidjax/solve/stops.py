@@ -54,7 +54,7 @@ class TracedProgram(NamedTuple):
 
     @property
     def jax_constants(self) -> Arrays:
-        """Return the JAX arrays that the function closes over; NumPy arrays stay in its program."""
+        """Return the JAX arrays that the traced function closes over, without its NumPy arrays."""
         return [c for c in self.closed.consts if eqx.is_array(c)]
 
     def replace_jax_constants(self, jax_arrays: Arrays) -> Arrays:
@@ -111,8 +111,8 @@ class ProgramWithStops(NamedTuple):
     constants: Arrays
     smooth: int  # only the first `smooth` constants may have derivatives
     stops: Array  # (k,), s, in order
-    # Whether a part of the field switches more often than the arrays can store; `None` if no part
-    # was found to switch.
+    # Whether some times are missing in `stops`, because a part of the field switches more often
+    # than can be stored; `None` if no part was found to switch.
     over: Array | None
 
 

@@ -78,8 +78,10 @@ CONSTANT, PIECES, STRAIGHT, MONOTONE, BENT = range(5)
 MOST = 64  # the largest number of switching times of one law, or of one `floor`, `round`, …
 _FEW = 32  # a comparison of more elements than this is treated as a table, not as a switch
 _FEW_KINKS = 3  # steps do not end at the kinks of an operation that has more kinks than this
-# A switch whose operand depends on the time as `BENT` is searched for on a grid of times. Between
-# grid points, changes are searched for in this many places.
+# The changes of a switch whose operand may rise and fall in time (`BENT`) are searched for on a
+# grid of times. Between two points of the grid an element may change twice. Such changes are
+# searched for near at most `NEAR` points of the grid: those where the switch comes closest to a
+# change.
 NEAR = 16
 
 
@@ -101,7 +103,7 @@ class Equation(NamedTuple):
 
     @property
     def primitive_name(self) -> str:
-        """Return the primitive's name, or "searchsorted" for a call of `jnp.searchsorted`."""
+        """Return the name of the equation's primitive, or "searchsorted" for `jnp.searchsorted`."""
         return _primitive_name(self)
 
 
@@ -132,16 +134,20 @@ class Switch(NamedTuple):
 
     @property
     def most_changes_if_monotonic(self) -> int:
-        """Return how many changes of an element are stored if its operand is monotonic in time.
+        """Return how many changes of each element of this switch are stored, if it is monotonic.
 
-        It is 1 for a comparison, which then changes only once. A function such as `floor` may
+        The switch is monotonic if its operand only rises or only falls in time. A comparison
+        changes at most once in this case, so that the number is 1. A function such as `floor` may
         change any number of times; at most `MOST` of its changes are stored.
         """
         return MOST if self.equation.primitive_name in _LEVELS else 1
 
     @property
     def storable_changes(self) -> int:
-        """Return the number of changes that the search for the switching times can store."""
+        """Return how many changes of this switch, at its switching times, can be stored in all.
+
+        The number is for all elements together, such as those of a comparison of arrays.
+        """
         return (
             MOST + 2 * NEAR
             if self.time_dependence == BENT
@@ -150,12 +156,16 @@ class Switch(NamedTuple):
 
     @property
     def stores_all_changes(self) -> bool:
-        """Return whether the search can always store all changes of each element."""
+        """Return whether all changes of this switch can be stored, however many there are.
+
+        This is so, for example, for a comparison whose operand only rises or only falls in time,
+        because each element then changes at most once.
+        """
         return self.time_dependence < BENT and self.most_changes_if_monotonic == 1
 
     @property
     def primitive_and_line(self) -> str:
-        """Return the name of the equation's primitive, and the line of code that wrote it.
+        """Return the name of the primitive of this switch, and the line of code that wrote it.
 
         The line is one of the user's code, given by its file and its number.
         """
@@ -171,8 +181,9 @@ class Analysis(NamedTuple):
 
     program: Program
     switches: list[Switch]
-    # Operations with so many kinks that no steps end at them. The times of the kinks only help in
-    # the search for the changes of bent switches (`BENT`).
+    # Operations with so many kinks that no steps end at these kinks. The times of the kinks are
+    # computed only because they help to find the changes of switches whose operand may rise and
+    # fall in time (`BENT`).
     kinks: list[Switch]
     by_state: list[str]  # the lines of code whose result switches at values of the state
     unseen: list[str]  # the lines of code that may switch at times that cannot be searched for
@@ -266,8 +277,9 @@ def _contains_switch(jaxpr: Jaxpr, with_kinks: bool = False) -> bool:
 def flatten_traced_function(traced: ClosedJaxpr) -> Program:
     """Return a traced function as one flat list of equations, in which calls are written out.
 
-    A call such as `cond` cannot be written out, and stays one equation. The equations of its body
-    follow it in the list, so that switches among them are found.
+    A call such as `jit` is replaced by the equations of its body. A call such as `cond` cannot be
+    replaced, and stays one equation; the equations of its body follow it in the list, so that
+    switches among them are found.
 
     - `traced`: the traced function f(t, y, …).
     """

@@ -34,8 +34,9 @@ from rigidjax.solve.switching import (
 )
 
 _HALVINGS = {"float64": 62, "float32": 36}
-# The changes of a bent switch, whose switching function may rise and fall, are searched for on a
-# grid of this many times.
+# The changes of a switch whose switching function may rise and fall are searched for on a grid of
+# times. For a switch of one element the grid has about this many times; for a switch of several
+# elements it has fewer.
 _GRID = 4096
 
 
@@ -73,7 +74,7 @@ def _switching_function_of_operands(
 
 
 def _piecewise_constant_value(switch: Switch, first_operand: Any, *others_and_result: Any) -> Array:
-    """Return a value for each element of a switch that is constant except where it changes.
+    """Return for each element of a switch a value, which only changes where the element changes.
 
     - `switch`: the equation, such as the comparison `t < 1`.
     - `first_operand`: its first operand.
@@ -125,17 +126,20 @@ class _TimedSwitch(NamedTuple):
 
     @property
     def with_fixed_constants(self) -> "_TimedSwitch":
-        """Return the same switch with constants that have no derivatives."""
+        """Return this switch, with constants of its program that have no derivatives."""
         return self._replace(constants=lax.stop_gradient(self.constants))
 
     def operands_and_result(self, t: Array) -> list[Any]:
-        """Return the operands of the equation, followed by its result, at the time t (), s."""
+        """Return the operands of the switch, followed by its result, at the time t (), s.
+
+        The switch is an equation of the program, such as the comparison `t < 1`.
+        """
         equation = self.switch.equation
         wanted = [*equation.inputs, equation.outputs[0]]
         return evaluator(self.program, wanted)(self.constants, t)
 
     def element_values(self, t: Array) -> Array:
-        """Return the values (m,) of all m elements at the time t (), s, as floating-point numbers.
+        """Return the values (m,) of the m elements of the switch at the time t (), s, as floats.
 
         The value of an element, such as 0 or 1 for a comparison, is constant except where the
         element changes.
@@ -143,7 +147,7 @@ class _TimedSwitch(NamedTuple):
         return _piecewise_constant_value(self.switch, *self.operands_and_result(t)).astype(t.dtype)
 
     def switching_functions(self, t: Array) -> Array:
-        """Return the switching functions (m,) of all m elements at the time t (), s.
+        """Return the switching functions (m,) of the m elements of the switch at the time t (), s.
 
         For a comparison the switching function is the difference of the operands, and the element
         changes where this function is zero. For a function such as `floor` it is the operand, and
@@ -154,7 +158,7 @@ class _TimedSwitch(NamedTuple):
         )
 
     def values_of_one_element(self, t: Array, element: Array | np.ndarray) -> Array:
-        """Return the value of one element at each of k times, an array (k,).
+        """Return the value of an element of the switch at each of k times, an array (k,).
 
         The value of an element, such as 0 or 1 for a comparison, is constant except where the
         element changes.
@@ -165,7 +169,7 @@ class _TimedSwitch(NamedTuple):
         return self._at_each_time(self.element_values, t, element)
 
     def switching_function_of_one_element(self, t: Array, element: Array | np.ndarray) -> Array:
-        """Return the switching function of one element at each of k times, an array (k,).
+        """Return the switching function of an element of the switch at each of k times, (k,).
 
         For a comparison the switching function is the difference of the operands, and the element
         changes where this function is zero. For a function such as `floor` it is the operand, and
@@ -312,7 +316,8 @@ def _times_of_nonmonotonic_switch(
     t, moves = _differentiable_times(timed_switch, jnp.where(there, t, end), element, there)
     if other_times:
         # If the switch changes because an operand jumps, the time of the change is the time at
-        # which the operand jumps; this is one of the other times, which may have derivatives.
+        # which the operand jumps. This is one of the `other_times`. It replaces the time that was
+        # found here, because it may have derivatives.
         near, still = jnp.argmin(jnp.abs(before[None] - t[:, None]), 1), lax.stop_gradient(t)
         same = jnp.abs(before[near] - still) <= 8 * jnp.finfo(t.dtype).eps * jnp.abs(still)
         t = jnp.where(there & ~moves & same, before[near], t)
@@ -386,9 +391,9 @@ def _bisect(
 ) -> list[Array]:
     """Return for each switch the times at which its elements change, found by halving intervals.
 
-    A switch is an equation of a traced program, such as `b = t < 1`, whose result jumps in time; it
-    may have several elements. Each of the
-    following lists has one entry for each switch, with arrays for k intervals of this switch:
+    A switch is an equation of a traced program, such as `b = t < 1`, whose result jumps in time. It
+    may have several elements, such as those of a comparison of arrays. Each of the following lists
+    has one entry for each switch, with arrays for k intervals of this switch:
 
     - `timed_switches`: the switches.
     - `edges`: the starts (k,) and the ends (k,) of the intervals, s.
@@ -457,7 +462,9 @@ def _differentiable_times(
         t = t - jnp.where(moves, rise / jnp.where(moves, slope, 1), 0)
     if degree == BENT:
         # If the switch changes because an operand jumps, the switching function jumps over zero.
-        # The equation "switching function = 0" then does not define the time of the change.
+        # The equation "switching function = 0" then does not define the time of the change, which
+        # gets no derivatives. A jump is recognised by the value of the switching function at the
+        # time `beside`, just before the change.
         beside = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
         step, eps = jnp.abs(slope) * (still - beside), jnp.finfo(t.dtype).eps
         jump = jnp.abs(here - timed_switch.switching_function_of_one_element(beside, element))
@@ -478,9 +485,9 @@ class _ResultFromStops(NamedTuple):
 
     @property
     def needed_inputs(self) -> list[Any]:
-        """Return the inputs of the equation that the method `result` reads.
+        """Return those inputs of the switch, an equation, whose values the method `result` reads.
 
-        There are none if the stops alone give the result.
+        If the stops that the run has passed are enough to give the result, the list is empty.
         """
         return [] if self.switch.stores_all_changes else self.switch.equation.inputs
 

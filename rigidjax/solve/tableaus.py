@@ -84,7 +84,9 @@ TSITOURAS5 = Tableau(
     a=tuple(_sparse_row(row) for row in _TSIT5.a_lower[:-1]),
     b=_sparse_row(_TSIT5.b_sol),
     errors=(_sparse_row(_TSIT5.b_error),),
-    # These are the coefficients of θ⁴ in the paper's interpolant; the cubic fixes the others.
+    # The dense output of Tsitouras' paper is a polynomial of degree 4 in θ, the fraction of the
+    # step that has passed. These are its coefficients of θ⁴. The other coefficients follow from the
+    # states and slopes at both ends of the step.
     dense=_parse_tableau_rows("""
     0:-1.0530884977290216 1:0.1017 2:2.490627285651252793 3:-16.54810288924490272
       4:47.37952196281928122 5:-34.87065786149660974 6:2.5
@@ -100,7 +102,8 @@ TSITOURAS5 = Tableau(
     0:0.054293734116568765 5:4.450312892752409 6:1.8915178993145003 7:-5.801203960010585
       8:0.3111643669578199 9:-0.1521609496625161 10:0.20136540080403034 11:0.04471061572777259
 """)
-# These are the three weights of the method of order 3.
+# The second error estimate of DOP853 is the difference from a method of order 3 with the same
+# stages. These are the three weights of this method that are not zero.
 _THIRD = {0: 0.2440944881889764, 8: 0.7338466882816118, 11: 0.022058823529411766}
 DORMAND_PRINCE8 = Tableau(
     order=8,

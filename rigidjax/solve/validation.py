@@ -41,7 +41,8 @@ def checked_body_state_and_times(
     dtype = ts.dtype
     for leaf in jax.tree.leaves(state0):
         dtype = jnp.promote_types(dtype, leaf.dtype)
-    # Outside of `jit` even a conversion to the same dtype costs as much as a step.
+    # Arrays that have this dtype are not converted: outside of `jit` even a conversion to the same
+    # dtype costs as much as a step.
     ts, state0 = jax.tree.map(
         lambda leaf: leaf if leaf.dtype == dtype else leaf.astype(dtype), (ts, state0)
     )
