@@ -183,7 +183,8 @@ def _linear_map_jvp(
 def raise_for_missing_transpose(*_: Any) -> Arrays:
     """Raise `TypeError`, because reverse mode needs the transpose of a map that has none.
 
-    This function takes the place of the missing transpose.
+    This function takes the place of the missing transpose. It is called in reverse mode over a
+    derivative, such as `jax.grad` of a `jax.grad`.
     """
     raise TypeError(
         "second derivatives through a solver are forward over reverse: wanted "

@@ -117,10 +117,11 @@ class Projected(dfx.AbstractWrappedSolver):
         solver_state: PyTree,
         made_jump: Bool[ArrayLike, ""],
     ) -> Any:
-        # Some solvers keep the slope at the end of a step for the next step. This slope belongs to
-        # the state before the quaternion was scaled. Also, if one body of a batch needs a new
-        # slope, diffrax computes it for all bodies, so that the result of one body would depend on
-        # the other bodies. With `made_jump=True` the slope is computed anew in every step.
+        # Some solvers keep the slope dy/dt at the end of a step for the next step. This slope
+        # belongs to the state before the quaternion was scaled. Also, if one body of a batch needs
+        # a new slope, diffrax computes it for all bodies, so that the result of one body would
+        # depend on the other bodies. The solver inside therefore always gets `made_jump=True`, with
+        # which it computes the slope anew in every step.
         del made_jump
         y1, error, dense, state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, True

@@ -1,6 +1,6 @@
 """Define `ReplayAdjoint`, by which diffrax runs the explicit methods of this package.
 
-It takes any vector field.
+It runs any vector field of the user, not only the equations of motion of a body.
 """
 
 import dataclasses

@@ -92,8 +92,9 @@ class DiffraxRun(eqx.Module):
         If so, the run uses the time s = σt, which increases along the run: σ is 1, or −1 in a run
         backwards in the time t.
         """
-        # `Magnus4`, `FreeSolver` and the splittings read attributes of the vector field. The field
-        # can therefore not be replaced by a traced program.
+        # Where steps end at jumps, the vector field is replaced by a traced program. `Magnus4`,
+        # `FreeSolver` and the splittings read attributes of the field, which a traced program does
+        # not have.
         solver = self.solver.solver if isinstance(self.solver, Projected) else self.solver
         reads_field = isinstance(solver, AbstractSplitting | Magnus4 | FreeSolver)
         return self.controller is None and not reads_field
@@ -170,7 +171,8 @@ def equations_of_motion(
 def direction_of_times(times: Array) -> Int[Array, ""] | None:
     """Return the direction of the `times` as an integer: 1 if they increase, −1 if they decrease.
 
-    If the direction is known to be 1 before the run, the result is `None`.
+    The result is `None` if the times increase and are known before the run, that is if they are not
+    traced.
     """
     ends = _checks.array_module(times).asarray(times)
     change = ends[-1] - ends[0]

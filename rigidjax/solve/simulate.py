@@ -98,9 +98,9 @@ def simulate(
       error of `DormandPrince8` is up to ten times `rtol`; that of `Dopri8` is up to 26 times `rtol`
       if `rtol` is below 1e-10.
     - `rtol`, `atol`: the relative and the absolute tolerance of the adaptive steps. The defaults
-      are 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in float32. Traced tolerances are not checked,
-      and other values do not compile again. Scale `atol` to the smallest number that matters. The
-      closed form uses neither.
+      are 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in float32. Traced tolerances are not checked. A
+      run with other tolerances does not compile again. Scale `atol` to the smallest number that
+      matters. The closed form uses neither.
     - `accuracy`: how far the states may be from the exact motion, given in the place of tolerances.
       For a rotation it is an angle, rad; for any other array of the state it is relative to the
       largest length of this array in the run. Two or more cheap runs find the tolerance. The

@@ -197,7 +197,8 @@ class Solution(eqx.Module, Generic[State]):
     def _states(self) -> Any:
         """Return the states of the body at the saved times, with the torque's own states, if any.
 
-        A torque that follows a filtered signal, for example, has states of its own.
+        A torque that follows a filtered signal, for example, has states of its own. The states are
+        then `Coupled`.
         """
         return self.ys if self.own is None else Coupled(self.ys, self.own)
 

@@ -79,7 +79,7 @@ def _symmetric_composition(
     return Composition(order, (*flows, middle, *flows[::-1]), (*kicks, *kicks[::-1]))
 
 
-# Strang 1968, doi:10.1137/0705041.
+# Half a kick, a free motion and half a kick: Strang 1968, doi:10.1137/0705041.
 STRANG = Composition(2, (1.0,), (0.5, 0.5))
 # Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, methods SRKN6b and SRKN11b. These methods
 # are for kicks B that commute with [B, [B, A]], where [·, ·] is the commutator. This holds here,
@@ -380,8 +380,10 @@ def _quintic_coefficients(
 
     (f0, s0), (f1, s1) = slopes(t0, y0), slopes(t1, y1)
 
-    # In a run backwards in time diffrax uses −t as the time. First derivatives then change their
-    # sign; here `h` changes its sign instead. Second derivatives keep their sign.
+    # `rows` returns the coefficients for one array of the state, from its values a and b at the two
+    # ends of the step, its first derivatives k and m, and its second derivatives u and v. In a run
+    # backwards in time diffrax uses −t as the time. First derivatives then change their sign; here
+    # `h` changes its sign instead. Second derivatives keep their sign.
     def rows(a: Array, b: Array, k: Array, m: Array, u: Array, v: Array) -> Array:
         step = jnp.asarray(h, a.dtype)
         rise, second, third = cubic_coefficients(b - a, step, k, m)

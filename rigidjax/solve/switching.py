@@ -31,8 +31,8 @@ from jax.extend.source_info_util import summarize
 
 from rigidjax.solve.batching import Arrays
 
-# The name of the scope of a law that declares its jumps; no switch is searched for inside this
-# scope.
+# The name of the scope (`jax.named_scope`) in which a law that declares its jumps is called. No
+# switch is searched for in the equations of this scope.
 DECLARED = "rigidjax_declared_jumps"
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 
@@ -231,8 +231,9 @@ def _may_jump(name: str, params: dict[str, Any], dtypes: list[Any]) -> bool:
     The answer is no if the first operand is a boolean or a whole number, because such an operand
     never changes continuously.
 
-    - `name`, `params`: the name and the parameters of its primitive, such as "lt" for `t < 1`.
-    - `dtypes`: the dtypes of its operands.
+    - `name`, `params`: the name of the primitive of the equation, such as "lt" for `t < 1`, and its
+      parameters.
+    - `dtypes`: the dtypes of the operands of the equation.
     """
     if not dtypes or not _is_float(dtypes[0]):
         return False
@@ -246,8 +247,8 @@ def _may_have_kink(name: str, dtypes: list[Any]) -> bool:
 
     At a kink the slope jumps and the value does not; `abs`, for example, has a kink at 0.
 
-    - `name`: the name of its primitive, such as "abs".
-    - `dtypes`: the dtypes of its operands.
+    - `name`: the name of the primitive of the equation, such as "abs".
+    - `dtypes`: the dtypes of the operands of the equation.
     """
     return bool(dtypes) and _is_float(dtypes[-1]) and name in KINKS
 
@@ -460,8 +461,9 @@ def _switch_of(
     shape = equation.shapes[0].shape
     size = int(np.prod(shape)) * (2 if name == "clamp" else 1)
     if name == "searchsorted":
-        # A search for one time among sorted edges is a switch. A search for many times is treated
-        # as a table, which is no switch.
+        # A `searchsorted` for one time among sorted edges is a switch. A `searchsorted` for many
+        # times is treated as a table, which is no switch: its size is set to one that is too large
+        # for a switch.
         size = _number_of_searchsorted_edges(equation) if shape == () else _FEW + 1
     return Switch(equation, max(timed) if steady else BENT, size, jumps)
 
