@@ -52,10 +52,11 @@ def run_with_replayed_derivatives(
     trees = run_tree, state_tree
     # The function `recorded` below runs the bodies, and returns a list of arrays: the states at the
     # saved times; the state of the loop over the steps at the end, packed into `size` arrays; and
-    # the record of the steps. The record is `size` arrays for the starts of its segments, one array
-    # for its rows and one for its counts. `states` are the indices of the arrays in the list that
-    # have derivatives. The function `answer` below makes no record, and returns only the first
-    # `head` arrays of the list.
+    # the record of the steps, which is divided into segments. The record is `size` arrays for the
+    # states of the loop at the starts of the segments, one array for the rows (one row for each
+    # step) and one for the counts of segments and rows. `states` are the indices of the arrays in
+    # the list that have derivatives. The function `answer` below makes no record, and returns only
+    # the first `head` arrays of the list.
     size = len(shapes)
     states, head = [0, 1, 1 + size, 1 + 2 * size], 1 + size
 

@@ -119,8 +119,9 @@ def stages(
     empty = jnp.zeros((step.y.shape[0], count, *step.y.shape[1:]), step.y.dtype)
     times, places = jnp.zeros((count, *step.t.shape), step.t.dtype), empty
     if not isinstance(dense, bool):
-        # The field may be infinite or NaN at a state of zeros. The places of stages that are left
-        # out therefore hold the time and state at the start of the step.
+        # If `dense` is false, the stages for dense output are not computed. Their places in the
+        # arrays hold the time and state at the start of the step, and not zeros, because the field
+        # may be infinite or NaN at a state of zeros.
         times, places = times + step.t[None], places + step.y[:, None]
         number = jnp.where(dense, number, np.int32(w.plain))
     begun = (times, places, empty)

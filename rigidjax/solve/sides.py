@@ -20,8 +20,8 @@ from rigidjax.motion.torques.piecewise import Held, Linear, Pulses, Tabulated
 from rigidjax.motion.torques.states import has_own_states
 from rigidjax.solve.switching import DECLARED
 
-# These laws of this package have jumps of their own; all other laws only pass on the jumps of the
-# laws inside them.
+# These laws of this package have jumps of their own. All other laws of this package only pass on
+# the jumps of the laws inside them.
 _OWN = (Held, Linear, Pulses, Tabulated, Delayed, Lagged)
 # These laws are constant between their jumps.
 _CONSTANT_PIECES = (Held, Pulses)

@@ -33,7 +33,8 @@ from rigidjax.solve.run import (
 from rigidjax.solve.solution import Solution, State, store_error_and_warn
 from rigidjax.solve.splitting import AbstractSplitting
 
-# A torque must accept the type of the state, so that type checkers refuse gravity on a `Spin`.
+# A function of the type `Law` must accept the type of the state. Type checkers therefore refuse
+# gravity on a `Spin`, which has no attitude.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 
 # The solver `SOLVER` and the adjoint `ADJOINT` are made only once, because building a Module takes
@@ -219,8 +220,8 @@ def _solver_of_run(
         # run.
         forward = isinstance(adjoint, dfx.ForwardMode) and event is None
         return SOLVER if forward or max_steps is None else DormandPrince8()
-    # The solvers of this package scale the quaternion inside the kernel of a step. A second scaling
-    # outside would split this kernel.
+    # The explicit methods and the splittings of this package scale the quaternion inside the kernel
+    # of a step. They are not wrapped, because a second scaling outside would split this kernel.
     ours = isinstance(solver, AbstractExplicit | AbstractSplitting | Projected)
     return solver if ours else Projected(solver)
 

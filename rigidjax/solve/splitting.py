@@ -257,7 +257,8 @@ def principal_frame_of_field(field: Any, y0: Any) -> PrincipalFrame:
     `y0`. Raise `TypeError` for any other field or state, and for a torque that may read the body
     rate.
     """
-    # If the torque reads the body rate, a kick is no exact flow, and the order would fall to 1.
+    # A torque that reads the body rate is refused, because a kick would then be no exact flow, and
+    # the order of the method would fall to 1.
     torque = require_attitude_equations("Splitting", field, y0, "DormandPrince8").euler.torque
     if may_read_rate(torque):
         raise TypeError(
@@ -313,8 +314,8 @@ def change_in_splitting_step(
     def kicked(t: Any, weight: Any, q: Array, change: Triple) -> Triple:
         if field.euler.torque is None:
             return change
-        # The torque has declared that it does not read the body rate, and gets NaN as the body
-        # rate.
+        # The torque has declared that it does not read the body rate. It gets NaN as the body rate,
+        # so that the result is NaN if the torque reads it nevertheless.
         at = Attitude(q, jnp.full(3, jnp.nan, dtype))
         torque = components_along(
             frame.axes, evaluate_torque(field.euler.torque, t, at, field.euler.inertia)

@@ -156,8 +156,8 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         # If the solver has no error estimate, `error_order` is `None`, and the inner controller
         # raises an error.
         if dt0 is None and error_order is not None:
-            # The first step is chosen here, because diffrax itself takes 0.01 for every field that
-            # `diffeqsolve` has wrapped for the direction of time, that is for every field.
+            # The first step is chosen here, because diffrax itself takes 0.01 s for each field that
+            # `diffeqsolve` has wrapped for the direction of time, and it wraps every field.
             h = self._first_step(y0, slope, error_order).astype(begin.dtype)
             # If the state or the slope is NaN or infinite, h > 0 is false; the inner controller
             # then gets the length 1.

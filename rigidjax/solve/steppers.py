@@ -271,7 +271,8 @@ def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
 
         def slope(t: Any, p: Triple) -> Triple:
             omega = barrier(rate(p))
-            # The torque gets a `Spin`, a state without an attitude.
+            # The torque does not read the attitude. It therefore gets a `Spin`, a state without an
+            # attitude.
             value = evaluate_torque(law, t, Spin(jnp.stack(omega)), body)
             return add(cross(p, omega), split_into_scalars(value))
 
@@ -305,8 +306,8 @@ def _stepper_of_explicit_method(
 
         def slope(t: Any, y: Atoms) -> Atoms:
             q, p = y[:many], y[many:]
-            # The derivatives of attitude and momentum both use this rate. Without the barrier each
-            # of the seven results would compute the rate again.
+            # The derivatives of attitude and momentum both use the body rate `omega`. Without the
+            # barrier XLA would compute it again for each of the seven results.
             omega = barrier(matvec(weights, p))
             pushed = cross(p, omega)
             if law is not None:
@@ -364,7 +365,7 @@ def _change_to_unit_length(y: Atoms, change: Atoms, example_state: Any) -> Atoms
     """
     if not isinstance(motion_of(example_state), HasAttitude):
         return change
-    # Without the barrier each part of the quaternion computes the whole change again.
+    # Without the barrier XLA would compute the whole change again for each part of the quaternion.
     change = barrier(change)
     after, moved = (
         motion_of(join_scalars(part, example_state)).q
