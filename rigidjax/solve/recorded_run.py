@@ -179,7 +179,8 @@ def _run_bodies(
     **Arguments:**
 
     - `return_record`: whether the record of the steps is returned, too.
-    - `method`: the explicit method of one body, with the field and the step control.
+    - `method`: the explicit Runge–Kutta method, the field and the step control of the run of one
+      body.
     - `trees`: a pair of tree structures. The first makes a `Run` (the arrays with which a run
       starts) from a list of its arrays; the second makes the states of step controller and progress
       meter from theirs.
@@ -226,7 +227,8 @@ def _unpack_recorded_run(
     **Arguments:**
 
     - `has_tangent`: which constants, and which arrays of the run, have a tangent.
-    - `method`: the explicit method of one body, with the field and the step control.
+    - `method`: the explicit Runge–Kutta method, the field and the step control of the run of one
+      body.
     - `trees`: a pair of tree structures. The first makes a `Run` (the arrays with which a run
       starts) from a list of its arrays; the second makes the states of step controller and progress
       meter from theirs.
@@ -277,7 +279,8 @@ def _tangents_of_states(
 
     - `has_tangent`: two lists of truth values: which constants, and which arrays of the run, have a
       tangent.
-    - `method`: the explicit method of one body, with the field and the step control.
+    - `method`: the explicit Runge–Kutta method, the field and the step control of the run of one
+      body.
     - `trees`: a pair of tree structures. The first makes a `Run` (the arrays with which a run
       starts) from a list of its arrays; the second makes the states of step controller and progress
       meter from theirs.
@@ -316,7 +319,8 @@ def _cotangents_of_inputs(
 
     - `has_tangent`: two lists of truth values: which constants, and which arrays of the run, get a
       cotangent.
-    - `method`: the explicit method of one body, with the field and the step control.
+    - `method`: the explicit Runge–Kutta method, the field and the step control of the run of one
+      body.
     - `trees`: a pair of tree structures. The first makes a `Run` (the arrays with which a run
       starts) from a list of its arrays; the second makes the states of step controller and progress
       meter from theirs.

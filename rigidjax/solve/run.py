@@ -238,7 +238,8 @@ def solve(
     if isinstance(setup, ClosedFormRun):
         ys, stats, result = _solve_in_closed_form(setup, state0, ts)
     else:
-        # If the torque has states of its own, they are integrated together with that of the body.
+        # If the torque has states of its own, they are integrated together with the state of the
+        # body.
         state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
         scene: Any = scene_of_force(setup.torque) if isinstance(state0, Point) else None
         watch = Ends(scene) if hasattr(scene, "ends") else None

@@ -399,8 +399,8 @@ def _stepper_of_splitting(solver: AbstractSplitting, field: Any, state0: Any) ->
       attitude.
     - `state0`: the state at the start.
     """
-    # No step converts the momentum Π to Ω = I⁻¹Π and back, so that |Π| drifts only by the round-off
-    # of the free motion.
+    # The momentum Π is carried from step to step, along the principal axes. No step converts Π to Ω
+    # = I⁻¹Π and back, so that |Π| drifts only by the round-off of the free motion.
     frame = splitting.principal_frame_of_field(field, state0)
 
     def change(t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:

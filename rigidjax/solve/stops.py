@@ -125,7 +125,7 @@ def program_with_stops(
 
     - `function`: the field `(t, y, *sides)`. If several parts of the field declare jumps, `sides`
       has one array for each of these parts: the times, s, at which steps end because this part
-      jumps.
+      jumps. Otherwise `sides` is empty.
     - `declared_jumps`: a list with the jump times, s, of each part of the field that declares
       jumps.
     - `t0`, `t1`: the start and the end of the run, s.

@@ -65,7 +65,7 @@ _LINEAR = {
     "convert_element_type", "stop_gradient", "optimization_barrier", "gather", "dynamic_slice",
 }  # fmt: skip
 _PRODUCTS = {"mul", "dot_general"}
-# Functions of one operand that rise or fall everywhere.
+# Primitives of one operand whose result only rises or only falls when the operand rises.
 _MONOTONE = {
     "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "tanh", "logistic", "erf", "sinh",
     "asinh", "atan",

@@ -354,7 +354,8 @@ def _intervals_with_one_change(
     low = grid[row]
     high = jnp.where(jnp.arange(MOST) < many, grid[row + 1], low)
     # Between two points of the grid an element may change twice, near the time at which its
-    # switching function comes closest to zero.
+    # switching function comes closest to zero. This time is searched for below. It divides the
+    # interval into two, each with at most one change.
     middle, sides = jnp.abs(height[1:-1]), jnp.stack([jnp.abs(height[:-2]), jnp.abs(height[2:])])
     calm = (
         (value[1:-1] == value[:-2]) & (value[1:-1] == value[2:]) & jnp.all(middle[None] <= sides, 0)
@@ -563,7 +564,8 @@ def separate_equal_times(times: Array, t0: Array, t1: Array) -> tuple[Array, Arr
     t = jnp.where(inside, times, jnp.where(times <= t0, t0, t1))
     still, last = lax.stop_gradient((t, t1))
     count = np.arange(t.shape[0])
-    # For so few times, comparing all pairs is faster than sorting.
+    # The times are put in order by their ranks. `earlier` compares all pairs of times, which is
+    # faster than sorting for so few times.
     earlier = still[None] < still[:, None]
     earlier = earlier | ((still[None] == still[:, None]) & (count[None] < count[:, None]))
     rank = jnp.sum(earlier, 1)

@@ -85,8 +85,8 @@ TSITOURAS5 = Tableau(
     b=_sparse_row(_TSIT5.b_sol),
     errors=(_sparse_row(_TSIT5.b_error),),
     # The dense output of Tsitouras' paper is a polynomial of degree 4 in θ, the fraction of the
-    # step that has passed. These are its coefficients of θ⁴. The other coefficients follow from the
-    # states and slopes at both ends of the step.
+    # step that has passed. These are the weights of the slopes at the stages in its coefficient of
+    # θ⁴. The other coefficients follow from the states and slopes at both ends of the step.
     dense=_parse_tableau_rows("""
     0:-1.0530884977290216 1:0.1017 2:2.490627285651252793 3:-16.54810288924490272
       4:47.37952196281928122 5:-34.87065786149660974 6:2.5
