@@ -76,7 +76,8 @@ def run_with_replayed_derivatives(
 
         The results are the states at the saved times and the state of the loop over the steps at
         the end. The record holds the steps, so that derivatives can repeat them. The tangents are
-        those of the states at the saved times and of the state at the end.
+        those of the states at the saved times and of the state at the end and, if
+        `cotangents_of_inputs` is `None`, also those of the states in the record.
 
         - `primals`: the inputs of the run, of which its constants are the first.
         - `tangents`: the tangents of the inputs; a symbolic zero for an input without a tangent.
@@ -189,8 +190,8 @@ def _run_bodies(
       and progress meter at the start.
     - `arrays_of_bodies`: the arrays of a `Run`, in which each body has values of its own.
 
-    **Returns** a list of arrays: the states at the saved times; the state of the loop at the end;
-    and, if `return_record` is true, the record of the steps.
+    **Returns** a list of arrays: the states at the saved times; the state of the loop over the
+    steps at the end; and, if `return_record` is true, the record of the steps.
     """
     method, run, _, constants = _batch_method_over_bodies(
         method, trees, layout, constants, arrays_of_bodies
@@ -275,7 +276,8 @@ def _tangents_of_states(
 ) -> Arrays:
     """Return the tangents of the states of a run whose steps were recorded, in forward mode.
 
-    The states are those at the saved times and the one at the end of the run.
+    The states are those at the saved times, the one at the end of the run, and those in the record
+    of the steps.
 
     - `has_tangent`: two lists of truth values: which constants, and which arrays of the run, have a
       tangent.

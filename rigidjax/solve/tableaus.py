@@ -66,8 +66,8 @@ def _sparse_row(row: np.ndarray) -> Row:
 
 # Kutta's method of 1901. The error estimate is the difference between the result of the method and
 # a second result, in which the slope at the end of the step takes the place of the fourth stage.
-# The second result fulfils all order conditions up to order 3, but not those of order 4: its sum Σ
-# b_i a_ij c_j² is 7/72, where order 4 needs 1/12.
+# The second result fulfils all order conditions up to order 3, but not all those of order 4. For it
+# the sum Σ b_i a_ij c_j² is 7/72, where order 4 needs 1/12.
 KUTTA4 = Tableau(
     order=4,
     c=(0.5, 0.5, 1.0),
