@@ -27,8 +27,8 @@ class Step(NamedTuple):
 
     t: Array  # (*bodies), s: the time at the start
     h: Array  # (*bodies), s: the length
-    # (*bodies), s: the end, equal to t + h but for rounding. If the step ends at a jump of the
-    # field, this is the last floating-point number before the time of the jump.
+    # (*bodies), s: the time at the end of the step, equal to t + h but for rounding. If the step
+    # ends at a jump of the field, it is the last floating-point number before the time of the jump.
     end: Array
     y: Array  # (n, *bodies) the state at the start
 

@@ -23,7 +23,7 @@ from rigidjax.solve.switching import DECLARED
 # These laws of this package have jumps of their own. All other laws of this package only pass on
 # the jumps of the laws inside them.
 _OWN = (Held, Linear, Pulses, Tabulated, Delayed, Lagged)
-# These laws are constant between their jumps.
+# A `Held` or `Pulses` law is constant between its jumps.
 _CONSTANT_PIECES = (Held, Pulses)
 
 

@@ -51,7 +51,8 @@ class Stepper(NamedTuple):
     """
 
     initial_numbers: Any  # the numbers y at the start, which stand for the state there
-    # change(t, end, h, y, inputs): the change of the numbers y in a step.
+    # change(t, end, h, y, inputs): the change of the numbers y in a step from t to end, of length
+    # h.
     change: Callable[[Any, Any, Any, Any, Any], Any]
     state_of_numbers: Callable[[Any], Any]  # the state that the numbers y stand for
     delays: tuple[tuple[str, Array], ...] = ()  # name and delay, s, of each delayed input

@@ -76,7 +76,8 @@ KUTTA4 = Tableau(
     errors=({3: 1 / 6, 4: -1 / 6},),
 )
 
-# Tsitouras 2011, doi:10.1016/j.camwa.2011.06.002; the numbers are those of diffrax.
+# Tsitouras' method of order 5 (2011), doi:10.1016/j.camwa.2011.06.002. The numbers are those of
+# `diffrax.Tsit5`.
 _TSIT5 = dfx.Tsit5.tableau
 TSITOURAS5 = Tableau(
     order=5,

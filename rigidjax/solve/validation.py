@@ -41,8 +41,8 @@ def checked_body_state_and_times(
     dtype = ts.dtype
     for leaf in jax.tree.leaves(state0):
         dtype = jnp.promote_types(dtype, leaf.dtype)
-    # Arrays that have this dtype are not converted: outside of `jit` even a conversion to the same
-    # dtype costs as much as a step.
+    # Arrays that already have the common dtype `dtype` are not converted: outside of `jit` even a
+    # conversion to the same dtype costs as much as a step.
     ts, state0 = jax.tree.map(
         lambda leaf: leaf if leaf.dtype == dtype else leaf.astype(dtype), (ts, state0)
     )
@@ -186,13 +186,14 @@ def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     rtol, atol = (u if g is None else g for u, g in zip(usual, (rtol, atol), strict=True))
     if not _checks.is_known((rtol, atol)):
         return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
-    # The tolerances are Python floats, because NumPy floats would promote a float32 run to float64.
+    # Known tolerances become Python floats, because NumPy floats would promote a float32 run to
+    # float64.
     rtol, atol = _checks.python_float(rtol, "rtol"), _checks.python_float(atol, "atol")
     if not 0 < rtol < np.inf or not 0 <= atol < np.inf:
         raise ValueError(f"simulate: wanted rtol > 0 and atol >= 0, got rtol={rtol}, atol={atol}")
     floor = 100 * float(jnp.finfo(dtype).eps)
-    # A relative tolerance below this floor cannot be met: the steps would shrink until max_steps
-    # ends the run.
+    # A relative tolerance below `floor`, which depends on the dtype, cannot be met: the steps would
+    # shrink until `max_steps` ends the run.
     if rtol < floor:
         advice = "" if double else "; set jax.config.update('jax_enable_x64', True) for float64"
         warnings.warn(
