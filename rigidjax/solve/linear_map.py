@@ -129,7 +129,8 @@ _linear_map.multiple_results = True
 def _linear_map_impl(*args: Any, function: Map, **_: Any) -> Arrays:
     """Call the `function` of a linear map with `args`, and return the list of its results.
 
-    This is the rule by which JAX evaluates the primitive `_linear_map` for known arrays.
+    This is the rule by which JAX evaluates the primitive `_linear_map` for arrays that are not
+    traced.
     """
     return function(*args)
 

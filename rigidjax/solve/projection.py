@@ -16,7 +16,8 @@ from rigidjax.solve.adaptive_loop import NONFINITE, finite
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
     """Interpolate the state within a step by `inner`, and scale the quaternion to length 1.
 
-    `inner` is the interpolation of the solver that took the step.
+    The quaternion is that of the interpolated state. `inner` is the interpolation of the solver
+    that took the step.
     """
 
     t0: Any

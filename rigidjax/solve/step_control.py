@@ -29,7 +29,8 @@ NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
 def _make_property_of_controller(attribute: str) -> Any:
     """Define a property that reads an attribute of the step controller `self.controller`.
 
-    `attribute` is the name of the attribute.
+    The property is for a class that wraps a step controller. `attribute` is the name of the
+    attribute.
     """
     return property(lambda self: getattr(self.controller, attribute))
 
@@ -56,7 +57,7 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
 
     @property
     def norm(self) -> Callable[[PyTree], Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the norm of an error: the root mean square of its numbers."""
+        """Return the function that measures an error: the root mean square of its numbers."""
         return NORM
 
     def wrap(self, direction: PyTree) -> "StandardController":

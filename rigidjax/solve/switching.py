@@ -136,9 +136,10 @@ class Switch(NamedTuple):
     def most_changes_if_monotonic(self) -> int:
         """Return how many changes of each element of this switch are stored, if it is monotonic.
 
-        The switch is monotonic if its operand only rises or only falls in time. A comparison
-        changes at most once in this case, so that the number is 1. A function such as `floor` may
-        change any number of times; at most `MOST` of its changes are stored.
+        An element is one number of the result of the switch, which may be an array. The switch is
+        monotonic if its operand only rises or only falls in time. A comparison changes at most once
+        in this case, so that the number is 1. A function such as `floor` may change any number of
+        times; at most `MOST` of its changes are stored.
         """
         return MOST if self.equation.primitive_name in _LEVELS else 1
 

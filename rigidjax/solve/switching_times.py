@@ -130,7 +130,7 @@ class _TimedSwitch(NamedTuple):
         return self._replace(constants=lax.stop_gradient(self.constants))
 
     def operands_and_result(self, t: Array) -> list[Any]:
-        """Return the operands of the switch, followed by its result, at the time t (), s.
+        """Return the operands of the switch, followed by its result, at one time `t`, s.
 
         The switch is an equation of the program, such as the comparison `t < 1`.
         """
@@ -139,7 +139,7 @@ class _TimedSwitch(NamedTuple):
         return evaluator(self.program, wanted)(self.constants, t)
 
     def element_values(self, t: Array) -> Array:
-        """Return the values (m,) of the m elements of the switch at the time t (), s, as floats.
+        """Return the values (m,) of the m elements of the switch at one time `t`, s, as floats.
 
         The value of an element, such as 0 or 1 for a comparison, is constant except where the
         element changes.
@@ -147,7 +147,7 @@ class _TimedSwitch(NamedTuple):
         return _piecewise_constant_value(self.switch, *self.operands_and_result(t)).astype(t.dtype)
 
     def switching_functions(self, t: Array) -> Array:
-        """Return the switching functions (m,) of the m elements of the switch at the time t (), s.
+        """Return the switching functions (m,) of the m elements of the switch at one time `t`, s.
 
         For a comparison the switching function is the difference of the operands, and the element
         changes where this function is zero. For a function such as `floor` it is the operand, and
