@@ -41,7 +41,10 @@ EPOCH = 2000 + (2440400.5 - 2451545.0) / 365.25
 
 
 class Moon(eqx.Module):
-    """Hold some years of the ephemeris, as functions of the time, s, since the start of `first`.
+    """Hold the motions of Moon, Earth and Sun over some years, as functions of the time.
+
+    The time is in s since the start of the year `first`. The numbers are those of JPL's ephemeris
+    DE421.
 
     **Arguments:** `first`, `last` Julian years, such as 1970.0 and 1976.0; 2000.0 is the Julian
     date 2451545.0. The tables begin at least ten days before `first` and end at least ten days
@@ -55,8 +58,8 @@ class Moon(eqx.Module):
     - `constants`: the constants of DE421, by name, in the units of DE421 (au, day, km).
     - `first`: the argument `first`.
 
-    **Raises:** `ModuleNotFoundError` without the package; `ValueError` for years outside of 1900
-    to 2199, or not in order.
+    **Raises:** `ModuleNotFoundError` without the package `de421`; `ValueError` for years outside of
+    1900 to 2199, or not in order.
 
     >>> Moon(1970.0, 1971.0).earth.coefficients.shape  # doctest: +SKIP
     (104, 3, 13)
@@ -99,8 +102,9 @@ class Moon(eqx.Module):
 
         numbers = np.load(Path(spec.origin).parent / "constants.npy")
         self.constants = {name.decode(): float(value) for name, value in numbers}
-        # The ephemeris gives the Earth–Moon barycentre and the Sun, and the Moon relative to the
-        # Earth.
+        # The ephemeris has three positions: the Moon relative to the Earth; the barycentre of Earth
+        # and Moon; and the Sun. `share` is the Earth's part of the mass of Earth and Moon: the Moon
+        # is at `middle + share * moon`.
         share = self.constants["EMRAT"] / (1 + self.constants["EMRAT"])
         moon, middle, sun = (
             1e3 * read_chebyshev_table(name, 4) for name in ("moon", "earthmoon", "sun")

@@ -32,8 +32,9 @@ from rigidjax.rotation import euler
 CITATION = "Takahashi, Busch & Scheeres 2013, AJ 146:95, table 3"
 DAY = 86400.0
 
-# Date in UTC; 3-1-3 Euler angles (φ, θ, ψ) in degrees of the body axes against the ecliptic of
-# J2000; body rate in degrees a day. The long axis is body z.
+# Each row has the date and time in UTC, three Euler angles, and three components of the body rate.
+# The angles (φ, θ, ψ) of the 3-1-3 sequence, in degrees, are those of the body axes against the
+# ecliptic of J2000. The rate is in degrees a day. The long axis of Toutatis is body z.
 OBSERVATIONS = (
     ("1992-12-02T21:40", 122.2, 86.5, 107.0, -35.6, 7.2, -97.0),
     ("1992-12-03T19:30", 86.3, 81.8, 24.5, -16.4, -29.1, -91.9),
@@ -53,14 +54,15 @@ OBSERVATIONS = (
     ("1992-12-17T06:49", 130.6, 76.1, 234.9, 12.6, 33.9, -94.0),
     ("1992-12-18T07:09", 91.6, 81.6, 142.4, -24.3, 29.6, -102.0),
 )
-# ATTITUDE_NOISE_DEG is the paper's standard deviation of a direction. The paper has no standard
-# deviation of the rates: RATE_NOISE_DEG_A_DAY is twice the scatter of the rates about the fit.
+# ATTITUDE_NOISE_DEG is the standard deviation of a direction in the paper of CITATION, whose table
+# is OBSERVATIONS. That paper has no standard deviation of the rates: RATE_NOISE_DEG_A_DAY is twice
+# the scatter of the rates about the fit.
 ATTITUDE_NOISE_DEG = 15.0
 RATE_NOISE_DEG_A_DAY = 10.0
 
 
 def recording() -> Recording:
-    """Return the 17 observations: times, attitudes and body rates.
+    """Return the 17 radar observations of the asteroid Toutatis: times, attitudes and body rates.
 
     The times are in s since the first observation, the attitudes map body axes to the ecliptic axes
     of J2000, and the rates are in rad/s.

@@ -107,11 +107,11 @@ class ThreeBody(AbstractReversible):
     ) -> Float[Array, "rows columns"]:
         """Return 2U, twice the `potential` U, on a grid of the plane z = 0.
 
-        A particle with Jacobi's constant C stays where 2U ≥ C.
+        A particle with Jacobi's constant C stays where 2U ≥ C. With `grid` for the result,
+        `matplotlib.pyplot.contour(xs, ys, grid, levels=[C])` draws the curve 2U = C, on which the
+        velocity is zero (Szebehely 1967, sec. 4.7).
 
         **Arguments:** `xs` (columns,), `ys` (rows,) the coordinates x and y of the grid.
-        `matplotlib.pyplot.contour(xs, ys, grid, levels=[C])` draws the curve of zero velocity
-        (Szebehely 1967, sec. 4.7).
 
         >>> rj.orbits.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
         [[4.0]]

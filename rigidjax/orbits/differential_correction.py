@@ -47,7 +47,7 @@ class PeriodicOrbit(eqx.Module):
 def periodic_orbit(
     scene: AbstractScene, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float | None = None
 ) -> PeriodicOrbit:
-    """Return the periodic orbit near `guess`, by differentiable correction.
+    """Return the periodic orbit near `guess`, by Newton's method (differential correction).
 
     The method finds orbits that are symmetric about the xz-plane: Lyapunov orbits, halo orbits,
     Arenstorf's orbits, and most other orbits in use. Such an orbit crosses the plane at a right
@@ -259,9 +259,9 @@ def newton_root(f: Callable[[Array], Array], start: Array, tolerance: float) -> 
         x, _, count = carry
         missed, slope = value_and_jacobian(f, x)
         moved = x - jnp.linalg.solve(slope, missed)
-        # The loop ends by the residual before the last step, since the residual after this step
-        # would cost a further solve. Newton's method converges quadratically, so that the residual
-        # after the step is smaller still.
+        # The loop ends by `missed`, the values of `f` before the last step, since the values after
+        # this step would cost a further call of `f`. Newton's method converges quadratically, so
+        # that the values after the step are smaller still.
         return jnp.where(jnp.isfinite(moved), moved, x), jnp.max(jnp.abs(missed)), count + 1
 
     carry = start, jnp.full_like(start[0], jnp.inf), 0

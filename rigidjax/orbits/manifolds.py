@@ -158,7 +158,9 @@ def _compiled_manifold_point(
     - `distance`: the distance of the returned state from the orbit, in (x, v).
     """
     value, vector = unstable_direction(scene.monodromy(orbit))
-    # The mirror image of the unstable manifold is the stable manifold, with the opposite phase.
+    # The stable manifold is the mirror image of the unstable manifold. A point of the stable
+    # manifold with a given phase is therefore the mirror image of the point of the unstable
+    # manifold with the opposite phase, which is computed first.
     turned = phase if branch == "unstable" else -phase
     turned = turned - lax.stop_gradient(jnp.floor(turned))
     later = partial(state_after, scene, t=turned * orbit.period, **_TIGHT)

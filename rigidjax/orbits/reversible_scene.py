@@ -76,7 +76,8 @@ class AbstractReversible(AbstractScene):
         """
         return continuation.stability_indices(self.monodromy(orbit))
 
-    # These functions are methods here: their first argument is the scene.
+    # The first argument of each of these functions is a scene, so that the functions serve here as
+    # methods of the scene.
     transition = differential_correction.transition_matrix
     periodic_orbit = differential_correction.periodic_orbit
     family = continuation.family

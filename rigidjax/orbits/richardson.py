@@ -112,8 +112,8 @@ def orbit_guess(
     s1 = (s1 - 0.375 * c4 * (3 * k2 * k2 - 8 * k2 + 8)) / below
     s2 = 1.5 * c3 * (2 * a22 * (k2 - 2) + a24 * (k2 + 2) + 2 * k * b22 + 5 * d21)
     s2 = (s2 + 0.375 * c4 * (12 - k2)) / below
-    # The third order adds b33 and b34 to the first harmonic of y; the first harmonic of x is the
-    # amplitude itself.
+    # In Richardson's solution b33 and b34 are terms of third order in the first harmonic of y. The
+    # first harmonic of x has no such terms: it is the amplitude itself.
     b33 = 12 * c3 * (b21 - 2 * k * a21 + k * a23) + 3 * c4 * k * (3 * k2 - 4)
     b33 = -k / (16 * w) * (b33 + 16 * s1 * w * (w * k - 1))
     b34 = -12 * c3 * k * a22 + 3 * c4 * k + 8 * s2 * w * (w * k - 1)
@@ -147,13 +147,12 @@ def _checked_amplitude(value: ScalarLike | None) -> Scalar:
 
 
 def _potential_coefficient(mu: Scalar, point_distance: Scalar, point: int, n: int) -> Scalar:
-    """Return the coefficient c_n of the power `n` of the distance in the expansion of a potential
-    about a collinear equilibrium point.
+    """Return the coefficient c_n of the power `n` of the distance from a collinear equilibrium
+    point, in the expansion of the potential about this point.
 
-    The potential is that of the three-body problem.
-
-    The unit of length of the expansion is the distance of the point from the nearer body. Source:
-    Richardson 1980, eq 8.
+    The potential is that of the two bodies of the circular restricted three-body problem. The unit
+    of length of the expansion is the distance of the equilibrium point from the nearer body.
+    Source: Richardson 1980, eq 8.
 
     - `mu`: the mass ratio μ, the mass of the second body divided by the mass of both.
     - `point_distance`: the distance of the point from the nearer body, in units of the distance

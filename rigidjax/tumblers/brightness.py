@@ -104,8 +104,8 @@ def mesh(
     to_sun, to_observer = (double * s[None, :]).sum(axis=1), (double * o[None, :]).sum(axis=1)
     size = (double * double).sum(axis=1)
     bright = (to_sun > 0) & (to_observer > 0) & (size > 0)
-    # Dark faces get the length one, since the square root of a size of zero would make derivatives
-    # NaN.
+    # `size` is the square of twice the area of a face. A dark face gets the length one, since for a
+    # size of zero the derivative of the square root would be NaN.
     length = jnp.sqrt(jnp.where(bright, size, 1.0))
     cosines = (jnp.where(bright, one, length) / length for one in (to_sun, to_observer))
     return jnp.where(bright, 0.5 * length * law.per_area(*cosines), 0.0).sum()

@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-# The highest multiple of the first frequency is two, since a squared brightness is of second order
-# in directions.
+# The highest multiple of the first frequency, that of precession, is two: the squared brightness is
+# nearly a quadratic form of the direction half way between sun and observer, in the axes of the
+# body, and precession turns these axes at the first frequency.
 FIRST = 2
 # The span is the time from the first to the last reading. The table has DENSE entries for each
 # frequency interval of 1/span. Each interpolation uses the NEAR nearest entries, and its error is
@@ -31,10 +32,10 @@ SIDES, HIGH = 2, 0.3
 
 
 class Sums(NamedTuple):
-    """Hold sums over the readings of a light curve, at the frequencies f = −4/DENSE, −3/DENSE, … in
-    1/span.
+    """Hold sums over the readings of a light curve, at F evenly spaced frequencies f, in 1/span.
 
-    The span is the time from the first to the last reading.
+    The span is the time from the first to the last reading. The frequencies are −4/16, −3/16, −2/16
+    and so on (16 is `DENSE` and 4 is half of `NEAR`).
 
     **Fields:** `window` (F,) the sums Σ w² exp 2πi f x; `data` (F,) the sums Σ w z exp 2πi f x;
     `total` the sum Σ z². Here x is the time of a reading divided by the span, minus ½; z is its
@@ -95,11 +96,11 @@ def _interpolate_sums(
     """Return complex sums over the readings of a light curve at the wanted `frequencies`,
     interpolated in a `table` of sums at other frequencies.
 
-    The interpolation is the polynomial (Lagrange) through the nearest entries, whose number is
-    `NEAR`.
+    The interpolation is the polynomial (Lagrange) through the 8 nearest entries (`NEAR`).
 
-    - `table`: (F,) the complex sums at the frequencies (k − NEAR/2)/DENSE, in 1/span, for k = 0, 1,
-      …, F − 1. The span is the time from the first to the last reading.
+    - `table`: (F,) the complex sums at the frequencies (k − 4)/16, in 1/span, for k = 0, 1, …,
+      F − 1 (16 is `DENSE`, the number of entries for each 1/span, and 4 is half of `NEAR`). The
+      span is the time from the first to the last reading.
     - `frequencies`: in 1/span, an array of any shape, which is also the shape of the result. The
       sum at a negative frequency is the complex conjugate of the sum at the opposite frequency.
     """
@@ -190,7 +191,7 @@ def pad_rows(rows: np.ndarray) -> np.ndarray:
     """Return the array `rows` (n, …) padded with copies of its first row, so that few different
     lengths occur and few programs are compiled.
 
-    The new length is `FEW` for at most `FEW` rows, else the next multiple of `MANY`.
+    The new length is 256 (`FEW`) for at most 256 rows, else the next multiple of 2048 (`MANY`).
     """
     size = FEW if len(rows) <= FEW else -(-len(rows) // MANY) * MANY
     return np.concatenate([rows, np.repeat(rows[:1], size - len(rows), axis=0)])

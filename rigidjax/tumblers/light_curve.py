@@ -102,10 +102,12 @@ class LightCurve(eqx.Module):
     - `deviations`: (4,) the relative standard deviations of four numbers of the best motion: the
       rotation period, the precession period and the two ratios of moments.
     - `pairs`: the pairs of frequencies that `two_frequencies` found.
-    - `search`: the answer whether the search found the best motion, as for a `Fit`. It is `not
-      alone` also if another alias explains the data nearly as well.
-    - `explanation`: the answer whether the model explains the readings, as for a `Fit`. It is
-      `leaves a part` also if χ² is three standard deviations above its mean for the given noise.
+    - `search`: the answer whether the search found the best motion, in the words of the field
+      `search` of a `Fit`. Here the answer is "not alone" also if another of the `aliases` explains
+      the data nearly as well.
+    - `explanation`: the answer whether the model explains the readings, in the words of the field
+      `explanation` of a `Fit`. Here the answer is "leaves a part" also if χ² is three standard
+      deviations above its mean for the given noise.
     """
 
     fit: Fit
@@ -117,19 +119,23 @@ class LightCurve(eqx.Module):
 
     @property
     def status(self) -> str:
-        """Return one line of text with the answers `search` and `explanation`; it is `ok` if both
-        answers are good and give no reasons.
+        """Return one line of text with the answers `search` and `explanation` of this result; the
+        line is "ok" if both answers are good and give no reason.
         """
         return answers.joined_status(self.search, self.explanation)
 
     @property
     def ok(self) -> bool:
-        """Return whether the fit is ok and no other motion explains the data nearly as well."""
+        """Return whether the `status` of this result is "ok", so that no other motion explains the
+        data nearly as well as the best motion.
+        """
         return self.status == "ok"
 
     @property
     def rivals(self) -> tuple[Alias, ...]:
-        """Return the other motions that explain the data nearly as well."""
+        """Return the motions, other than the best, that explain the data nearly as well as the
+        best.
+        """
         return tuple(alias for alias in self.aliases[1:] if alias.explains)
 
     def __str__(self) -> str:
@@ -168,8 +174,8 @@ def fit_light_curve(
       of the sensor a `Free` unless the level is known.
     - `shortest`: the shortest period of a line in the spectrum, s; `None` for four times the median
       interval between the samples.
-    - `count`: the largest number of pairs of frequencies. If more pairs fit, the search has
-      `not ended`.
+    - `count`: the largest number of pairs of frequencies. If more pairs fit, the answer `search` of
+      the result is "not ended".
     - `tolerance`: as for `rigidjax.identify.fit`.
     - `progress`: a function such as `print`, called with lines of text.
 
@@ -409,14 +415,16 @@ def _light_curve_of_fit(
         )
         for one in (best, wider)
     )
-    # A search that stopped on its way to the best motion does not count as a rival.
+    # A motion nearer than `near` to the best motion is the result of a search that stopped on its
+    # way to the best motion: it does not count as another motion.
     near = np.fmax(SAME, REACH * own)
-    # The costs of the search are compared, since they all have the same noise; the fit may have
-    # estimated another noise.
+    # The best motion keeps the cost that the search gave it, since the costs of the search all
+    # belong to the same noise; the fit may have estimated another noise.
     first = _motion_of_free_numbers(best.model, best.x, aliases[0].cost)
     others = [alias for alias in aliases if not _is_same_motion(alias, first, near)]
-    # The margin between misfits is wider if the errors are larger than the noise, or
-    # autocorrelated.
+    # A motion whose misfit exceeds that of the best motion by less than a margin explains the data
+    # nearly as well. The margin is wider if the errors of the best motion are larger than the
+    # noise, or autocorrelated.
     count = int(best.model.records.readings[0].host_mask.sum())
     margin = MARGIN * max(1.0, 2.0 * first.cost / count) * max(best.correlation, 1.0)
     marked = tuple(

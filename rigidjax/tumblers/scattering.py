@@ -34,6 +34,8 @@ ValuePerFace = Float[Array, "*faces"]
 class AbstractScattering(eqx.Module):
     """Describe a scattering law by the light from a piece of surface and from a whole ellipsoid.
 
+    To make a law of your own, write a subclass with the methods `per_area` and `of_ellipsoid`.
+
     >>> class Flat(AbstractScattering):  # all that is lit and seen is equally bright
     ...     def per_area(self, incidence, emission):
     ...         return emission
@@ -45,10 +47,11 @@ class AbstractScattering(eqx.Module):
 
     @abc.abstractmethod
     def per_area(self, incidence: ValuePerFace, emission: ValuePerFace) -> ValuePerFace:
-        """Return the brightness of a piece of surface divided by its area, from the cosines of its
-        angles of `incidence` and `emission`.
+        """Return the brightness of a piece of surface divided by its area.
 
-        Both cosines are positive.
+        The arguments are cosines, both positive: `incidence` is the cosine of the angle between the
+        normal of the surface and the direction to the sun, and `emission` the cosine of the angle
+        between the normal and the direction to the observer.
         """
 
     @abc.abstractmethod
@@ -174,9 +177,10 @@ def _scalars_of_ellipsoid_brightness(
     of_sun, turned = apply(minors, sun), cross(sun, observer)
     pq = dot(observer, of_sun)
     p, q = _sqrt_or_zero(dot(sun, of_sun)), _sqrt_or_zero(dot(observer, apply(minors, observer)))
-    # The smaller of the two numbers |p||q| ± p·q is |p × q|² divided by the larger number. Since |p
-    # × q|² is computed without a subtraction, the smaller number keeps its digits at zero phase and
-    # at a phase of 180°.
+    # Here `p` and `q` hold |p| and |q|, `pq` holds p·q, and `across` holds |p × q|². The smaller of
+    # the two numbers |p||q| ± p·q is |p × q|² divided by the larger number. Since |p × q|² is
+    # computed without a subtraction, the smaller number keeps its digits where sun and observer are
+    # in the same or in opposite directions.
     across = dot(turned, apply(shape, turned)) * determinant(shape)
     same_side = pq > 0
     large = p * q + jnp.where(same_side, pq, -pq)
@@ -257,8 +261,8 @@ def _integral_over_lune_of_normals(shape: Mat3, minors: Mat3, sun: Vec3, observe
     """
     pole = cross(sun, observer)
     sine, apart = _sqrt_or_zero(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
-    # If the directions to sun and observer are nearly parallel or opposite, any pole orthogonal to
-    # them can be used.
+    # The pole is the axis of the lune, orthogonal to the directions to sun and observer. If these
+    # are nearly parallel or opposite, any pole orthogonal to them can be used.
     least = jnp.eye(3, dtype=pole.dtype)[jnp.argmin(jnp.abs(sun))]
     pole = jnp.where(apart, pole, cross(sun, least))
     pole = pole / jnp.sqrt(dot(pole, pole))
@@ -266,8 +270,9 @@ def _integral_over_lune_of_normals(shape: Mat3, minors: Mat3, sun: Vec3, observe
     width = jnp.arctan2(jnp.where(apart, sine, 0.0), -dot(sun, observer))
     e_edge, e_pole, turned = apply(shape, edge), apply(shape, pole), apply(minors, edge)
     d0, d1, d2 = dot(sun, apply(minors, sun)), -dot(sun, turned), dot(edge, turned)
-    # The integrand has a peak at the minimum of d, a determinant that is defined below, as in an
-    # elliptic integral. After two Landen transformations of the angle this peak is gone.
+    # The integral is over an angle. As in an elliptic integral, the integrand has a peak where the
+    # determinant d, which is computed below from d0, d1 and d2, has its minimum. Two Landen
+    # transformations of the angle remove this peak.
     m0, m1, m2 = (jax.lax.stop_gradient(d) for d in (d0, d1, d2))
     mean, far = 0.5 * (m0 + m2), jnp.sqrt(0.25 * (m0 - m2) ** 2 + m1 * m1)
     first = 0.5 * jnp.arctan2(2.0 * m1, m0 - m2)

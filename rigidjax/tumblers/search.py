@@ -91,8 +91,10 @@ def starts_from_frequency_pairs(
     for pair in pairs:
         for mode in starts.MODES:
             candidates = starts.candidate_motions(pair, mode, light, middle, areas, 3)
-            # The best body for each pair and each mode comes first, since the misfits on a grid
-            # cannot decide between modes and pairs.
+            # `best_of` gets the starts of the best body for this pair and this mode, and `others`
+            # the starts of the other bodies. All starts of `best_of` are used, those of `others`
+            # only to fill the last chunk, since misfits on a grid cannot decide between pairs and
+            # modes.
             best_of += candidates[: len(starts.ABOUT)]
             others += candidates[len(starts.ABOUT) :]
     chunks = max(1, -(-len(best_of) // FIRST))

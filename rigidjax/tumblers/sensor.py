@@ -42,8 +42,8 @@ class Brightness(AbstractSensor):
     **Arguments:**
 
     - `sun`, `observer`: the directions from the body to sun and observer, world frame, of any
-      length: (3,), or a callable Module of time, t → (3,), such as `torques.Linear(times,
-      directions)`.
+      length: a vector (3,), or a function of the time t, s, that returns a vector (3,), such as
+      `torques.Linear(times, directions)`.
     - `scattering`: the law, `LommelSeeliger()` (also for `None`), `Geometric()` or `Lambert()` of
       `rj.tumblers.brightness`.
     - `noise`: the standard deviation of a reading, in its unit; `None` to estimate it.
@@ -130,16 +130,17 @@ class Brightness(AbstractSensor):
         relative = area / (math.pi * jnp.cbrt(determinant(shape)))
         if self.unit == "flux":
             return self.level * relative
-        # A body whose lit side is hidden has an infinite magnitude. It is bounded by a magnitude
-        # that is fainter than any reading.
+        # If the observer does not see the lit side, the flux is 0 and the magnitude infinite. The
+        # magnitude is therefore bounded, by 30 above the level, which is fainter than any reading.
         visible = relative > 1e-12
         return self.level - 2.5 / math.log(10.0) * jnp.log(jnp.where(visible, relative, 1e-12))
 
     def typical_rate(self, t: np.ndarray, values: np.ndarray) -> float:
         """Return a rough rate of the body, rad/s: half of the angular frequency of the strongest
-        line in the first 1000 readings.
+        line in the spectrum of the first 1000 readings.
 
-        The factor is one half, because the brightness of an ellipsoid has two maxima in a turn.
+        The arguments are the times `t` (T,), s, and the readings `values` (T,). The factor is one
+        half, because the brightness of an ellipsoid has two maxima in a turn.
         """
         t, values = t[:1000], values[:1000]
         if t.size < 10 or np.ptp(values) == 0:

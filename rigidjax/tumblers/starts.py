@@ -249,7 +249,10 @@ def _fit_motions_on_grid_of_phases(
                 def entry(i: int, j: int) -> Any:
                     return sum(form[k] * m[i, k] * m[j, k] for k in range(3))
 
-                # These are the entries of Σ M_k r_k r_kᵀ, with r_k the body axes in the world.
+                # The model of the squared flux is n·Q n with Q = Σ M_k r_k r_kᵀ, where r_k are the
+                # principal axes of the body (the columns of m) and M_k the numbers of `form`. It is
+                # linear in the six entries xx, yy, zz, xy, xz, yz of n nᵀ. The coefficients of
+                # these entries are returned.
                 twice = (2 * entry(0, 1), 2 * entry(0, 2), 2 * entry(1, 2))
                 return jnp.stack([entry(0, 0), entry(1, 1), entry(2, 2), *twice])
 

@@ -33,7 +33,8 @@ TRIED = 2
 # Squares of numbers above LARGEST may overflow. If more than MOST of the shortest periods fit into
 # the span, a search takes hours.
 LARGEST, MOST = 1e100, 1e5
-# The number of times is padded to a multiple of BLOCK, so that few programs are compiled.
+# The arrays of a light curve are padded to a length that is a multiple of BLOCK, so that few
+# programs are compiled.
 BLOCK = 256
 # Two pairs count as the same if both frequencies differ by less than this, in 1/span.
 NEAR = 0.25
@@ -281,7 +282,8 @@ def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
     related = ((first / 2, second), (2 * first, second), (first, second / 2), (first, 2 * second))
     related += ((first, second + first), (first, second - first))
     rows = [*moved, *(np.stack(one, axis=-1) for one in related)]
-    # The pair (f₁, −f₂) has the same lines as (f₁, f₂).
+    # A sum or difference above may be a negative frequency. Its sign is dropped, since the pair
+    # (f₁, −f₂) has the same lines j f₁ + k f₂ as the pair (f₁, f₂).
     return np.abs(np.concatenate(rows).reshape(-1, 2))
 
 
@@ -321,7 +323,8 @@ def distinct_pairs(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[i
     """Return the indices of the best different pairs of frequencies, at most `count` of them, in
     the order of their misfits.
 
-    Two pairs are different if the first or the second frequency differs by more than `NEAR`.
+    Two pairs are different if the first or the second frequency differs by more than 1/4 (`NEAR`),
+    in 1/span, where the span is the time from the first to the last reading.
 
     - `pairs`: (P, 2) the two frequencies of each pair, 1/span.
     - `misfits`: (P,) χ² of the pairs.

@@ -38,17 +38,19 @@ class Belief(eqx.Module):
     """Hold an estimate of the state at one time, and a root S of the covariance `S Sᵀ` of its
     errors.
 
-    `first_belief` makes the belief before the first reading. In the result of `filter` all fields
-    have a leading time axis.
+    `first_belief` makes the belief before the first reading. The result of `filter` holds one
+    `Belief` for all times, in which all fields have a leading time axis.
 
     **Fields:**
 
     - `t`: the time, s.
-    - `x`: the estimated state, an `ExtendedState`.
-    - `root`: S (n, n). The rows belong to the errors of the state in this order: for a `Spin` the
-      body rate Ω; for an `Attitude` a small turn δθ (body frame, rad) and Ω; for a `Rigid` the
-      position x, the velocity v, δθ and Ω; then three rows for each `CorrelatedTorque`, and the
-      rows of the walks.
+    - `x`: the estimated state, an `ExtendedState`: the motion (a `Spin`, `Attitude` or `Rigid`);
+      each `CorrelatedTorque`, an unknown torque that is correlated in time; and each `Walk`, a
+      number that drifts as a random walk, such as the bias of a gyro.
+    - `root`: S (n, n) for the n components of an error of the state. Each component has a row, in
+      this order: for a `Spin` the body rate Ω; for an `Attitude` a small turn δθ (body frame, rad)
+      and Ω; for a `Rigid` the position, the velocity, δθ and Ω; then three rows for each
+      `CorrelatedTorque`, and the rows of each `Walk`.
     """
 
     t: Float[Array, "*times"]
@@ -57,29 +59,35 @@ class Belief(eqx.Module):
 
     @property
     def state(self) -> Spin | Attitude | Rigid:
-        """Return the estimated state at each time, of the type of the first state: a `Spin`, an
-        `Attitude` or a `Rigid`.
+        """Return the estimated motion of this belief: a `Spin`, `Attitude` or `Rigid`, of the same
+        type as the initial state.
         """
         return self.x.motion
 
     @property
     def torques(self) -> tuple[Float[Array, "*times 3"], ...]:
-        """Return the estimate (3,) of each `CorrelatedTorque`, N m, body frame."""
+        """Return the torques (3,) of this belief, N m, body frame: the estimate of each
+        `CorrelatedTorque`, an unknown torque that is correlated in time.
+        """
         return self.x.torques
 
     @property
     def walks(self) -> tuple[Array, ...]:
-        """Return the estimate of each `Walk`, a number that drifts as a random walk."""
+        """Return the walks of this belief: the estimate of each `Walk`, a number that drifts as a
+        random walk.
+        """
         return self.x.walks
 
     @property
     def covariance(self) -> Float[Array, "*times n n"]:
-        """Return the covariance `S Sᵀ` of the errors of the estimate."""
+        """Return the covariance `S Sᵀ` (n, n) of the errors of this belief, from its root S."""
         return self.root @ jnp.swapaxes(self.root, -1, -2)
 
     @property
     def deviation(self) -> Float[Array, "*times n"]:
-        """Return the standard deviations of the errors of the estimate."""
+        """Return the standard deviations (n,) of the errors of this belief, in the order of the
+        rows of `root`.
+        """
         return jnp.sqrt(jnp.sum(self.root**2, axis=-1))
 
 
@@ -93,7 +101,8 @@ def first_belief(
     position: NumbersLike | None = None,
     velocity: NumbersLike | None = None,
 ) -> Belief:
-    """Return the belief before the first reading.
+    """Return the belief before the first reading: the estimated initial state with a root of the
+    covariance of its errors.
 
     The walks (numbers of the model that drift randomly, such as the bias of a gyro) begin at the
     values that the model gives them. Each `CorrelatedTorque` begins at its stationary distribution.
@@ -269,9 +278,10 @@ class Grid(NamedTuple):
     def at_recording_times(self, values: PyTree[Array]) -> PyTree[Array]:
         """Return the entries of `values` at the times of the recording.
 
-        The arrays in `values` have a leading axis over all times of the grid.
+        The arrays in `values` have a leading axis over all N times of this grid, the times at which
+        the steps of a filter end.
         """
-        # If the grid has no other times, indexing would only copy the arrays.
+        # If all times of the grid are times of the recording, indexing would only copy the arrays.
         same = self.rows.size == self.t.size
         return values if same else jax.tree.map(lambda leaf: leaf[self.rows], values)
 
@@ -282,8 +292,8 @@ def grid_of_step_times(
     """Return the times at which the steps of a filter end, from the time of a `belief` to the last
     reading.
 
-    These are the times of the `recording`. Between two of them there are equally spaced further
-    times if one step would be too long.
+    The steps end at the times of the `recording`. If one step between two of these times would be
+    too long, steps also end at further times between the two, at equal distances.
 
     **Arguments:**
 
@@ -291,8 +301,8 @@ def grid_of_step_times(
       correlation times.
     - `recording`: the times and readings.
     - `belief`: the estimate from which the filter starts, at or before the first reading.
-    - `substeps`: the number of steps from one time to the next; `None` chooses this number by the
-      body rate and the correlation times.
+    - `substeps`: the number of steps from one time of the recording to the next; `None` chooses
+      this number by the body rate and the correlation times.
     """
     xp = _checks.array_module((recording.t, belief.t))
     t, t0 = xp.asarray(recording.t), xp.asarray(belief.t)
@@ -348,8 +358,11 @@ class Filtered(eqx.Module):
 
     **Fields:**
 
-    - `belief`: a `Belief` at each time of the recording, after its readings.
-    - `readings`: a `ReadNumbers` for each sensor, with `innovation`, `variance` and `mask`, (T, k).
+    - `belief`: the `Belief` (the estimate with a root of its covariance) at each of the T times of
+      the recording, after the readings at this time.
+    - `readings`: a `ReadNumbers` for each sensor, with three arrays (T, k) for the k components of
+      a reading: `innovation` (reading minus prediction), the `variance` of the innovation, and
+      `mask`, true for a component that was read.
     - `log_likelihood`: the logarithm of the density of all readings.
     - `status`: 0 if the filter followed the readings, 1 if it was lost, 2 if an estimate is not
       finite. `words` describes the status.
@@ -364,29 +377,32 @@ class Filtered(eqx.Module):
 
     @property
     def t(self) -> Float[Array, " times"]:
-        """Return the times of the recording, s."""
+        """Return the times of the estimates, s, which are the times of the recording."""
         return self.belief.t
 
     @property
     def states(self) -> Spin | Attitude | Rigid:
-        """Return the estimated states, with a leading time axis."""
+        """Return the estimated motion at the times of the recording, as one `Spin`, `Attitude` or
+        `Rigid` with a leading time axis.
+        """
         return self.belief.state
 
     @property
     def words(self) -> str:
-        """Return text that says whether the filter followed the readings, was lost, or stopped."""
+        """Return the `status` of this result in words: the filter followed the readings, was lost,
+        or stopped because an estimate is NaN or infinite.
+        """
         return WORDS[int(self.status)]
 
     @property
     def nis(self) -> tuple[Float[Array, " times"], ...]:
-        """Return, for each sensor, the sum of its squared innovations divided by their variances,
-        at each of T times (T,).
+        """Return the normalised innovations squared (T,) of each sensor: at each of the T times,
+        the sum of ν²/s over the components that were read.
 
-        An innovation is a component of a reading minus its prediction.
-
-        If the model is right, the sum follows the χ² distribution, with as many degrees of freedom
-        as components were read at this time (Bar-Shalom, Li and Kirubarajan, Estimation (2001),
-        §5.4).
+        The innovation ν is a component of the reading minus its prediction, and s is the variance
+        of ν. If the model is right, the sum follows the χ² distribution, with as many degrees of
+        freedom as components were read at this time (Bar-Shalom, Li and Kirubarajan, Estimation
+        (2001), §5.4).
         """
         return tuple(
             jnp.sum(jnp.where(r.mask, r.innovation**2 / r.variance, 0), -1) for r in self.readings
@@ -564,7 +580,8 @@ def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) 
     - `stop`: the new time, s, and for each sensor its reading at this time and whether there is
       one.
     """
-    # Replace missing readings by a unit vector: derivatives at a zero quaternion are NaN.
+    # Missing readings do not count, but their derivatives must be finite. They are replaced by a
+    # unit vector, since for a quaternion of zeros derivatives would be NaN.
     units = (jnp.eye(1, v.size, dtype=v.dtype).reshape(v.shape) for v in stop.values)
     values = tuple(map(jnp.where, stop.masks, stop.values, units))
     values = tuple(value.astype(belief.root.dtype) for value in values)

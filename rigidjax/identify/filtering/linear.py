@@ -15,15 +15,17 @@ from rigidjax import _checks
 from rigidjax._types import Numbers, Scalar
 from rigidjax.identify.filtering import roots
 
-# A parameter is an array or nested lists of numbers, with a leading axis or without.
+# An argument of `LinearModel` is an array or nested lists of numbers. It may have a leading axis
+# over steps or times.
 Parameter = Float[ArrayLike, "..."] | Numbers
 
 
 class LinearModel(eqx.Module):
     """Hold a linear model of a state x and its readings y, with normal noise.
 
-    A step leads from x to `F x + d + G u`, and the readings are `y = H x + c + r v`. The vectors u
-    and v are normal, with independent entries of unit variance.
+    A step leads from x to `F x + d + G u`, and the readings are `y = H x + c + r v`, where r is
+    multiplied by v entry by entry. The vectors u and v are normal, with independent entries of unit
+    variance. The state x has n entries, y and v have k, and u has m.
 
     **Arguments:**
 
@@ -96,12 +98,14 @@ class LinearModel(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return the number of entries of the state."""
+        """Return n, the number of entries of the state of this model."""
         return self.transition.shape[-1]
 
 
 class LinearEstimate(eqx.Module):
     """Hold the estimated state of a `LinearModel` at each time, and its covariance.
+
+    There are T times; the state has n entries, a reading k numbers and the noise of a step m.
 
     **Fields:**
 
@@ -130,7 +134,9 @@ class LinearEstimate(eqx.Module):
 
     @property
     def deviation(self) -> Float[Array, "times n"]:
-        """Return the standard deviation of each entry of the state at each time."""
+        """Return the standard deviation (T, n) of each of the n entries of the estimated state at
+        each of the T times.
+        """
         return jnp.sqrt(jnp.sum(self.root**2, -1))
 
 
@@ -344,13 +350,15 @@ def smoother_gain_and_roots(transition: Array, noise: Array, root: Array) -> Smo
     The three matrices are computed from blocks of the triangular root of the matrix `[[F S, G], [S,
     0]]` (Park and Kailath 1995, doi:10.1080/00207179508921582).
 
-    **Arguments:** `transition` F (n, n); `noise` G (n, m); `root` S (n, n), a root of the
-    covariance of the state before the step. **Returns** the `SmootherMatrices`.
+    **Arguments:** `transition` F (n, n), which maps a state before the step to the state after it;
+    `noise` G (n, m), a root of the covariance that the noise of the step adds; `root` S (n, n), a
+    root of the covariance of the state before the step. **Returns** the `SmootherMatrices`.
     """
     n, m = noise.shape
     upper = jnp.concatenate([roots.matrix_product(transition, root), noise], 1)
     whole = jnp.concatenate([upper, jnp.pad(root, ((0, 0), (0, m)))])
-    # A triangular root of 2n rows needs as many columns.
+    # `triangular_root` needs at least as many columns as rows: the matrix of 2n rows and n + m
+    # columns gets further columns of zeros if m < n.
     whole = roots.triangular_root(jnp.pad(whole, ((0, 0), (0, max(0, n - m)))))
     predicted, cross = whole[:n, :n], whole[n:, :n]
     return SmootherMatrices(

@@ -136,7 +136,9 @@ class LogDensityTerms(NamedTuple):
 
     @property
     def total_log_density(self) -> Scalar:
-        """Return the sum of the logarithms of the normal densities of all numbers read."""
+        """Return the logarithm of the density of all numbers read, −½ Σ (error² + log_variance),
+        from these terms.
+        """
         return -0.5 * jnp.sum(self.error**2 + self.log_variance)
 
 

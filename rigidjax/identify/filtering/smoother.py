@@ -75,17 +75,23 @@ class Smoothed(eqx.Module):
 
     @property
     def words(self) -> str:
-        """Return text that says whether the filter followed the readings, was lost, or stopped."""
+        """Return the `status` of this result in words: the filter followed the readings, was lost,
+        or stopped because an estimate is NaN or infinite.
+        """
         return WORDS[int(self.status)]
 
     @property
     def t(self) -> Float[Array, " stops"]:
-        """Return the times of all stops, s."""
+        """Return the times, s, of all N stops: the times of the recording and the times between
+        them at which steps end.
+        """
         return self.belief.t
 
     @property
     def states(self) -> Spin | Attitude | Rigid:
-        """Return the most probable states at the recorded times, with a leading time axis."""
+        """Return the most probable motion at the times of the recording, as one `Spin`, `Attitude`
+        or `Rigid` with a leading time axis.
+        """
         return jax.tree.map(lambda leaf: leaf[self.rows], self.belief.state)
 
 
@@ -223,12 +229,13 @@ def _gauss_newton_iteration(
     def linearise_step_and_readings(
         row: tuple[Array, Stops, ExtendedState, ExtendedState, Array],
     ) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array, Array]]:
-        """Return two things: one step of the motion, linearised; and the readings at its end,
-        linearised.
+        """Return two things: one step of the motion, linearised about the given `path` of states;
+        and the readings at the end of the step, linearised too.
 
-        The `row` holds five things: the time t0 before the step, s; the time and the readings at
-        its end (`Stops`); the states of the path before and after the step; and the unit normal
-        numbers (m,) that make the noise of the torques in the step.
+        The `row` holds five things: the time t0 before the step, s; the time at the end of the step
+        and the readings at this time (`Stops`); the state of the `path` before the step; the state
+        of the `path` after the step; and the unit normal numbers (m,) that make the noise of the
+        torques in the step.
 
         The linearised step is three arrays F, G and d: an error e of the state before the step
         becomes `F e + d + G u` after the step, with the unit normal noise u. The linearised

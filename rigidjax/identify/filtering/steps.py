@@ -96,7 +96,8 @@ class Dynamics(eqx.Module):
 
     **Fields:**
 
-    - `scene`: the scene, with the body in the form that the equations of motion need.
+    - `scene`: all on which readings depend (body, torques, sensors and initial state), with the
+      body in the form that the equations of motion need.
     - `field`: the equations of motion under the known torque, a function of time, state and `None`.
     - `inverse`: (3, 3) the inverse of the inertia tensor.
     - `white`: the square root of the spectral density of each `RandomTorque`.
@@ -510,7 +511,8 @@ def _sample(
         x: ExtendedState, row: tuple[Array, Array, Array]
     ) -> tuple[ExtendedState, ExtendedState]:
         left, right, one = row
-        # Subtract times before they are rounded to the dtype of the state.
+        # Subtract times before they are rounded to the dtype of the state: for times that are long
+        # after zero the seven digits of float32 are too few.
         h = ((right - left) / pieces).astype(dtype)
         left = left.astype(dtype)
         kicks = jax.random.normal(one, (pieces, dynamics.noise_dimension), dtype)

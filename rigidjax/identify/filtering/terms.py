@@ -106,7 +106,8 @@ def _log_density_terms_of_motion(model: Model, scene: Scene, record: Recording) 
             reading.values, reading.mask, error, noise, limit, reading.jitter_error
         )
         scaled.append(one)
-        # A channel at full scale contributes a probability, and so no logarithm of a variance.
+        # A component at full scale contributes the probability of a reading beyond the full scale
+        # instead of a density, so that its logarithm of a variance is set to zero.
         mask = reading.mask[:, None] & ~full
         logs = jnp.log(2 * math.pi * noise**2)[None]
         log_variance.append(jnp.where(mask, logs if wider is None else logs + wider, 0))

@@ -53,12 +53,16 @@ class AttitudeSensor(ClockedSensor):
         return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
 
     def reading_of(self, motion: SensorInput, error: Vec3) -> Float[Array, "4"]:
-        """Return the reading (4,) whose error is `error` (3,), rad, for this motion."""
+        """Return the quaternion (4,) that this attitude sensor reads for a given `motion` if its
+        error is the rotation vector `error` (3,), rad.
+        """
         q = _mounted_attitude(motion.state.q, self.mounting)
         return quaternion.multiply(q, quaternion.exp(error))
 
     def readings(self, values: np.ndarray) -> np.ndarray:
-        """Return `values`, quaternions (T, 4) or matrices (T, 3, 3), as readings (T, 4)."""
+        """Return the attitudes `values`, which are quaternions (T, 4) or rotation matrices (T, 3,
+        3), as quaternions (T, 4), the form of the readings of this sensor.
+        """
         return _quaternions_of_matrices(values) if values.shape[1:] == (3, 3) else values
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:

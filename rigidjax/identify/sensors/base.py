@@ -42,15 +42,17 @@ class SensorInput(eqx.Module):
 
     @property
     def rate(self) -> Any:
-        """Return the time derivative of the state: its `.omega` is dΩ/dt, its `.v` the
-        acceleration.
+        """Return the time derivative of the state, as an object of the same type: its `.omega` is
+        dΩ/dt and, for a `Rigid`, its `.v` is the acceleration of the centre of mass.
         """
         return self.field(self.t, self.state, None)
 
     def lever(self, place: Vec3) -> Vec3:
-        """Return the vector (3,), m, from the reference point of the state to a `place`.
+        """Return the vector (3,), m, from the reference point of the body to a `place`.
 
-        The vector and the `place` (3,), m, are in the body frame.
+        The reference point is the centre of mass if the body is a `MassProperties`. If the body is
+        an `Inertia`, it is the origin of the body frame, such as the pivot. The vector and the
+        `place` (3,), m, are in the body frame.
         """
         return place - self.body.com if isinstance(self.body, MassProperties) else place
 
@@ -62,7 +64,9 @@ class AbstractSensor(eqx.Module):
     To make a sensor of your own, write a subclass with the method `error` and these members:
 
     - `reading_shape`: the shape of one reading.
-    - `feels`: the state that the sensor needs, `HasSpin`, `HasAttitude` or `HasPose`.
+    - `feels`: the protocol of the states that the sensor can read: `HasSpin` if it needs only the
+      body rate, `HasAttitude` if it needs the attitude too, `HasPose` if it needs also position and
+      velocity.
     - `components`, `unit`: the number k of components of an error, and the unit of an error.
     - `noise`: (k,) the standard deviation of each component; `None` if a fit shall estimate it.
 

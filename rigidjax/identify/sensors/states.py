@@ -47,12 +47,16 @@ class StateSensor(AbstractSensor):
 
     @property
     def reading_shape(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Return the shape of a reading."""
+        """Return the shape of a reading of this sensor: (3,), (7,) or (13,), by its `kind` of
+        state.
+        """
         return (_SIZES[self.kind][0],)
 
     @property
     def components(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Return the number of components of an error."""
+        """Return the number of components of an error of this sensor: 3, 6 or 12, by its `kind` of
+        state.
+        """
         return _SIZES[self.kind][1]
 
     @property

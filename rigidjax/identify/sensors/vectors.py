@@ -100,7 +100,8 @@ class Gyro(VectorSensor):
     )
     place: Vec3 | None = eqx.field(converter=base.optional_array_field("place"), default=None)
     gravity: Vec3 | None = eqx.field(converter=base.optional_array_field("gravity"), default=None)
-    # The gyro needs the attitude only to turn gravity into the body frame.
+    # `feels` is the state that the gyro needs, which `__post_init__` sets: the body rate, and the
+    # attitude only if there is a gravity to turn into the body frame.
     feels: type = eqx.field(static=True, init=False, default=HasSpin)
 
     def __post_init__(self) -> None:
@@ -127,9 +128,9 @@ def specific_force(motion: SensorInput, place: Vec3, gravity: Vec3 | None) -> Ve
     """Return the specific force (3,) at a place of the body, m/s², body frame.
 
     It is `Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)`. Here R is the rotation from body to world axes, Ω
-    the body rate, r the vector from the reference point of the state to the `place`, a the
-    acceleration of this point, and g the `gravity`. If `gravity` is `None`, the result is only the
-    terms with r.
+    the body rate, r the vector to the `place` from the reference point (the centre of mass, or the
+    pivot of a body on a pivot), a the acceleration of the reference point, and g the `gravity`. If
+    `gravity` is `None`, the result is only the terms with r.
     """
     state, rate = motion.state, motion.rate
     r = motion.lever(place)
@@ -165,7 +166,8 @@ class Accelerometer(VectorSensor):
     'm/s²'
     """
 
-    # The sensor needs the attitude only to turn gravity into the body frame.
+    # `feels` is the state that the accelerometer needs: the body rate, and the attitude only if
+    # there is a gravity to turn into the body frame.
     feels: ClassVar[Any] = property(lambda self: HasSpin if self.gravity is None else HasAttitude)
     unit: ClassVar[str] = "m/s²"
     _: dataclasses.KW_ONLY
