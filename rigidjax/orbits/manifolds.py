@@ -27,8 +27,8 @@ from rigidjax.solve.run import Ends
 if TYPE_CHECKING:
     from rigidjax.orbits.reversible_scene import AbstractReversible
 
-# The mirror image of a motion, y → −y and t → −t, is a motion, too. These are the signs by which it
-# multiplies x, y, z, vx, vy, vz.
+# The mirror image of a motion, y → −y and t → −t, is a motion, too. Its position (x, y, z) and
+# velocity (vx, vy, vz) are those of the motion, multiplied by these signs.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 Branch = Literal["stable", "unstable"]
 # A manifold starts at a point of the orbit. The integration to this point has these relative and

@@ -116,7 +116,9 @@ class Brightness(AbstractSensor):
         return (reading - self.predict(motion))[None]
 
     def predict(self, motion: SensorInput) -> Scalar:
-        """Return the predicted reading, without noise, for the state in `motion`."""
+        """Return the predicted flux or magnitude, without noise, for a `motion`: the time, the
+        attitude at this time, and the body.
+        """
         shape = motion.body.second_moment
         if self.semi_axes is not None:
             shape = jnp.diag(self.semi_axes * self.semi_axes)

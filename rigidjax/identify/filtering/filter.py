@@ -111,9 +111,9 @@ def first_belief(
 
     - `model`: a `Model` of one recording.
     - `x`: (n,) the free numbers of the model, such as `fit(model).x`. With `None` the body must be
-      known, and the initial state is the state that the first readings show.
+      known.
     - `state`: the initial state, a `Spin`, `Attitude` or `Rigid`; `None` takes the initial state
-      that x represents.
+      that x represents or, without x, the state that the first readings show.
     - `rate`: the standard deviation of the initial body rate Ω, rad/s, one number or three; zero if
       the rate is known.
     - `attitude`: the standard deviation of the initial attitude, rad, one number or three, for an
@@ -187,14 +187,14 @@ def belief_at(
 
 
 def _require_shown_attitude(recording: Recording, state: HasSpin | None) -> None:
-    """Raise an error if a filter cannot take its initial attitude from the readings alone.
+    """Raise an error if the initial state of a filter has an attitude that no reading shows.
 
     An attitude sensor, two directions or three markers show the attitude.
 
-    **Arguments:** `recording` the readings of all sensors; `state` the initial state, which has an
-    attitude to be found if it is an `Attitude` or a `Rigid`. **Raises:** `TypeError` for a traced
-    recording, whose readings cannot be looked at; `ValueError` if `state` has an attitude and no
-    reading shows it.
+    **Arguments:** `recording` the readings of all sensors; `state` the initial state, of which only
+    the type counts: an `Attitude` or a `Rigid` has an attitude, a `Spin` has none. **Raises:**
+    `TypeError` for a traced recording, whose readings cannot be looked at; `ValueError` if `state`
+    has an attitude and no reading shows it.
     """
     if not _checks.is_known(recording):
         raise TypeError(
@@ -263,8 +263,8 @@ class Grid(NamedTuple):
     **Fields:**
 
     - `t`: (N,) the times, s.
-    - `source`: (N,) for each time of `t`, an index into the times of the recording: that of the
-      first recorded time at or after it.
+    - `source`: (N,) for each time of `t`, the index of the first time of the recording that is not
+      earlier.
     - `real`: (N,) for each time of `t`, whether it is a time of the recording, so that its readings
       count.
     - `rows`: (T,) the index in `t` of each time of the recording.
@@ -575,8 +575,8 @@ def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) 
 
     - `scene`: the body, torques and sensors.
     - `drifts`: the numbers that drift as random walks, such as the bias of a gyro.
-    - `belief`: the estimated state before the step, with a root of its covariance C
-      (a matrix B with B Bᵀ = C).
+    - `belief`: the estimated state before the step, with a root S of the covariance `S Sᵀ` of its
+      errors.
     - `stop`: the new time, s, and for each sensor its reading at this time and whether there is
       one.
     """
@@ -601,8 +601,8 @@ def _predict_and_update(
     **Arguments:**
 
     - `dynamics`: the equations of motion, the noise of the torques, and the sensors.
-    - `belief`: the estimated state before the step, with a root of its covariance C
-      (a matrix B with B Bᵀ = C).
+    - `belief`: the estimated state before the step, with a root S of the covariance `S Sᵀ` of its
+      errors.
     - `stop`: the new time, s, and for each sensor its reading at this time and whether there is
       one.
 

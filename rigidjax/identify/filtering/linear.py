@@ -211,8 +211,8 @@ def _checked_arguments(
 
     - `model`: the linear model, with n entries of the state and k numbers read at a time.
     - `readings`: (T, k) the numbers read at each of T times.
-    - `mean`, `root`: (n,) the mean of the first state, and (n, n) a root of its covariance C
-      (a matrix B with B Bᵀ = C).
+    - `mean`, `root`: (n,) the mean of the first state, and (n, n) a root S of its covariance
+      `S Sᵀ`.
     - `mask`: (T, k) true for the numbers to use; `None` to use all.
 
     **Returns** five things: the arrays of the `model` as a dict of field name → array; the
@@ -357,8 +357,8 @@ def smoother_gain_and_roots(transition: Array, noise: Array, root: Array) -> Smo
     n, m = noise.shape
     upper = jnp.concatenate([roots.matrix_product(transition, root), noise], 1)
     whole = jnp.concatenate([upper, jnp.pad(root, ((0, 0), (0, m)))])
-    # `triangular_root` needs at least as many columns as rows: the matrix of 2n rows and n + m
-    # columns gets further columns of zeros if m < n.
+    # If m < n, columns of zeros are added, which do not change `A Aᵀ`: the matrix A then has at
+    # least as many columns as rows.
     whole = roots.triangular_root(jnp.pad(whole, ((0, 0), (0, max(0, n - m)))))
     predicted, cross = whole[:n, :n], whole[n:, :n]
     return SmootherMatrices(

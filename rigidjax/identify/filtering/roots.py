@@ -55,8 +55,9 @@ def inverse_sqrt_or_zero(x: Array, threshold: ScalarLike = 0.0) -> Array:
 
 
 def matrix_product(left: Float[Array, "n m"], right: Float[Array, "m k"]) -> Float[Array, "n k"]:
-    """Return the matrix product `left right` in full precision, in a way that is cheap for a few
-    rows.
+    """Return the matrix product `left right` in full precision, by sums over products of entries.
+
+    These sums are cheap if the matrices have only a few rows.
     """
     return jnp.sum(left[:, :, None] * right[None], 1)
 

@@ -212,8 +212,8 @@ def _gauss_newton_iteration(
     **Arguments:**
 
     - `dynamics`: the equations of motion, the noise of the torques, and the sensors.
-    - `belief`: the estimated state before the first reading, with a root of its covariance C
-      (a matrix B with B Bᵀ = C).
+    - `belief`: the estimated state before the first reading, with a root S of the covariance `S Sᵀ`
+      of its errors.
     - `stops`: the N times at which steps end, with their readings.
     - `path`: the N + 1 states about which the problem is linearised, at the time of the `belief`
       and at the N times.

@@ -48,9 +48,10 @@ def log_density_terms_of_recording(
 ) -> LogDensityTerms:
     """Return the terms of the log-density of the readings of one recording.
 
-    The readings are normal about the motion. If the model has an unknown torque, or numbers that
-    drift as random walks, a Kalman filter integrates over these unknowns, and the readings are
-    normal about the predictions of the filter.
+    The errors of the readings are normal. They are the differences of the readings from the motion
+    that the equations of motion give. If the model has an unknown torque, or numbers that drift as
+    random walks, a Kalman filter integrates over these unknowns, and the errors are the differences
+    of the readings from the predictions of the filter.
 
     **Arguments:**
 
@@ -82,8 +83,8 @@ def _log_density_terms_of_motion(model: Model, scene: Scene, record: Recording) 
     """Return the terms of the log-density of one recording if no torque is random and no
     parameter drifts.
 
-    The readings are then independent, and normal about the motion that the equations of motion
-    give.
+    The errors of the readings, which are their differences from the motion that the equations of
+    motion give, are then independent and normal.
 
     **Arguments:**
 

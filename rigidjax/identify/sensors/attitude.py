@@ -260,7 +260,7 @@ class Position(ClockedSensor):
 
     **Arguments:**
 
-    - `noise`: the standard deviation, m, one number or (3,), `None` estimates the noise.
+    - `noise`: the standard deviation, m, one number or (3,); `None` estimates the noise.
     - `bias`: (3,) m, world frame, or `None`.
     - `offset`, `jitter`: the clock offset and the deviation of the time stamps, s, as for `Gyro`.
 
@@ -291,7 +291,7 @@ class Velocity(ClockedSensor):
 
     **Arguments:**
 
-    - `noise`: the standard deviation, m/s, one number or (3,), `None` estimates the noise.
+    - `noise`: the standard deviation, m/s, one number or (3,); `None` estimates the noise.
     - `place`: (3,) the point, m, in the frame of the `MassProperties`; `None` for the centre of
       mass.
     - `mounting`: (3,) the rotation vector from the body's axes to the sensor's, rad, for a sensor
@@ -337,7 +337,7 @@ class Range(ClockedSensor):
     **Arguments:**
 
     - `station`: (3,) the position p of the station, m, world frame.
-    - `noise`: the standard deviation, m, `None` estimates the noise.
+    - `noise`: the standard deviation, m; `None` estimates the noise.
     - `place`: (3,) the point, m, in the frame of the `MassProperties`; `None` for the centre of
       mass.
     - `bias`: m, or `None`.

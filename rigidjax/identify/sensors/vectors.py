@@ -152,7 +152,7 @@ class Accelerometer(VectorSensor):
 
     **Arguments:**
 
-    - `noise`: the standard deviation, m/s², one number or (3,), `None` estimates the noise.
+    - `noise`: the standard deviation, m/s², one number or (3,); `None` estimates the noise.
     - `place`: (3,) the sensor's place, m, body frame: from the reference point of the `Inertia`, or
       in the frame of the `MassProperties`.
     - `gravity`: (3,) m/s², world frame; `None` for a body in free fall (`Spin`, `Attitude`). A body
