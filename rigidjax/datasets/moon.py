@@ -128,9 +128,12 @@ class Moon(eqx.Module):
     ) -> Inertia:
         """Return the inertia of the Moon, kg m², with the oblateness J2 of DE421.
 
-        **Arguments:** `beta` β = (C − A)/B and `gamma` γ = (B − A)/C, with the principal moments A
-        ≤ B ≤ C; `None` for the values of DE421; `core` whether a liquid core turns in the mantle,
-        so that the result is the inertia of the mantle alone, for use with `torque(core=True)`.
+        **Arguments:**
+
+        - `beta`: β = (C − A)/B for the principal moments A ≤ B ≤ C; `None` for the value of DE421.
+        - `gamma`: γ = (B − A)/C; `None` for the value of DE421.
+        - `core`: whether a liquid core turns in the mantle; the result is then the inertia of the
+          mantle alone, for use with `torque(core=True)`.
         """
         c = self.constants
         b = jnp.asarray(c["LBET"] if beta is None else beta)

@@ -381,7 +381,10 @@ def bifurcation(
     low, high = excess(a), excess(b)
     if not low * high <= 0:
         ends = f"{low + value:.6g} at one orbit, {high + value:.6g} at the other"
-        raise ValueError(f"bifurcation: the index is {ends}: {value:g} does not lie between")
+        raise ValueError(
+            f"bifurcation: the stability index is {ends}: {value:g} is not between these two; "
+            "give orbits on both sides of the branch point"
+        )
     root: Any = brentq(excess, a, b, xtol=1e-13 * max(1.0, abs(b - a)), maxiter=_MOST)
     return orbits[root]
 

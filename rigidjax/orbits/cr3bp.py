@@ -263,8 +263,8 @@ class Hill(AbstractReversible):
     def approach(
         self, t: ScalarLike, state: Point
     ) -> tuple[Float[Array, "distances=1"], Float[Array, "collision_distances=1"]]:
-        """Return two arrays (1,): the distance from the small body; and the distance that counts as
-        a collision.
+        """Return two arrays (1,) for the small body: the distance of the particle from it; and the
+        distance that counts as a collision with it.
         """
         gap = jnp.sqrt(jnp.sum(state.x * state.x, keepdims=True))
         least = jnp.maximum(self.radius.astype(gap.dtype), smallest_accurate_distance(gap.dtype))

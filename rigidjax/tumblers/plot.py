@@ -35,7 +35,7 @@ def light_curve(
     **Arguments:**
 
     - `ts`: (T,) the times, s.
-    - `values`: (T,) readings, NaN for a gap.
+    - `values`: (T,) the readings, in the unit that `quantity` names; NaN for a gap.
     - `periods`: one period, several or none, s.
     - `model`: (T,) the prediction of a motion at `ts`, such as `values - fit.residuals[0][:, 0]`,
       or `None`.
@@ -65,7 +65,7 @@ def light_curve(
         raise ValueError(f"model: wanted (T,) as ts has, got {predicted.shape}")
     several = np.atleast_1d(_checks.host_array(periods, "periods"))
     if several.ndim != 1:
-        raise ValueError(f"periods: wanted one or a row of them, s, got shape {several.shape}")
+        raise ValueError(f"periods: wanted one period or a list of them, got shape {several.shape}")
     folds = [_checks.positive_float(period, "periods", "positive periods, s") for period in several]
     count = 1 + len(folds)
     ax = axes_of_shape(ax, (count,), nrows=count, figsize=(7.2, 2.5 * count))

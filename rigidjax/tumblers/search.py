@@ -68,7 +68,9 @@ def starts_from_frequency_pairs(
     noise: np.ndarray | None,
     pairs: np.ndarray,
 ) -> list[Float[Array, " n"]]:
-    """Return the best starting points over all pairs of frequencies, each as free numbers (n,).
+    """Return the best starting points of the searches, over all given pairs of frequencies.
+
+    A starting point is a vector (n,) of the free numbers of the model.
 
     - `model`: the model of the light curve.
     - `reading`: the readings of the one `Brightness` sensor.

@@ -110,10 +110,11 @@ def _rotations_from_momentum_frame_to_world(
     """Return the quaternions (4,), one for each angle of `ABOUT`, that rotate the frame of the
     angular momentum to the world frame.
 
-    The z axis of the frame of the angular momentum is along the momentum. Each of the rotations
-    takes the direction n, half way between sun and observer, from this frame to the world frame.
-    The rotations differ in the angle of a further rotation about n in the world. The
-    `fitted_entries` do not determine this angle: `ABOUT` has three values of it, rad.
+    The z axis of the frame of the angular momentum is along the momentum. Let n be the unit vector
+    half way between sun and observer. Each rotation maps the components of n (or of −n, which a
+    matrix n nᵀ cannot tell from n) in the frame of the momentum to its components in the world. The
+    rotations differ in the angle of a further rotation about n. The `fitted_entries` do not
+    determine this angle: `ABOUT` has three values of it, rad.
 
     - `fitted_entries`: (6,) the entries xx, yy, zz, xy, xz, yz of the fitted matrix n nᵀ in the
       frame of the momentum, whose eigenvector of the largest eigenvalue is taken as n.

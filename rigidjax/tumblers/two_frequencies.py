@@ -339,11 +339,11 @@ def distinct_pairs(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[i
 
 
 def refine_pairs(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return two things: the pairs of frequencies (P, 2), each moved to a minimum of χ²; and χ²
-    (P,) there.
+    """Return two things: the pairs of frequencies (P, 2), each moved towards a minimum of χ²; and
+    χ² (P,) there, of the best Fourier series in the two frequencies.
 
-    Each pair moves to the best of its neighbours on a square grid. The grid becomes finer whenever
-    no neighbour has a lower misfit.
+    Each pair moves nine times, to the best of its neighbours on a square grid. Where no neighbour
+    has a lower χ², the pair stays and its grid becomes finer.
 
     - `table`: the sums over the readings, as `fourier_sum_table` returns them.
     - `pairs`: (P, 2) the pairs from which the refinement starts, 1/span, where the span is the time

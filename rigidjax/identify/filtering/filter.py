@@ -649,7 +649,8 @@ def scan_filter(
         belief, read = _predict_and_update(dynamics, belief, stop)
         return belief, keep(belief, read)
 
-    # Let a reverse pass compute each step again: storing one step would take some thousand numbers.
+    # Let a reverse pass compute each step again. Without `jax.checkpoint` it would store some
+    # thousand numbers for each step.
     filter_step = jax.checkpoint(filter_step)  # pyright: ignore[reportPrivateImportUsage]
     return dynamics, stops, lax.scan(filter_step, first, stops)[1]
 
