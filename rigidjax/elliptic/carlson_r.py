@@ -61,7 +61,8 @@ def r_integral(powers: tuple[float, ...], arguments: tuple[RealOrArray, ...]) ->
     count = (jnp.arange(nodes, dtype=dtype) + 0.5).reshape((nodes,) + (1,) * scale.ndim)
     t = jnp.exp(low[None] + step[None] * count)
 
-    # Begin the product with t: the product then stays between the sizes of its factors.
+    # Begin the product with t, and divide by one power of t + a after the other: begun with 1, the
+    # product of the quotients alone could overflow or underflow for very small or large t.
     product = t
     for a, power in zip(scaled, powers, strict=True):
         product = _divide_by_power(product, t + a[None], power)

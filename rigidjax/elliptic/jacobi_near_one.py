@@ -25,7 +25,8 @@ from rigidjax.rotation.stumpff import power_of_minus_one
 # The sums are used for m1 = 1 − m up to this number. The complementary nome p is then below 0.0066:
 # a few terms of the sums, and a few terms of the series for p, are enough.
 LARGEST_M1 = 0.1
-# The number of images (terms of the sums) on either side of the image whose centre is nearest to u.
+# Each sum over images in the docstring of this module is cut to this many images on either side of
+# the one whose centre is nearest to the argument u.
 _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 
 

@@ -595,10 +595,11 @@ def _changes_of_momentum_derivatives(
     variables: Float[Array, "10"],
     change_of_variables: Float[Array, "10"],
 ) -> tuple[VectorDerivatives, SymmetricEntries]:
-    """Return two changes for a change of the ten variables of a free motion: the change of the
-    derivatives of the body momentum Π(t) with respect to these variables, as three arrays (10,),
-    one for each component of Π; and the change of the six entries (11, 22, 33, 12, 13, 23) of the
-    matrix G = ∫ Π Πᵀ dt from 0 to t.
+    """Return how two results of a free motion change if its ten variables change.
+
+    The first result is the derivatives of the body momentum Π(t) with respect to the ten variables,
+    three arrays (10,), one for each component of Π. The second is the six entries (11, 22, 33, 12,
+    13, 23) of the matrix G = ∫ Π Πᵀ dt from 0 to t.
 
     - `inverse_inertia`: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
       inertia tensor, in principal axes.

@@ -85,14 +85,16 @@ _ABOVE, _ABOVE_ONE, _CLEAR, _PLAIN, _COARSE = 100.0, 10.0, 3.0, 1e6, 1e5
 # `simulate(…, accuracy=…)` searches for a tolerance at which a run is as accurate as wanted. The
 # search starts with a run at the tolerance `_FIRST`, which takes n steps. The tolerance of the next
 # run is found from n: in 800 motions of `bench_error` the error was n²/100 times the tolerance,
-# within a factor of ten. The next run has `_SECOND` times the tolerance at which this error would
-# be the wanted one. From the second run on, the error is measured. Errors are proportional to the
-# tolerance only up to a factor of four, `_ALLOWED`, by which the estimate of the error is
-# multiplied. The search aims at the wanted accuracy divided by `_AIM`.
+# within a factor of ten. At one tolerance this formula gives the wanted error; the next run has
+# `_SECOND` times this tolerance, since a run that is too accurate costs more than a further run.
+# From the second run on, the error is measured. Where the tolerance changes, the error changes in
+# proportion only within a factor of four: an error that is predicted is therefore multiplied by
+# `_ALLOWED`. The search aims at the wanted accuracy divided by `_AIM`.
 #
 # In three cases the error is not proportional to the tolerance: if the error is above `_FORESEEN`
 # (0.1 rad); if the run has fewer than `_FEW` steps; and if the number of steps grew from the run
-# before by less than `_GROWTH` times the factor that the order of the method implies.
+# before by less than `_GROWTH` times the factor that the order of the method implies. The measured
+# error is then not used, and the next run has a hundredth of the tolerance.
 _FIRST, _SECOND, _ALLOWED, _AIM = 1e-4, 20.0, 4.0, 2.0
 _FORESEEN, _FEW, _GROWTH = 0.1, 8, 0.9
 # The smallest tolerance, as a multiple of the relative rounding error of the dtype: `_FLOOR` in the

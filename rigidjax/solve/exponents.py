@@ -91,7 +91,9 @@ def lyapunov_exponents(
 
     Each conserved quantity gives an exponent of zero, and so does the direction of the motion
     itself. The computed value of such an exponent is not zero: it decreases with the length t of
-    the run as (log t)/t. `errors` does not include this trend; it is seen in `running`.
+    the run as (log t)/t. The estimated error of an exponent (`errors` of the result) does not
+    include this trend; the exponents as they were after each interval (`running` of the result)
+    show it.
 
     **Returns** an `Exponents`. Its numbers are NaN if the run fails, and `result` says why.
 
@@ -120,7 +122,7 @@ def lyapunov_exponents(
         _checks.require_finite(_checks.numeric_array(leaf, "state0"), "state0")
     size = dimension(state0)
     if not size:
-        raise ValueError("state0: wanted an array or a state of numbers, got none")
+        raise ValueError("state0: wanted an array or a state that holds numbers, got an empty one")
     many = size if number is None else _checks.integer(number, "number", 1)
     if many > size:
         raise ValueError(

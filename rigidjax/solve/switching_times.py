@@ -74,7 +74,8 @@ def _switching_function_of_operands(
 
 
 def _piecewise_constant_value(switch: Switch, first_operand: Any, *others_and_result: Any) -> Array:
-    """Return for each element of a switch a value, which only changes where the element changes.
+    """Return for each element of a switch a value that is constant in time, but for the times at
+    which the element switches.
 
     - `switch`: the equation, such as the comparison `t < 1`.
     - `first_operand`: its first operand.
@@ -439,7 +440,8 @@ def _differentiable_times(
     - `timed_switch`: the switch.
     - `t`: (k,) s, the times, without derivatives.
     - `element`: (k,) the index of the element that changes at each time.
-    - `has_change`: (k,), whether the element does change at each time.
+    - `has_change`: (k,), true for a time at which a change was found. Where none was found, the
+      time is only the end of the interval that was searched.
 
     **Returns** two things: the times (k,), s; and for each time whether it has derivatives. A time
     has no derivatives if the slope of the switching function is zero at this time, or if the

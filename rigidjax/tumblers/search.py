@@ -131,10 +131,10 @@ def _free_numbers_of_candidate(
 
 @jax.jit
 def _rotation_vector_from_reference(q: Array, principal_to_body: Array, reference: Array) -> Vec3:
-    """Return the rotation vector (3,), rad, from a reference attitude to the attitude of a body,
-    whose principal axes have the attitude `q`.
+    """Return the rotation vector (3,), rad, that turns a reference attitude of a body to its
+    attitude. The components are along the body axes.
 
-    - `q`: (4,) the quaternion that maps principal axes to world axes.
+    - `q`: (4,) the quaternion that maps principal axes to world axes at the attitude of the body.
     - `principal_to_body`: (3, 3) the rotation matrix from principal axes to body axes.
     - `reference`: (4,) the quaternion of the reference attitude, body → world.
     """

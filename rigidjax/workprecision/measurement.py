@@ -152,8 +152,10 @@ def compute_reference(scene: BenchmarkScene, gradients: bool = True) -> Referenc
 
 
 def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
-    """Return a scene (a motion to run) in single precision, without its equations in plain
-    arithmetic (`plain`), which are in double precision.
+    """Return a scene (a motion to run) in single precision.
+
+    The field `plain` of the new scene is empty: it holds equations of motion that are written out
+    by hand, and they are in double precision.
 
     The new scene has a reference (the correct last state, and, if `gradients` is true, the correct
     gradient) that is computed in double precision from the numbers rounded to single precision.

@@ -82,9 +82,10 @@ def _method_value_of_package(
     function of a scene (a motion to run) that returns the `PreparedMethod`, or `None` for a scene
     that the package cannot do.
 
-    `make(scene, numbers, start, module)` gets the imported module, and returns a function of the
-    setting. The time that `make` takes is recorded as compile time; the time to import the module
-    is not.
+    `make(scene, numbers, start, module)` gets the scene, its numbers as one vector, its initial
+    state and the imported module. It returns a function of the setting, which is a tolerance or a
+    number of steps. The time that `make` takes is recorded as compile time; the time to import the
+    module is not.
 
     - `package`: the name of the package that is imported.
     - `can_run`: a function of a scene that returns whether the package can do the scene.

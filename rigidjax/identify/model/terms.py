@@ -505,10 +505,11 @@ def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]
 def reading_weights(
     model: "Model", errors: SensorErrors, noise: Noise
 ) -> tuple[Float[Array, "..."], ...]:
-    """Return, for each sensor, the weight (R, T) of each of its readings in the normal equations.
+    """Return, for each sensor, the weights (R, T) of its readings in the normal equations, for R
+    recordings of T times.
 
-    The weight is dρ/ds of the robust loss ρ(s), where s is the squared length of the error in
-    standard deviations, or 1 without a loss. It is zero for a masked reading.
+    With a robust loss ρ(s), the weight is dρ/ds, where s is the squared length of the error in
+    standard deviations. Without a loss the weight is 1. It is zero for a masked reading.
 
     - `errors`: for each sensor the errors (R, T, k) in its unit.
     - `noise`: for each sensor the standard deviations (R, k) of its noise.

@@ -452,11 +452,11 @@ def _factor_of_shared_numbers(
     selected: np.ndarray,
     shared: np.ndarray,
 ) -> np.ndarray:
-    """Return a triangular matrix that replaces the derivatives of the errors of all recordings
-    without own numbers.
+    """Return a triangular matrix that replaces the derivatives of the errors of those recordings
+    whose errors depend on shared numbers only.
 
-    The errors of a recording without own numbers depend only on the s numbers that recordings
-    share. The matrix A (q, s) is computed by a QR decomposition. Its product AᵀA is the same as
+    A free number of the fit is an own number of a recording if no other recording depends on it,
+    and no prior ties it to another one. All other free numbers are called shared; there are s. The matrix A (q, s) is computed by a QR decomposition. Its product AᵀA is the same as
     that of the derivatives of the errors with respect to the shared numbers.
 
     **Arguments:**
