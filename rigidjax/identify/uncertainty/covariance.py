@@ -456,8 +456,9 @@ def _factor_of_shared_numbers(
     whose errors depend on shared numbers only.
 
     A free number of the fit is an own number of a recording if no other recording depends on it,
-    and no prior ties it to another one. All other free numbers are called shared; there are s. The matrix A (q, s) is computed by a QR decomposition. Its product AᵀA is the same as
-    that of the derivatives of the errors with respect to the shared numbers.
+    and no prior ties it to another one. All other free numbers are called shared; there are s. The
+    returned matrix A (q, s) is computed by a QR decomposition. AᵀA is the same as for the
+    derivatives of the errors with respect to the shared numbers.
 
     **Arguments:**
 
