@@ -159,8 +159,11 @@ def _newton_step_of_wahba(
     - `body`: b (n, 3), the same direction in the body frame
     """
     moved = (rotation[None] * body[:, None, :]).sum(-1)
-    lengths = [jnp.sqrt((x * x).sum(-1)) for x in lax.stop_gradient((moved, world))]
-    ratio = lengths[0] / jnp.where(lengths[1] > 0, lengths[1], 1)
+    # The ratio of the lengths makes the difference below small. Its derivative makes the derivative
+    # of the difference small, too, if the length of a direction with a large weight changes.
+    squares = [(x * x).sum(-1) for x in (moved, world)]
+    lengths = [jnp.sqrt(jnp.where(square > 0, square, 1)) for square in squares]
+    ratio = lengths[0] / lengths[1]
     moment = (weights[:, None] * jax.vmap(cross)(moved - ratio[:, None] * world, world)).sum(0)
     turn = solve(
         _curvature_of_rotation_fit(
