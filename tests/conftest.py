@@ -1,7 +1,7 @@
 """Strict JAX, and every public signature checked at run time (jaxtyping + beartype)."""
 
 import gc
-import importlib
+import importlib.metadata
 import itertools
 import os
 from pathlib import Path
@@ -20,6 +20,13 @@ def pytest_configure(config):
     if hasattr(config, "cache") and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(config.cache.mkdir("jax"))
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    default_run = config.option.markexpr == "not slow and not long"
+    # The older emitters of XLA compile the same programs in half of the time. jaxlib 0.10 has both;
+    # later ones have one, and end at the flag. Long tests are compiled as users compile them.
+    if default_run and importlib.metadata.version("jaxlib").startswith("0.10."):
+        flags = os.environ.get("XLA_FLAGS", "")
+        if "xla_cpu_use_fusion_emitters" not in flags:
+            os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {flags}"
     # Threads of OpenBLAS wait busily for one another: where all cores are taken, the QR of some
     # thousand small matrices took 0.55 s of the processor by one thread and 115 s by two.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -111,7 +111,8 @@ def simulate(
       under a torque, and the choice of `rollout` for `Steps`. With times any
       `diffrax.AbstractSolver` may be given; the explicit methods of `rigidjax.solvers` run in a
       loop of rigidjax, which is faster than the loop of diffrax.
-    - `rtol`, `atol`, `max_steps`, `adjoint`: as for `rigidjax.simulate`.
+    - `rtol`, `atol`, `max_steps`, `adjoint`: as for `rigidjax.simulate`. On a GPU the memory of a
+      gradient grows as the root of `max_steps`.
 
     All bodies of a chunk wait for the slowest body of this chunk. Each chunk therefore gets bodies
     with similar initial rates, which need similar numbers of steps. The results of a body do not

@@ -12,7 +12,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia
 from rigidjax.frames.base import AbstractScene, Force, checked_force_per_mass, jump_times_within
-from rigidjax.frames.moving import MovingFrame, require_frame
+from rigidjax.frames.moving import MovingFrame, fictitious_acceleration, require_frame
 from rigidjax.frames.rotation_models import Uniform
 from rigidjax.rotation import linalg3, quaternion
 
@@ -62,7 +62,7 @@ class InFrame(AbstractScene):
 
     def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
         now = self.frame.at(t)
-        total = now.fictitious(state.x, state.v)
+        total = fictitious_acceleration(self.frame, now, state.x, state.v)
         if self.inside is not None:
             total = total + checked_force_per_mass(self.inside(t, state), self.inside).astype(
                 total.dtype
@@ -176,7 +176,7 @@ class BodyInFrame(eqx.Module):
         force = None
         if hasattr(state, "x"):
             mass = body.mass.astype(omega.dtype)  # pyright: ignore[reportAttributeAccessIssue]
-            force = mass * now.fictitious(state.x, state.v)
+            force = mass * fictitious_acceleration(self.frame, now, state.x, state.v)
         if self.torque is not None:
             real = self.torque(t, state, body)
             if hasattr(real, "force"):

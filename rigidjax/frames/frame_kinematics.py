@@ -117,9 +117,22 @@ class Instant(eqx.Module):
 
         - `x`, `v`: the position (3,), m, and the velocity (3,), m/s, of a particle in S'
         """
-        x, v = _checks.array_of_shape(x, (3,), "x"), _checks.array_of_shape(v, (3,), "v")
-        turning = self.centrifugal(x) + self.coriolis(v) + self.euler_acceleration(x)
-        return turning + self.translational_acceleration().astype(x.dtype)
+        turning = acceleration_due_to_rotation(self, x, v)
+        return turning + self.translational_acceleration().astype(turning.dtype)
+
+
+def acceleration_due_to_rotation(instant: Instant, x: Vector, v: Vector) -> Vec3:
+    """Return the sum of the centrifugal, Coriolis and Euler accelerations (3,), m/s², in the axes
+    of a moving frame S'.
+
+    It does not depend on the rotation matrix of S'. In a frame whose origin is at rest it is the
+    whole fictitious acceleration.
+
+    - `instant`: the motion of S' at one time
+    - `x`, `v`: the position (3,), m, and the velocity (3,), m/s, of a particle in S'
+    """
+    x, v = _checks.array_of_shape(x, (3,), "x"), _checks.array_of_shape(v, (3,), "v")
+    return instant.centrifugal(x) + instant.coriolis(v) + instant.euler_acceleration(x)
 
 
 def _require_transformable(state: PyTree) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.frames import rotation_models
-from rigidjax.frames.frame_kinematics import Instant
+from rigidjax.frames.frame_kinematics import Instant, acceleration_due_to_rotation
 from rigidjax.frames.point import require_point
 from rigidjax.rotation import linalg3
 
@@ -183,8 +183,7 @@ class MovingFrame(eqx.Module):
         >>> frame.acceleration([1.0, 0, 0], [0.0, -2, 0], 0.0).tolist()
         [-4.0, 0.0, 0.0]
         """
-        x, v = _checks.array_of_shape(x, (3,), "x"), _checks.array_of_shape(v, (3,), "v")
-        free = self.at(t).fictitious(x, v)
+        free = fictitious_acceleration(self, self.at(t), x, v)
         return free if force is None else _checks.array_of_shape(force, (3,), "force") + free
 
     def acceleration_to_inertial(self, x: Vector, v: Vector, a: Vector, t: ScalarLike) -> Vec3:
@@ -259,6 +258,22 @@ class MovingFrame(eqx.Module):
         if self.origin is None:
             return jnp.zeros(3, t.dtype)
         return _checks.array_of_shape(self.origin(t), (3,), "origin").astype(t.dtype)
+
+
+def fictitious_acceleration(frame: MovingFrame, instant: Instant, x: Vector, v: Vector) -> Vec3:
+    """Return the fictitious acceleration (3,), m/s², of a particle in a moving frame S', in the
+    axes of S'.
+
+    The rotation matrix of S', which most frames compute by sines and cosines, is used only if S'
+    has an `origin`.
+
+    - `frame`: the frame S'
+    - `instant`: the motion of S' at the time at which the acceleration is wanted
+    - `x`, `v`: the position (3,), m, and the velocity (3,), m/s, of the particle in S'
+    """
+    if frame.origin is None:
+        return acceleration_due_to_rotation(instant, x, v)
+    return instant.fictitious(x, v)
 
 
 def require_frame(frame: object, name: str) -> MovingFrame:

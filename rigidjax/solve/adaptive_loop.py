@@ -6,6 +6,7 @@ but the single steps of the last segment only. For a derivative each earlier seg
 more, from its stored state, to get its steps.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
+from rigidjax.rotation.barrier import platform
 from rigidjax.solve.batching import Arrays, add_leading_axes
 from rigidjax.solve.runge_kutta import (
     Field,
@@ -30,11 +32,12 @@ from rigidjax.solve.tableaus import Tableau
 # diffrax inherits this member from optimistix, and type checkers do not find it there.
 NONFINITE: Any = dfx.RESULTS.nonfinite
 
-# The number of steps in one segment, rejected steps included. A run whose steps are recorded for
-# derivatives is divided into segments.
+# The largest number of steps in one segment, rejected steps included. A run whose steps are recorded
+# for derivatives is divided into segments.
 SEGMENT = 512
-# The number of additional rows for a segment that is run again for derivatives: if the program for
-# derivatives rounds differently from the program of the run, the segment may take a few more steps.
+# The largest number of additional rows for a segment that is run again for derivatives: if the
+# program for derivatives rounds differently from the program of the run, the segment may take a few
+# more steps.
 _MORE = 64
 # XLA on CPU makes one kernel of a loop whose state is smaller than a kilobyte. The rows of steps
 # are therefore collected in a block of at most `_BLOCK` bytes and `_MOST` rows, and each full block
@@ -423,6 +426,30 @@ def _array_for_saved_states(run: Run) -> Array:
     return jnp.broadcast_to(still[None], (run.between.shape[0], *run.y0.shape))
 
 
+def _largest_number_of_rows(method: Method, run: Run) -> int:
+    """Return the largest number of rows of a recorded run: its steps, and one row for each stop.
+
+    - `method`: holds the largest number of steps.
+    - `run`: holds the stops, the times at which steps end.
+    """
+    return method.max_steps + run.stops.shape[0]
+
+
+def _rows_of_segment(method: Method, run: Run) -> tuple[int, int]:
+    """Return the number of steps in one segment of a recorded run, and the number of spare rows.
+
+    The spare rows serve a segment that is run again and takes a few more steps. On a GPU the record
+    of all bodies stays in memory, and most of it stays empty. There it has about as many segments
+    as a segment has steps, so that it grows as the root of `method.max_steps`.
+
+    - `method`: holds the largest number of steps.
+    - `run`: holds the stops, the times at which steps end.
+    """
+    most = _largest_number_of_rows(method, run)
+    segment = min(SEGMENT, most if platform() == "cpu" else math.isqrt(most) + 1)
+    return segment, min(_MORE, segment // 8 + 1)
+
+
 def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState, Record]:
     """Run one body or many and record the steps, from which derivatives are computed later.
 
@@ -435,11 +462,11 @@ def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, Loop
     run did not reach; the state of the loop over steps at the end; and the record of the run.
     `*bodies` is one last axis for the bodies of a batch, or no axis for one body.
     """
-    loop, most = initial_loop_state(run), method.max_steps + run.stops.shape[0]
-    count = -(-most // SEGMENT) + 1
+    loop, (segment, spare) = initial_loop_state(run), _rows_of_segment(method, run)
+    count = -(-_largest_number_of_rows(method, run) // segment) + 1
     starts = [jnp.zeros((count, *a.shape), a.dtype) for a in pack_loop_state(loop)]
     ys = _array_for_saved_states(run)
-    rows = jnp.zeros((SEGMENT + _MORE + _MOST, HEAD + run.y0.shape[0], *run.t0.shape), ys.dtype)
+    rows = jnp.zeros((segment + spare + _MOST, HEAD + run.y0.shape[0], *run.t0.shape), ys.dtype)
     zero = jnp.zeros((), jnp.int32)
 
     def put(into: Arrays, i: Array, loop: LoopState) -> Arrays:
@@ -577,7 +604,8 @@ def record_segment(
     that are filled.
     """
     many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))
-    room = rows.shape[0] - (_MORE if until is None else 0) - _MOST
+    segment, spare = _rows_of_segment(method, run)
+    room = segment + (0 if until is None else spare)
 
     def filled(body: Callable[..., Any], loop: LoopState, rows: Rows, most: int) -> Any:
         on = lambda state: jnp.any(is_running(method, run, state[0], until)) & (state[2] < most)  # noqa: E731

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import count
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import (
@@ -35,6 +36,9 @@ from rigidjax.solve.batching import Arrays
 # switch is searched for in the equations of this scope.
 DECLARED = "rigidjax_declared_jumps"
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
+_EQUINOX = os.path.dirname(os.path.abspath(eqx.__file__)) + os.sep
+# The number of innermost calls among which a line outside of JAX and Equinox is looked for.
+_FRAMES = 8
 
 # `COMPARISONS`: primitives whose result changes when the first operand becomes equal to the second.
 # `_LEVELS`: primitives whose result changes when the first operand (for `rem` the quotient of the
@@ -98,8 +102,22 @@ class Equation(NamedTuple):
     outputs: list[int]
     dtypes: list[Any]  # the dtype of each input that has one
     shapes: list[Any]  # the shape and dtype of each output
-    source: Any  # where in the user's code the equation was written
+    sources: tuple[Any, ...]  # where the equation and, from inside out, the calls around it stand
     declared: bool  # whether it belongs to a part that declares its jumps
+
+    @property
+    def line_of_code(self) -> str:
+        """Return the line of code that wrote this equation: its file and its number.
+
+        Lines of JAX and Equinox are passed over. JAX traces some of its own functions only once,
+        such as `jnp.round`. Their equations name no other line, and the line that calls the
+        function is returned.
+        """
+        for source in self.sources:
+            for line in reversed(summarize(source, num_frames=_FRAMES).splitlines()):
+                if line and not line.startswith(_EQUINOX):
+                    return line
+        return ""
 
     @property
     def primitive_name(self) -> str:
@@ -170,7 +188,7 @@ class Switch(NamedTuple):
 
         The line is one of the user's code, given by its file and its number.
         """
-        return f"{self.equation.primitive_name}, {summarize(self.equation.source)}"
+        return f"{self.equation.primitive_name}, {self.equation.line_of_code}"
 
 
 class Analysis(NamedTuple):
@@ -283,33 +301,44 @@ def flatten_traced_function(traced: ClosedJaxpr) -> Program:
     replaced, and stays one equation; the equations of its body follow it in the list, so that
     switches among them are found.
 
+    Equations that have no effect on the result are left out.
+
     - `traced`: the traced function f(t, y, …).
     """
     numbers, equations, inner = count(), [], {}
 
-    def enter(jaxpr: Any, consts: Any, inputs: list[Any], declared: bool) -> list[Any]:
+    def enter(
+        jaxpr: Any, consts: Any, inputs: list[Any], around: tuple[tuple[Any, ...], bool],
+        wanted: list[bool],
+    ) -> list[Any]:  # fmt: skip
+        # `around` describes the calls around this program: where they stand, and whether they
+        # belong to a part that declares its jumps. `wanted` says which results are used.
         scope: dict[Any, Any] = dict(zip(jaxpr.invars, inputs, strict=True))
         scope |= dict(zip(jaxpr.constvars, consts, strict=True))
         read = lambda atom: atom if isinstance(atom, Literal) else scope[atom]  # noqa: E731
-        for eqn in jaxpr.eqns:
+        live, used = _live_equations(jaxpr, wanted)
+        for eqn in live:
             args, name = [read(atom) for atom in eqn.invars], _primitive_name(eqn)
-            own = declared or DECLARED in str(eqn.source_info.name_stack)
+            sources = (eqn.source_info, *around[0])
+            own = around[1] or DECLARED in str(eqn.source_info.name_stack)
             if name in _CALLS:
                 ((body, held),) = _inner_programs(eqn.params)
-                outputs = enter(body, kept(held), args, own)
+                asked = [variable in used for variable in eqn.outvars]
+                outputs = enter(body, kept(held), args, (sources, own), asked)
             else:
                 outputs = [next(numbers) for _ in eqn.outvars]
                 shapes = [variable.aval for variable in eqn.outvars]
                 equation = Equation(
                     eqn.primitive, eqn.params, args, outputs, _dtypes_of_inputs(eqn), shapes,
-                    eqn.source_info, own,
+                    sources, own,
                 )  # fmt: skip
                 equations.append(equation)
                 if name in _WHOLE:
                     for body, held in _inner_programs(eqn.params):
-                        enter(body, kept(held), args[len(args) - len(body.invars) :], own)
+                        given, every = args[len(args) - len(body.invars) :], [True]
+                        enter(body, kept(held), given, (sources, own), every * len(body.outvars))
             scope.update(zip(eqn.outvars, outputs, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
+        return [read(atom) if use else None for atom, use in zip(jaxpr.outvars, wanted, strict=True)]
 
     def kept(consts: Any) -> list[int]:
         names = [next(numbers) for _ in consts]
@@ -318,8 +347,40 @@ def flatten_traced_function(traced: ClosedJaxpr) -> Program:
 
     inputs = [next(numbers) for _ in traced.jaxpr.invars]
     constants = [next(numbers) for _ in traced.consts]
-    outputs = enter(traced.jaxpr, constants, inputs, False)
-    return Program(equations, constants, inner, inputs, outputs[0])
+    (output,) = enter(traced.jaxpr, constants, inputs, ((), False), [True])
+    return Program(equations, constants, inner, inputs, output)
+
+
+def _live_equations(jaxpr: Jaxpr, wanted: list[bool]) -> tuple[list[Any], set[Any]]:
+    """Return the equations of a program on which its wanted results depend, and their variables.
+
+    Equations with effects, such as a print, are returned, too.
+
+    - `jaxpr`: the program.
+    - `wanted`: for each result of the program, whether it is wanted.
+
+    **Returns** two things: the equations in the order of evaluation; and the set of the variables
+    that the equations, or the caller of the program, read.
+    """
+    results = zip(jaxpr.outvars, wanted, strict=True)
+    used = {atom for atom, use in results if use and not isinstance(atom, Literal)}
+    live = []
+    for eqn in reversed(jaxpr.eqns):
+        if eqn.effects or any(variable in used for variable in eqn.outvars):
+            live.append(eqn)
+            used.update(atom for atom in eqn.invars if not isinstance(atom, Literal))
+    return live[::-1], used
+
+
+def depends_on_time(traced_field: ClosedJaxpr) -> bool:
+    """Return whether the result of a traced field f(t, y, …) depends on the time t.
+
+    A field may compute a number from the time that it does not use, as a uniformly turning frame
+    computes its rotation matrix.
+    """
+    program = flatten_traced_function(traced_field)
+    time = program.inputs[0]
+    return program.output == time or any(time in each.inputs for each in program.equations)
 
 
 def time_dependence_of(equation: Equation, operand_dependences: list[int]) -> int:
@@ -387,7 +448,7 @@ def find_switches(traced_field: ClosedJaxpr) -> Analysis | None:
             or _is_of_this_package(equation)
         ):
             continue
-        where = f"{equation.primitive_name}, {summarize(equation.source)}"
+        where = f"{equation.primitive_name}, {equation.line_of_code}"
         jumps = _may_jump(equation.primitive_name, equation.params, equation.dtypes)
         if jumps and stateful:
             by_state.append(where)
@@ -409,7 +470,7 @@ def _is_of_this_package(equation: Equation) -> bool:
     The torque laws of this package state the times of their jumps themselves, so that these times
     need not be searched for in their equations.
     """
-    return summarize(equation.source).startswith(_PACKAGE)
+    return equation.line_of_code.startswith(_PACKAGE)
 
 
 def _may_switch(equation: Equation) -> bool:

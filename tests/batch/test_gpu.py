@@ -12,7 +12,7 @@ from rigidjax import _checks
 from rigidjax.batch import sharding
 from rigidjax.identify.answer import fit as fits
 from rigidjax.rotation.barrier import platform
-from rigidjax.solve import fixed_loop, pieces
+from rigidjax.solve import adaptive_loop, batching, fixed_loop, pieces
 
 CHANGES = jnp.asarray([1.0, -0.5, 0.25])
 
@@ -108,6 +108,33 @@ def test_bodies_of_an_odd_number(monkeypatch):
     np.testing.assert_array_equal(doubled(jnp.arange(4.0)), 2 * np.arange(4.0))
     # One chunk of five bodies, of which the last one fills it up.
     assert "f64[1,5]" in str(jax.make_jaxpr(doubled)(jnp.arange(4.0)))
+
+
+def test_a_record_on_a_gpu_follows_the_largest_number_of_steps(monkeypatch):
+    """The steps of each body are kept in segments of the root of that number: the same gradient.
+
+    The run takes more steps than one segment has, so that segments are run again.
+    """
+    bodies, states = batch(3)
+    law = rj.torques.HeavyTop(1.0, [0.0, 0.0, 1.0], [0.0, 0.0, -1.0])
+
+    def compiled(max_steps):
+        def loss(omega):
+            start = rj.Attitude(states.q, omega)
+            sol = rj.batch.simulate(bodies, start, [0.0, 20.0], law, max_steps=max_steps)
+            return jnp.sum(sol.ys.omega[:, -1] ** 2), sol.num_steps
+
+        return jax.jit(jax.grad(loss, has_aux=True)).lower(states.omega).compile()
+
+    here = compiled(400)
+    slope, steps = here(states.omega)
+    assert int(steps.max()) > 2 * 21
+    for module in (sharding, batching, adaptive_loop):
+        monkeypatch.setattr(module, "platform", lambda: "gpu")
+    there = compiled(401)  # another number, so that no trace of the first call is taken
+    np.testing.assert_allclose(there(states.omega)[0], slope, rtol=1e-11, atol=1e-12)
+    small, large = (f.memory_analysis().temp_size_in_bytes for f in (there, here))
+    assert small < 0.2 * large
 
 
 def test_many_rows_are_checked_where_they_are():

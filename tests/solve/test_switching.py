@@ -12,12 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from once import once
 
 import rigidjax as rj
 from rigidjax import torques
+from rigidjax.solve.run import equations_of_motion
 from rigidjax.solve.stops import trace_program
-from rigidjax.solve.switching import find_switches
+from rigidjax.solve.switching import depends_on_time, find_switches
 
 AXIS = np.array([0.0, 0.0, 1.0])
 BODY = rj.Inertia.from_principal(1.0, 1.0, 2.0)
@@ -174,14 +176,40 @@ def test_second_derivatives(power):
         (lambda t, s: jnp.interp(t, np.linspace(0.0, 2.0, 1000), np.sin(np.linspace(0, 2, 1000))), 2),
         (lambda t, s: jnp.polyval(1e-9 * jnp.arange(20.0), t), 0),
         (lambda t, s: torques.Series(np.linspace(0.0, 2.0, 50), np.ones((50, 1)))(t)[0], 0),
+        (lambda t, s: rj.so3.exp(jnp.stack([0.0, t, 0.0]))[0, 0], 0),
+        (lambda t, s: jax.jit(lambda t: (jnp.round(t), 2 * t))(t)[1], 0),
     ],
-    ids=["smooth", "branches of the state", "a long table", "a scan", "a series"],
+    ids=["smooth", "branches of the state", "a long table", "a scan", "a series",
+         "a turn of this package", "a jump that is not used"],
 )  # fmt: skip
 def test_continuous_laws_have_no_switches(law, ends):
     program = trace_program(lambda t, y: law(t, y[2]) * y, jnp.asarray(0.0), jnp.asarray(AXIS))
     analysis = find_switches(program.closed)
     assert analysis is None or not analysis.unseen
     assert (0 if analysis is None else len(analysis.switches)) == ends
+
+
+@pytest.mark.parametrize(
+    ("frame", "depends"),
+    [
+        (rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.3, 1.5])), False),
+        (rj.scenes.turntable(1.5, 0.2), True),
+    ],
+    ids=["uniform", "turntable that speeds up"],
+)
+def test_a_frame_has_no_switches(frame, depends):
+    """Its matrix is computed by a function with jumps and kinks, and a free particle needs none."""
+    field = equations_of_motion(None, rj.Point([1.0, 0.0, 0.0], [0.0, 0.2, 0.0]), frame)
+    flat = lambda t, y: ravel_pytree(field(t, rj.Point(y[:3], y[3:]), None))[0]
+    traced = trace_program(flat, jnp.asarray(0.0), jnp.ones(6)).closed
+    assert not find_switches(traced).switches
+    assert depends_on_time(traced) == depends
+
+
+def test_a_switch_within_a_function_of_jax_has_the_line_that_calls_it():
+    traced = trace_program(lambda t, y: jnp.clip(t, 0.5, y), jnp.asarray(0.0), jnp.asarray(1.0))
+    (switch,) = find_switches(traced.closed).switches
+    assert "test_switching.py" in switch.equation.line_of_code
 
 
 @pytest.mark.parametrize(
