@@ -32,8 +32,8 @@ from rigidjax.solve.tableaus import Tableau
 # diffrax inherits this member from optimistix, and type checkers do not find it there.
 NONFINITE: Any = dfx.RESULTS.nonfinite
 
-# The largest number of steps in one segment, rejected steps included. A run whose steps are recorded
-# for derivatives is divided into segments.
+# The largest number of steps in one segment, rejected steps included. A run whose steps are
+# recorded for derivatives is divided into segments.
 SEGMENT = 512
 # The largest number of additional rows for a segment that is run again for derivatives: if the
 # program for derivatives rounds differently from the program of the run, the segment may take a few

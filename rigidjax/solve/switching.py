@@ -338,7 +338,9 @@ def flatten_traced_function(traced: ClosedJaxpr) -> Program:
                         given, every = args[len(args) - len(body.invars) :], [True]
                         enter(body, kept(held), given, (sources, own), every * len(body.outvars))
             scope.update(zip(eqn.outvars, outputs, strict=True))
-        return [read(atom) if use else None for atom, use in zip(jaxpr.outvars, wanted, strict=True)]
+        return [
+            read(atom) if use else None for atom, use in zip(jaxpr.outvars, wanted, strict=True)
+        ]
 
     def kept(consts: Any) -> list[int]:
         names = [next(numbers) for _ in consts]

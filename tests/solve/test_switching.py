@@ -189,16 +189,26 @@ def test_continuous_laws_have_no_switches(law, ends):
     assert (0 if analysis is None else len(analysis.switches)) == ends
 
 
+def frame_of_a_tumbling_body():
+    """The frame of a free tumbling body."""
+    start = rj.Attitude([1.0, 0.0, 0.0, 0.0], [0.3, 1.1, 0.2])
+    body = rj.Inertia.from_principal(1.0, 1.6, 2.2)
+    return rj.frames.MovingFrame(rj.simulate(body, start, [0.0, 1.0]))
+
+
 @pytest.mark.parametrize(
     ("frame", "depends"),
     [
         (rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.3, 1.5])), False),
         (rj.scenes.turntable(1.5, 0.2), True),
+        (rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.3, 1.5]), lambda t: t * t * AXIS), True),
+        (frame_of_a_tumbling_body, True),
     ],
-    ids=["uniform", "turntable that speeds up"],
+    ids=["uniform", "turntable that speeds up", "origin", "riding on a tumbling body"],
 )
 def test_a_frame_has_no_switches(frame, depends):
     """Its matrix is computed by a function with jumps and kinks, and a free particle needs none."""
+    frame = frame() if frame is frame_of_a_tumbling_body else frame
     field = equations_of_motion(None, rj.Point([1.0, 0.0, 0.0], [0.0, 0.2, 0.0]), frame)
     flat = lambda t, y: ravel_pytree(field(t, rj.Point(y[:3], y[3:]), None))[0]
     traced = trace_program(flat, jnp.asarray(0.0), jnp.ones(6)).closed
