@@ -447,7 +447,7 @@ def _rows_of_segment(method: Method, run: Run) -> tuple[int, int]:
     """
     most = _largest_number_of_rows(method, run)
     segment = min(SEGMENT, most if platform() == "cpu" else math.isqrt(most) + 1)
-    return segment, min(_MORE, segment // 8 + 1)
+    return segment, min(_MORE, max(8, segment // 8))
 
 
 def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState, Record]:

@@ -1,5 +1,7 @@
 """Carlson's and Legendre's integrals against mpmath at 50 digits: values, derivatives, edges."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mpmath as mp
@@ -210,18 +212,23 @@ FUNCTIONS = {
 }
 
 
-@pytest.mark.oldest
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_legendre_first_and_second_derivatives(name):
-    ours, reference, point = FUNCTIONS[name]
-    size = len(point)
+@functools.cache
+def derivatives(ours):
+    """The compiled gradient and Hessian of a function of the numbers in one array."""
 
     def whole(a):
         return ours(*a)
 
-    at = jnp.asarray(point)
-    gradient, hessian = once(lambda a: (jax.grad(whole)(a), jax.jacfwd(jax.jacrev(whole))(a)))(at)
-    backwards = once(jax.hessian(whole))(at) if size == 1 else hessian
+    return once(lambda a: (jax.grad(whole)(a), jax.jacfwd(jax.jacrev(whole))(a)))
+
+
+@pytest.mark.oldest
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_legendre_first_and_second_derivatives(name):
+    ours, reference, point = FUNCTIONS[name]
+    size, at = len(point), jnp.asarray(point)
+    gradient, hessian = derivatives(ours)(at)
+    backwards = once(jax.hessian(lambda a: ours(*a)))(at) if size == 1 else hessian
     with mp.workdps(50):
         for i in range(size):
             for j in range(size):
