@@ -353,7 +353,10 @@ def nearest_rotation(b: Mat3) -> Mat3:
         r = quaternion.to_matrix(q)
         turn = solve(_curvature_of_rotation_fit(r, b), 2 * vee(product(r.T, b)))
         q = quaternion.normalise(quaternion.multiply(q, quaternion.exp(turn)))
-    return quaternion.to_matrix(q)
+    # The matrix of a quaternion is orthogonal to ten units of round-off. The first term of the
+    # series of (RᵀR)^(−½) makes it orthogonal to two.
+    r = quaternion.to_matrix(q)
+    return r + product(r, 0.5 * (jnp.eye(3, dtype=r.dtype) - product(r.T, r)))
 
 
 @nearest_rotation.defjvp
