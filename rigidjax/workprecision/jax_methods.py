@@ -225,8 +225,10 @@ def _solve_with_diffrax(
     - `setting`: the relative tolerance of a step; the absolute tolerance is a thousandth of it.
     - `end`: the last time, s.
     """
+    # The adjoint equation of diffrax takes times of the precision of the state only.
+    first, last = jnp.zeros_like(setting), jnp.asarray(end, setting.dtype)
     out = dfx.diffeqsolve(
-        dfx.ODETerm(field), solver, 0.0, end, None, start, args,
+        dfx.ODETerm(field), solver, first, last, None, start, args,
         stepsize_controller=dfx.PIDController(rtol=setting, atol=1e-3 * setting),
         adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         max_steps=MOST, throw=False,

@@ -172,6 +172,15 @@ def test_a_scene_in_single_precision():
     assert all(r.setting > 1e-6 for r in records)
 
 
+@pytest.mark.long
+def test_gradients_of_diffrax_in_single_precision():
+    """Its adjoint equation, too, which takes no times of another precision than the state's."""
+    scene = to_float32(scenes()["free-top"](), gradients=False)
+    for compiled in diffrax_method(dfx.Dopri8(), gradients=True).gradients.values():
+        gradient, _ = compiled(scene).run(1e-3)
+        assert gradient.dtype == jnp.float32 and np.isfinite(gradient).all()
+
+
 def test_the_front_and_the_table():
     ladder = [line("a", 1e-2, 1.0), line("a", 1e-6, 2.0), line("a", 1e-12, 8.0)]
     other = [line("b", 1e-4, 1.2, group="jax"), line("b", 1e-8, 9.0, group="jax")]
