@@ -265,9 +265,10 @@ def _compile_value_or_gradient(
     try:
         return compile_flow(scene, flow if differentiate is None else slopes)
     except TypeError as refused:
-        # A splitting method refuses a torque that depends on the rate: the method is left out for
-        # such a scene.
-        if "Splitting" in str(refused):
+        # A splitting method refuses a torque that depends on the rate, and the adjoint equation of
+        # diffrax refuses some fields that hold a function of time: the method is left out for such
+        # a scene.
+        if "Splitting" in str(refused) or "_DistinctTuple" in str(refused):
             return None
         raise
 
