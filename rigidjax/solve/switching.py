@@ -301,7 +301,8 @@ def flatten_traced_function(traced: ClosedJaxpr) -> Program:
     replaced, and stays one equation; the equations of its body follow it in the list, so that
     switches among them are found.
 
-    Equations that have no effect on the result are left out.
+    An equation on which the result does not depend is left out, unless it has an effect, such as a
+    print.
 
     - `traced`: the traced function f(t, y, …).
     """
