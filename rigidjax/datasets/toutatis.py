@@ -6,9 +6,7 @@ doi:10.1088/0004-6256/146/4/95; from the radar imaging of R. S. Hudson and S. J.
 270:84 (1995).
 """
 
-from collections.abc import Callable
 from datetime import datetime
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +17,7 @@ from rigidjax import exact
 from rigidjax._names import define_dir_and_getattr
 from rigidjax.body import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
-from rigidjax.identify.answer.result import Fit
+from rigidjax.identify.answer.result import Fit, value_and_interval_of
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.model.charts import PrincipalRatios
 from rigidjax.identify.model.model import Model
@@ -75,11 +73,18 @@ def recording() -> Recording:
     angles = jnp.asarray(np.radians([row[1:4] for row in OBSERVATIONS]))
     # The matrix of the published angles maps ecliptic to body coordinates. The same three angles in
     # the order of eq 31 of the notes give the transpose of this matrix, body → ecliptic.
-    attitudes = [euler.to_quaternion(a, sequence="ZXZ") for a in angles]
+    attitudes = _quaternions_of_angles(angles)
     rates = np.radians([row[4:7] for row in OBSERVATIONS]) / DAY
     sensor = AttitudeSensor(np.radians(ATTITUDE_NOISE_DEG))
     gyro = Gyro(np.radians(RATE_NOISE_DEG_A_DAY) / DAY)
-    return Recording(t, (sensor, np.stack(attitudes)), (gyro, rates))
+    return Recording(t, (sensor, attitudes), (gyro, rates))
+
+
+@jax.jit
+@jax.vmap
+def _quaternions_of_angles(angles: Float[Array, "3"]) -> Float[Array, "4"]:
+    """Return the attitudes (T, 4) with the Euler angles (T, 3) φ, θ, ψ, rad, of T observations."""
+    return euler.to_quaternion(angles, sequence="ZXZ")
 
 
 def model() -> Model:
@@ -94,23 +99,17 @@ def model() -> Model:
 
 
 @jax.jit
-def _log_periods(body: Inertia, state: Attitude) -> Float[Array, "2"]:
-    """Return the logarithms (2,) of the rotation period and the precession period, days, of a free
-    `body` with the initial `state`.
+def _log_periods_and_momentum_direction(body: Inertia, state: Attitude) -> Float[Array, "4"]:
+    """Return four numbers of a free `body` with the initial `state`: the logarithms of the rotation
+    period and the precession period, days; and the longitude and latitude, rad, of the angular
+    momentum in world axes.
     """
     turning = exact.body_period(body, state.omega)
     precessing = exact.precession_period(body, state.omega)
-    return jnp.log(jnp.stack([turning, precessing]) / DAY)
-
-
-@jax.jit
-def _momentum_direction(body: Inertia, state: Attitude) -> Float[Array, "2"]:
-    """Return the longitude and latitude (2,), rad, of the angular momentum of a `body` with the
-    given `state`, in world axes.
-    """
     momentum = spatial_angular_momentum(body, state)
-    flat = jnp.hypot(momentum[0], momentum[1])
-    return jnp.stack([jnp.arctan2(momentum[1], momentum[0]), jnp.arctan2(momentum[2], flat)])
+    longitude = jnp.arctan2(momentum[1], momentum[0])
+    latitude = jnp.arctan2(momentum[2], jnp.hypot(momentum[0], momentum[1]))
+    return jnp.stack([jnp.log(turning / DAY), jnp.log(precessing / DAY), longitude, latitude])
 
 
 def rows(fit: Fit) -> list[Row]:
@@ -120,22 +119,17 @@ def rows(fit: Fit) -> list[Row]:
     low, high, unit), where low and high are the ends of the 95 % interval: two periods, days, and
     the ecliptic longitude and latitude (J2000) of the angular momentum, degrees.
     """
-
-    def rows_of_quantities(
-        quantities: Callable[[Any, Any], Array],
-        names: tuple[str, str],
-        shown: Callable[[np.ndarray], np.ndarray],
-    ) -> Any:
-        bounds = fit.interval_of(lambda point: quantities(point.body, point.state0))
-        # The interval of a quantity that the data do not determine may end at infinity.
-        with np.errstate(over="ignore"):
-            numbers = [shown(np.asarray(v)) for v in (quantities(fit.body, fit.state0), *bounds)]
-        return zip(names, *numbers, strict=True)
-
+    value_low_high = value_and_interval_of(
+        fit, lambda point: _log_periods_and_momentum_direction(point.body, point.state0)
+    )
     names = ("rotation about the long axis", "precession of the long axis")
-    out: list[Row] = [(*row, "day") for row in rows_of_quantities(_log_periods, names, np.exp)]
+    # The interval of a quantity that the data do not determine may end at infinity.
+    with np.errstate(over="ignore"):
+        periods = np.exp(value_low_high)[:, :2].T.tolist()
+    out: list[Row] = [(name, *row, "day") for name, row in zip(names, periods, strict=True)]
     names = ("angular momentum, longitude", "angular momentum, latitude")
-    for name, *numbers in rows_of_quantities(_momentum_direction, names, np.degrees):
+    directions = np.degrees(value_low_high)[:, 2:].T.tolist()
+    for name, numbers in zip(names, directions, strict=True):
         turn = 360.0 if "longitude" in name and numbers[0] < 0 else 0.0
         out.append((name, *(number + turn for number in numbers), "deg, ecliptic J2000"))
     return out

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
+from rigidjax._types import Quat, Vec3
 from rigidjax.plot.style import (
     COLOURS,
     LINE_STYLES,
@@ -88,8 +89,8 @@ def _dense_times_and_states(
         state0 = jax.tree.map(lambda leaf: leaf[index], state0)
     if isinstance(body, dict):
         body = body[model.body_names[index]]
-    dense = jnp.linspace(record.t[0], record.t[-1], 800)
-    return np.asarray(dense), simulate(body, state0, dense).ys
+    dense = np.linspace(record.t[0], record.t[-1], 800)
+    return dense, simulate(body, state0, dense).ys
 
 
 def _draw_readings_and_residuals(
@@ -121,16 +122,16 @@ def _draw_readings_and_residuals(
     names: tuple[str, ...] = ("x", "y", "z")[: values.shape[1]]
     scale, unit, line_t = 1.0, sensor.unit, t
     if sensor.reading_shape == (4,):
-        read, scale = _body_z_in_world(values), 180 / np.pi
+        read, scale = np.asarray(_body_z_in_world(values)), 180 / np.pi
         # The predicted attitude is the attitude read, turned back by the residual, which is a
         # rotation vector in body axes.
-        back = jax.vmap(lambda q, e: quaternion.multiply(q, quaternion.exp(-e)))
-        line = _body_z_in_world(back(jnp.asarray(values), jnp.asarray(errors)))
+        line = np.asarray(_body_z_in_world(_attitudes_turned_back(values, errors)))
         names = tuple(f"{axis} of body z" for axis in "xyz")
         upper_axes.set_ylabel("body z axis in world axes")
         unit = "deg (body axes)"
         if dense_states is not None:
-            line_t, line = dense_states[0] / seconds, _body_z_in_world(dense_states[1].q)
+            line_t = dense_states[0] / seconds
+            line = np.asarray(_body_z_in_world(dense_states[1].q))
     else:
         if sensor.unit == "rad/s":
             scale, unit, names = rate, rate_unit, ("Ωx", "Ωy", "Ωz")
@@ -157,6 +158,17 @@ def _draw_readings_and_residuals(
             lower_axes.plot(t[seen], errors[seen, axis] * scale, alpha=0.7, **mark)
 
 
-def _body_z_in_world(q: ArrayLike) -> np.ndarray:
+@jax.jit
+@jax.vmap
+def _attitudes_turned_back(q: Quat, rotation_vector: Vec3) -> Quat:
+    """Return the attitudes (T, 4) that a turn by the T rotation vectors (T, 3), rad, in body axes,
+    takes to the attitudes `q` (T, 4), body → world.
+    """
+    return quaternion.multiply(q, quaternion.exp(-rotation_vector))
+
+
+@jax.jit
+@jax.vmap
+def _body_z_in_world(q: Quat) -> Vec3:
     """Return the body z axis (T, 3) in world axes for the attitudes `q` (T, 4), body → world."""
-    return np.asarray(jax.vmap(lambda one: quaternion.rotate(one, jnp.eye(3)[2]))(jnp.asarray(q)))
+    return quaternion.rotate(q, jnp.eye(3, dtype=q.dtype)[2])

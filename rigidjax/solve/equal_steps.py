@@ -19,7 +19,7 @@ from jaxtyping import Array, PyTree
 
 from rigidjax.rotation.barrier import barrier
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.tableaus import Row, Tableau
+from rigidjax.solve.tableaus import Row, Tableau, round_weights
 
 # field(t, y) returns dy/dt for any tree of arrays y; it is fastest if y is a tuple of scalars (see
 # the module `components`).
@@ -103,7 +103,7 @@ def change_and_slope_at_start(
     """
     # Without `barrier` around each stage XLA makes one kernel for each array of the result, and
     # each of these kernels computes all stages before it once more.
-    end = t + h if end is None else end
+    end, tableau = t + h if end is None else end, round_weights(tableau, h.dtype)
     slopes = [barrier(field(t, y))]
     for node, row in zip(tableau.c, tableau.a, strict=True):
         place = barrier(jax.tree.map(jnp.add, y, _weighted_sum(h, row, slopes)))
@@ -144,7 +144,7 @@ def _change_by_looped_stages(
 
     **Returns** a tree of the structure of `y`.
     """
-    count = len(tableau.a) + 1
+    count, tableau = len(tableau.a) + 1, round_weights(tableau, h.dtype)
     rows = np.zeros((count, max(i - min(row) for i, row in enumerate(tableau.a, 1))))
     for i, row in enumerate(tableau.a, 1):
         rows[i, [i - 1 - j for j in row]] = list(row.values())

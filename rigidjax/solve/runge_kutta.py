@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.solve.batching import Arrays, add_leading_axes
-from rigidjax.solve.tableaus import Tableau
+from rigidjax.solve.tableaus import Tableau, round_weights
 
 # field(constants, t, y) → dy/dt, for t (*bodies), y (n, *bodies).
 Field = Callable[[Arrays, Array, Array], Array]
@@ -64,6 +64,7 @@ class Weights(NamedTuple):
 
 def arrays_of_tableau(tableau: Tableau, dtype: Any) -> Weights:
     """Return the numbers of a Runge–Kutta method, its `tableau`, as arrays of the `dtype`."""
+    tableau = round_weights(tableau, dtype)
     c = np.array([0.0, *tableau.c, 1.0, *tableau.extra_c])
     rows = [{}, *tableau.a, tableau.b, *tableau.extra_a, *tableau.dense, *tableau.errors]
     table, whole = np.zeros((len(rows), c.size)), c.size

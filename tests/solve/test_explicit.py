@@ -311,6 +311,48 @@ def test_single_precision_stays_single():
     assert float(driven.error(end, ts[1])) < 1e-5
 
 
+@pytest.mark.oldest
+@pytest.mark.parametrize("method", [Tsitouras5, DormandPrince8], ids=lambda m: m.__name__)
+def test_single_precision_is_neither_fast_nor_slow(method):
+    """Ω of a symmetric body circles its axis at 1 rad/s: the phase after 600 rad, by each loop.
+
+    The weights of Dormand and Prince, each rounded by itself, sum to 1 + 4.2e-7: 2.5e-4 rad.
+    """
+    field = EulerEquations(rj.Inertia(jnp.diag(jnp.array([1.0, 1.0, 2.0], jnp.float32))))
+    start = rj.Spin(jnp.array([1.0, 0.0, 1.0], jnp.float32))
+    here, there = np.float32(0.0), np.float32(600.0)
+    by_equal_steps = run(method(), field, start, jnp.asarray(here), jnp.asarray(there), 2400)
+    by_diffrax = dfx.diffeqsolve(
+        dfx.ODETerm(field), method(), here, there, np.float32(0.25), start,
+        max_steps=2400, adjoint=rj.solvers.ReplayAdjoint(),
+    ).ys.omega[-1]  # fmt: skip
+    for omega in (by_equal_steps.omega, by_diffrax):
+        assert omega.dtype == jnp.float32
+        phase = np.arctan2(float(omega[1]), float(omega[0]))
+        assert abs(np.remainder(phase - 600.0 + np.pi, 2 * np.pi) - np.pi) < 6e-5
+
+
+@pytest.mark.parametrize("name", ["KUTTA4", "TSITOURAS5", "DORMAND_PRINCE8"])
+def test_rounded_weights_keep_their_sums(name):
+    """The sums of a long row move by a small part of the round-off of its largest weight."""
+    exact, dtype = getattr(tableaus, name), np.float32
+    rounded = tableaus.round_weights(exact, dtype)
+    nodes = np.array([0.0, *exact.c, 1.0, *exact.extra_c])
+    for old, new in zip(
+        [*exact.a, exact.b, *exact.extra_a], [*rounded.a, rounded.b, *rounded.extra_a], strict=True
+    ):
+        weights = np.array(list(new.values()))
+        assert list(old) == list(new)
+        np.testing.assert_array_equal(weights.astype(dtype).astype(float), weights)
+        change = weights - np.array(list(old.values()))
+        assert (np.abs(change) <= np.spacing(np.abs(weights).astype(dtype))).all()
+        if len(new) >= 7:
+            least = 0.1 * np.finfo(dtype).eps * np.abs(weights).max()
+            assert abs(change.sum()) < least
+            assert abs(change @ nodes[list(new)]) < least
+    assert tableaus.round_weights(exact, float) is exact
+
+
 def test_failures_are_results_not_numbers():
     ts = jnp.array([0.0, 1.0, 20.0])
     out = adaptive(Tsitouras5(), FREE, ts, START, rtol=1e-9, atol=1e-9, max_steps=60)

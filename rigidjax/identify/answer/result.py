@@ -194,7 +194,7 @@ class Fit(eqx.Module):
         The field `scale` of a body is "arbitrary" if the fit finds its inertia only up to a factor.
         This happens if the chart, which maps free numbers to the body, describes ratios of moments.
         """
-        return self.model.bodies(self.x)
+        return self.model.unpack(self.x).body
 
     @property
     def state0(self) -> Any:
@@ -209,7 +209,7 @@ class Fit(eqx.Module):
         """Return a dict of name → fitted value with one entry for each `Free` (a number of a torque
         or sensor that the fit may move), in the unit of this number.
         """
-        return self.model.values(self.x)
+        return self.model.unpack(self.x).values
 
     @property
     def spreads(self) -> dict[str, Array]:
@@ -310,32 +310,8 @@ class Fit(eqx.Module):
 
         **Raises** as `interval`.
         """
-        _checks.require_function(function, "function", "of `Unpacked` to an array")
-        if not _checks.is_known(self.x):
-            raise TypeError(
-                "Fit: wanted known numbers, got traced ones; intervals are made on the host: call "
-                "interval_of outside of jax.jit, jax.grad and jax.vmap"
-            )
-
-        def value(point: Unpacked) -> Array:
-            point = dataclasses.replace(point, noise=self.noises)
-            return _checks.numeric_array(function(point), "function(point)")
-
-        # Unpack x in one compiled program: without `jit` each operation of JAX is compiled as a
-        # program of its own, and some ninety programs took seconds to compile.
-        point, slopes = unpack_with_slopes(self.model, self.derivative_point)
-        best = point if self.near is None else unpack_with_slopes(self.model, self.x)[0]
-
-        def change(step: Unpacked) -> Array:
-            return jax.jvp(value, (point,), (step,))[1]
-
-        middle = np.asarray(_checks.require_finite(value(best), "function(point)"))
-        slope = np.asarray(jax.vmap(change, in_axes=-1, out_axes=-1)(slopes))
-        determined, null = np.asarray(self.determined_covariance), np.asarray(self.null_directions)
-        if self.hidden_directions is not None:
-            null = np.concatenate([null, np.asarray(self.hidden_directions)])
-        reach = two_sided_student_quantile(level, self.degrees_of_freedom(slope))
-        return interval_about(middle, slope, determined, null, reach, self.limits)
+        _, low, high = value_and_interval_of(self, function, level)
+        return low, high
 
     def degrees_of_freedom(self, slope: np.ndarray) -> np.ndarray:
         """Return the degrees of freedom (…,) of the variance of each of several functions.
@@ -363,6 +339,42 @@ class Fit(eqx.Module):
     def identifiability(self) -> tuple[str, ...]:
         """Describe which quantities the data of this fit determine well, weakly, and not at all."""
         return undetermined.describe_identifiability(self)
+
+
+def value_and_interval_of(
+    fit: Fit, function: Callable[[Unpacked], Any], level: float = 0.95
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the value of a differentiable function of the fitted numbers, and its interval as two
+    arrays, the low ends and the high ends.
+
+    Value and derivative come from one evaluation, so that JAX compiles one program for both. The
+    arguments and errors are those of `Fit.interval_of`, with the `fit` in front.
+    """
+    _checks.require_function(function, "function", "of `Unpacked` to an array")
+    if not _checks.is_known(fit.x):
+        raise TypeError(
+            "Fit: wanted known numbers, got traced ones; intervals are made on the host: call "
+            "interval_of outside of jax.jit, jax.grad and jax.vmap"
+        )
+
+    def value(point: Unpacked) -> Array:
+        point = dataclasses.replace(point, noise=fit.noises)
+        return _checks.numeric_array(function(point), "function(point)")
+
+    point, slopes = unpack_with_slopes(fit.model, fit.derivative_point)
+
+    def value_and_change(step: Unpacked) -> tuple[Array, Array]:
+        return jax.jvp(value, (point,), (step,))
+
+    # Under `vmap` the value may come once for each of the n derivatives; all of these are equal.
+    values, slope = jax.vmap(value_and_change, in_axes=-1, out_axes=(0, -1))(slopes)
+    best = values[0] if fit.near is None else value(fit.model.unpack(fit.x))
+    middle, slope = np.asarray(_checks.require_finite(best, "function(point)")), np.asarray(slope)
+    determined, null = np.asarray(fit.determined_covariance), np.asarray(fit.null_directions)
+    if fit.hidden_directions is not None:
+        null = np.concatenate([null, np.asarray(fit.hidden_directions)])
+    reach = two_sided_student_quantile(level, fit.degrees_of_freedom(slope))
+    return middle, *interval_about(middle, slope, determined, null, reach, fit.limits)
 
 
 def require_one_fit(fit: PyTree, name: str = "fit") -> Fit:

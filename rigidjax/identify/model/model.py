@@ -366,7 +366,10 @@ class Model(eqx.Module):
 
         For several recordings the states have a leading axis.
         """
-        return unpack_numbers(self, require_numbers(self, x))
+        x = require_numbers(self, x)
+        if _checks.is_known((self, x)):
+            return _compiled_quantities(with_first_times_only(self), x)
+        return unpack_numbers(self, x)
 
     def bodies(self, x: Float[Array, " n"]) -> Any:
         """Return the body that the free numbers x (n,) represent, or for several bodies a dict of
@@ -584,6 +587,18 @@ def unpack_numbers(model: Model, x: Float[Array, " n"]) -> Unpacked:
     starts = jax.vmap(ReferenceStates.initial_state_at)(model.reference, x[model.index.start])
     state0 = stacking.pick_records(starts, 0) if model.count == 1 else starts
     return Unpacked(x, model.bodies(x), state0, values_of(model, x))
+
+
+@eqx.filter_jit
+def _compiled_quantities(model: Model, x: Float[Array, " n"]) -> Unpacked:
+    """Return the quantities that the free numbers x (n,) of a `model` represent, computed in one
+    compiled program.
+
+    Without `jit` each operation of JAX is compiled as a program of its own: the first call took
+    seconds. The quantities are the body, the initial state, and the values of the `Free`s, which
+    are the other numbers that a fit may move.
+    """
+    return unpack_numbers(model, x)
 
 
 def unpack_with_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
