@@ -26,6 +26,11 @@ Devices = Literal["all"] | Sequence[jax.Device] | None
 # The size, in bytes, of an array with one number for each body of a chunk. With this size the
 # arrays of a step stay in the first-level cache, which holds 32 KB on many cores.
 _ROW = 512
+# On a GPU a chunk may use this share of the memory for the record from which derivatives in reverse
+# mode are computed. These derivatives themselves need about as much again.
+_SHARE = 0.25
+# The record of fewer bodies than this fits the memory of any GPU, and its size is not computed.
+_FEW = 10_000
 # JAX takes this option of XLA only at the outermost jit, and it exists only on CPU.
 _WIDE = {"xla_cpu_prefer_vector_width": 512}
 
@@ -161,6 +166,40 @@ def chunk_size(chunk: int | None, dtype: np.dtype, num_bodies: int) -> int:
     if not isinstance(chunk, int) or chunk < 1:
         raise ValueError(f"chunk: wanted a positive number of bodies, got {chunk!r}")
     return min(chunk, num_bodies)
+
+
+def fit_chunk_to_memory(
+    division: Division, function: Callable[[Any, Any], Any], shared: PyTree, per_body: PyTree
+) -> Division:
+    """Return the `division` of a batch with chunks that fit the memory of a GPU, if all bodies
+    would be computed at once.
+
+    The memory is that of the record from which derivatives in reverse mode are computed. Its size
+    for one body is found without running anything. On CPU, and for a few thousand bodies, the
+    `division` is returned unchanged.
+
+    - `division`: how the batch is divided among devices and into chunks.
+    - `function`, `shared`, `per_body`: the arguments of `map_bodies`. The function must have
+      derivatives in reverse mode.
+    """
+    count = jax.tree.leaves(per_body)[0].shape[0]
+    if platform() == "cpu" or count < _FEW or division.chunk < count:
+        return division
+    row = jax.tree.map(lambda a: a[0], per_body)
+    record = jax.eval_shape(lambda *args: jax.vjp(function, *args)[1], shared, row)
+    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(record))
+    fitting = _SHARE * memory_of_device(division.mesh) / size
+    return division._replace(chunk=int(min(count, max(1, fitting))))
+
+
+def memory_of_device(mesh: Mesh | None) -> float:
+    """Return how many bytes of its memory JAX may use on a device of the `mesh` or, if that is
+    `None`, on the default device; infinity if JAX does not know this number.
+    """
+    default: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    chosen = default if isinstance(default, jax.Device) else jax.devices()[0]
+    device = chosen if mesh is None else mesh.devices.flat[0]
+    return (device.memory_stats() or {}).get("bytes_limit", np.inf)
 
 
 def map_bodies(

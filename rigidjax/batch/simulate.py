@@ -14,7 +14,14 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.batch.rollout import Inputs, rollout
-from rigidjax.batch.sharding import CompiledFunction, Devices, Division, divide_batch, map_bodies
+from rigidjax.batch.sharding import (
+    CompiledFunction,
+    Devices,
+    Division,
+    divide_batch,
+    fit_chunk_to_memory,
+    map_bodies,
+)
 from rigidjax.batch.validation import (
     BodyBatch,
     TorqueAxes,
@@ -26,6 +33,7 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of, with_own_states
 from rigidjax.motion.torques.base import Torque
+from rigidjax.rotation.barrier import platform
 from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
 from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_or_nonfinite_input
 from rigidjax.solve.explicit import DormandPrince8
@@ -103,8 +111,8 @@ def simulate(
 
     **Arguments:**
 
-    - `bodies`, `states0`, `torque`, `torque_axes`, `chunk`, `devices`, `progress_meter`, and
-      `inputs` (with `Steps` only): as for `rigidjax.batch.rollout`.
+    - `bodies`, `states0`, `torque`, `torque_axes`, `devices`, `progress_meter`, and `inputs` (with
+      `Steps` only): as for `rigidjax.batch.rollout`.
     - `ts_or_steps`: times (T,), s, increasing or decreasing, which begin with the time of
       `states0`; or `Steps(size, number)` for fixed steps.
     - `solver`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
@@ -113,6 +121,9 @@ def simulate(
       loop of rigidjax, which is faster than the loop of diffrax.
     - `rtol`, `atol`, `max_steps`, `adjoint`: as for `rigidjax.simulate`. On a GPU the memory of a
       gradient grows as the root of `max_steps`.
+    - `chunk`: the number of bodies that a device computes at a time. On a GPU it is by default as
+      many bodies as fit a quarter of the memory with the record of their steps; a derivative in
+      reverse mode computes each of several chunks once more.
 
     All bodies of a chunk wait for the slowest body of this chunk. Each chunk therefore gets bodies
     with similar initial rates, which need similar numbers of steps. The results of a body do not
@@ -200,6 +211,13 @@ def _simulate_bodies(
 
     if options["solver"] is None:
         return map_bodies(simulate_body, (shared, ts), per_body, division)
+    if options["adjoint"] is None:
+        division = fit_chunk_to_memory(division, simulate_body, (shared, ts), per_body)
+    if platform() != "cpu" and division.chunk < jax.tree.leaves(per_body)[0].shape[0]:
+        # On a GPU the record of a body is large, because bodies are computed many at a time. With
+        # `jax.checkpoint` the reverse pass computes each chunk once more, and keeps the record of
+        # one chunk at a time.
+        simulate_body = jax.checkpoint(simulate_body)
 
     def initial_speed(row: PyTree) -> Array:
         # The bodies are sorted by |Ω| + √|dΩ/dt| at the first time, in rad/s, where Ω is the body

@@ -1,5 +1,7 @@
 """What runs on a GPU, on a CPU: steps in pieces, places of bodies, checks of many rows, fits."""
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,7 +115,8 @@ def test_bodies_of_an_odd_number(monkeypatch):
 def test_a_record_on_a_gpu_follows_the_largest_number_of_steps(monkeypatch):
     """The steps of each body are kept in segments of the root of that number: the same gradient.
 
-    The run takes more steps than one segment has, so that segments are run again.
+    The run takes more steps than one segment has, so that segments are run again. Bodies whose
+    records do not fit the memory together go in chunks.
     """
     bodies, states = batch(3)
     law = rj.torques.HeavyTop(1.0, [0.0, 0.0, 1.0], [0.0, 0.0, -1.0])
@@ -129,12 +132,34 @@ def test_a_record_on_a_gpu_follows_the_largest_number_of_steps(monkeypatch):
     here = compiled(400)
     slope, steps = here(states.omega)
     assert int(steps.max()) > 2 * 21
-    for module in (sharding, batching, adaptive_loop):
-        monkeypatch.setattr(module, "platform", lambda: "gpu")
+    module, chunks = sys.modules["rigidjax.batch.simulate"], []
+    for one in (sharding, batching, adaptive_loop, module):
+        monkeypatch.setattr(one, "platform", lambda: "gpu")
+
+    def fit_chunk_to_memory(*args):
+        division = sharding.fit_chunk_to_memory(*args)
+        chunks.append(division.chunk)
+        return division
+
+    monkeypatch.setattr(module, "fit_chunk_to_memory", fit_chunk_to_memory)
+    monkeypatch.setattr(sharding, "memory_of_device", lambda mesh: 1e4)
     there = compiled(401)  # another number, so that no trace of the first call is taken
-    np.testing.assert_allclose(there(states.omega)[0], slope, rtol=1e-11, atol=1e-12)
-    small, large = (f.memory_analysis().temp_size_in_bytes for f in (there, here))
-    assert small < 0.2 * large
+    monkeypatch.setattr(sharding, "_FEW", 2)
+    apart = compiled(402)
+    assert chunks == [3, 1]
+    for one in (there, apart):
+        np.testing.assert_allclose(one(states.omega)[0], slope, rtol=1e-11, atol=1e-12)
+    large, small, least = (f.memory_analysis().temp_size_in_bytes for f in (here, there, apart))
+    assert small < 0.2 * large and least < 0.5 * small
+
+
+def test_memory_of_a_device_is_what_jax_says(monkeypatch):
+    class Card:
+        memory_stats = staticmethod(lambda: {"bytes_limit": 5.0})
+
+    assert sharding.memory_of_device(None) == np.inf  # a CPU
+    monkeypatch.setattr(jax, "devices", lambda: [Card()])
+    assert sharding.memory_of_device(None) == 5.0
 
 
 def test_many_rows_are_checked_where_they_are():
