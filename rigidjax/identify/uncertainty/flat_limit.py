@@ -18,7 +18,7 @@ from rigidjax.identify.model.charts import (
     chart_list,
     numbers_of_each_body,
 )
-from rigidjax.identify.model.model import Model, with_first_times_only
+from rigidjax.identify.model.model import Model
 
 # Derivatives are computed at a body whose smallest second moment is at least this fraction of the
 # sum of its three second moments.
@@ -131,19 +131,7 @@ def bodies_at(model: Model, x: Float[Array, " n"]) -> list[Any]:
 
     A chart is the parametrisation of one body by free numbers.
     """
-    return _compiled_bodies(with_first_times_only(model), x)
-
-
-@eqx.filter_jit
-def _compiled_bodies(model: Model, x: Float[Array, " n"]) -> list[Any]:
-    """Return the bodies of a `model` at its free numbers x (n,), computed in one compiled program.
-
-    The bodies are in the order of the model's charts. A chart is the parametrisation of one body by
-    free numbers.
-    """
-    # Compile one program for all bodies: single operations of JAX are slow outside of a compiled
-    # program.
-    return bodies_as_list(model.bodies(x))
+    return bodies_as_list(model.unpack(x).body)
 
 
 def _numbers_of_thicker_body(
