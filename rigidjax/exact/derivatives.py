@@ -23,7 +23,7 @@ where the derivative comes from a Taylor series.
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -445,8 +445,17 @@ def _motion_and_derivatives_jvp(
     (body, *k), (_, *d_k), inputs, change = _derivative_variables_and_changes(primals, tangents)
     d_motion = _change_of_motion(motion, rows, change)
     d_parts = _changes_of_momentum_derivatives(body, inputs, change)
+    # One column after the other makes a shorter program than all columns as one batch.
+    of_parts = functools.partial(_motion_derivatives, map_columns=jax.lax.map)
     at, changes = (*k, *primals[1:], motion, *parts), (*d_k, *tangents[1:], d_motion, *d_parts)
-    return (motion, rows, parts), (d_motion, jax.jvp(_motion_derivatives, at, changes)[1], d_parts)
+    return (motion, rows, parts), (d_motion, jax.jvp(of_parts, at, changes)[1], d_parts)
+
+
+def _map_as_batch(function: Callable[[Any], Any], rows: PyTree) -> PyTree:
+    """Return the results of `function` for each row of the arrays in `rows`, all computed
+    together.
+    """
+    return jax.vmap(function)(rows)
 
 
 def _motion_derivatives(
@@ -457,6 +466,7 @@ def _motion_derivatives(
     motion: Motion,
     momentum_rows: VectorDerivatives,
     momentum_integral: SymmetricEntries,
+    map_columns: Callable[[Callable[[Any], Any], Any], Any] = _map_as_batch,
 ) -> MotionDerivatives:
     """Return the derivatives of a free motion (of its body momentum Π(t), rotation and body rate
     Ω(t)) with respect to ten variables, from the derivatives of its body momentum.
@@ -470,6 +480,8 @@ def _motion_derivatives(
     - `momentum_rows`: the derivatives of Π(t) − Π(0) with respect to the ten variables, as three
       arrays (10,), one for each component.
     - `momentum_integral`: the six entries of G = ∫ Π Πᵀ dt from 0 to t.
+    - `map_columns`: a function (f, trees of arrays with ten rows) that calls f with each row, all
+      together or one after the other.
 
     The ten variables are d12, d23, k12, k13, k23, the three of Π(0), k33 and t, where kij are the
     entries of K and dij = kii − kjj.
@@ -516,7 +528,8 @@ def _motion_derivatives(
         theta = tuple(jnp.where(still, a, b) for a, b in zip(near, theta, strict=True))
         return d_out, theta, add(matvec(inverse_inertia, d_out), matvec(d_k, out))
 
-    return MotionDerivatives(*jax.vmap(column)(jnp.eye(10, dtype=t.dtype), momentum_rows))
+    unit_changes = jnp.eye(10, dtype=t.dtype)
+    return MotionDerivatives(*map_columns(lambda one: column(*one), (unit_changes, momentum_rows)))
 
 
 def derivative_variables(

@@ -294,7 +294,7 @@ def _solve_run(
     try:
         if event is None:
             # An error that the compiled program raises would need a callback, which takes a fifth
-            # of the time of its compilation, and in JAX 0.10 it keeps the program out of JAX's cache.
+            # of the time of its compilation, and keeps the program out of the cache of JAX 0.10.
             known = solved_run is not None or _checks.is_known((setup, state0, times))
             quiet = dataclasses.replace(setup, throw=setup.throw and not known)
             ys, stats, result = solved_run or solve(quiet, state0, times)
