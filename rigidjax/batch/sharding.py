@@ -29,7 +29,7 @@ _ROW = 512
 # On a GPU a chunk may use this share of the memory for the record from which derivatives in reverse
 # mode are computed. These derivatives themselves need about as much again.
 _SHARE = 0.25
-# The record of fewer bodies than this fits the memory of any GPU, and its size is not computed.
+# The record of fewer bodies than this takes about a gigabyte or less; its size is not computed.
 _FEW = 10_000
 # JAX takes this option of XLA only at the outermost jit, and it exists only on CPU.
 _WIDE = {"xla_cpu_prefer_vector_width": 512}
