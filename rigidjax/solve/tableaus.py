@@ -10,6 +10,8 @@ import diffrax as dfx
 import numpy as np
 
 Row = dict[int, float]
+# Of the weights of one row at most this many may be rounded to the number that is not the nearest.
+_MOST_CHOSEN = 12
 
 
 class Tableau(NamedTuple):
@@ -90,14 +92,19 @@ def _rounded_weights(
     exact = np.array(weights)
     near = exact.astype(dtype)
     error = near.astype(float) - exact
-    way = np.where(error > 0, -np.inf, np.inf).astype(dtype)
+    # A weight that `dtype` holds exactly stays as it is.
+    way = np.where(error == 0, near, np.where(error > 0, -np.inf, np.inf)).astype(dtype)
     step = np.nextafter(near, way).astype(float) - near.astype(float)
     # Each row of `choice` is one choice: 1 for each weight that is not rounded to the nearest
-    # number, but to the next one on the other side.
-    choice = np.arange(2**exact.size)[:, None] >> np.arange(exact.size) & 1
-    changes = (error + choice * step) @ np.stack([np.ones(exact.size), times], axis=1)
-    best = choice[np.argmin(np.sum(changes**2, axis=1))]
-    return tuple((near.astype(float) + best * step).tolist())
+    # number, but to the next one on the other side. In a long row these are weights whose
+    # rounding matters most.
+    chosen = np.argsort(-np.abs(step))[:_MOST_CHOSEN]
+    choice = np.arange(2**chosen.size)[:, None] >> np.arange(chosen.size) & 1
+    sums = np.stack([np.ones(exact.size), times], axis=1)
+    changes = error @ sums + (choice * step[chosen]) @ sums[chosen]
+    near = near.astype(float)
+    near[chosen] += choice[np.argmin(np.sum(changes**2, axis=1))] * step[chosen]
+    return tuple(near.tolist())
 
 
 def _sparse_row(row: np.ndarray) -> Row:

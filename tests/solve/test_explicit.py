@@ -353,6 +353,19 @@ def test_rounded_weights_keep_their_sums(name):
     assert tableaus.round_weights(exact, float) is exact
 
 
+def test_a_long_row_is_rounded_soon():
+    """25 weights, as in a method of order 12: their sums move less than by the nearest numbers."""
+    weights = np.random.default_rng(3).normal(size=25) * 10.0 ** np.linspace(-3, 1, 25)
+    row, times = dict(enumerate(weights)), np.linspace(0.0, 1.0, 25)
+    long = tableaus.Tableau(
+        order=12, c=tuple(times[1:-1]), a=({0: 0.5},) * 23, b=row, errors=({0: 1.0},)
+    )
+    rounded = np.array(list(tableaus.round_weights(long, np.float32).b.values()))
+    nearest = weights.astype(np.float32).astype(float)
+    for sums in (np.ones(25), times):
+        assert abs((rounded - weights) @ sums) < 0.1 * abs((nearest - weights) @ sums)
+
+
 def test_failures_are_results_not_numbers():
     ts = jnp.array([0.0, 1.0, 20.0])
     out = adaptive(Tsitouras5(), FREE, ts, START, rtol=1e-9, atol=1e-9, max_steps=60)
