@@ -1,5 +1,7 @@
 """The front door: values and derivatives against oracles, refusals, no needless compilation."""
 
+import sys
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -10,6 +12,7 @@ from once import once
 from systems import free_body_mp
 
 import rigidjax as rj
+from rigidjax.solve import run
 
 TENSOR = np.array([[1.0, 0.1, -0.05], [0.1, 1.6, 0.2], [-0.05, 0.2, 2.1]])
 OMEGA = np.array([0.9, -1.1, 0.4])
@@ -392,3 +395,30 @@ def test_a_torque_of_nan_is_told_in_one_sentence_outside_of_jit():
     words = str(caught.value)
     assert words.startswith("simulate: the motion became NaN or infinite.")
     assert "\n" not in words and caught.value.__suppress_context__
+
+
+@pytest.mark.oldest
+@WAYS
+def test_a_run_raises_once_whether_its_numbers_are_known_or_traced(torque, monkeypatch):
+    """Known: on the host, so that the program has no callback. Traced: in the program."""
+    raised_in_program = []
+    module = sys.modules["rigidjax.solve.simulate"]
+
+    def solve(setup, state0, ts):
+        raised_in_program.append(setup.throw)
+        return run.solve(setup, state0, ts)
+
+    monkeypatch.setattr(module, "solve", solve)
+
+    def last(ts):
+        body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
+        return rj.simulate(body, rj.Spin([1.0, 1.0, 1.0]), ts, torque, max_steps=3).ys.omega
+
+    late, words = (1e75, "more turns than") if torque is None else (50.0, "maximum number of")
+    early, late = jnp.array([0.0, 1e-3]), jnp.array([0.0, late])
+    wanted = last(early)
+    for function in (last, eqx.filter_jit(last)):
+        np.testing.assert_allclose(function(early), wanted, rtol=1e-14)
+        with pytest.raises(Exception, match=words):
+            jax.block_until_ready(function(late))
+    assert raised_in_program == [False, False, False, True]
