@@ -434,6 +434,9 @@ def explain_max_steps_error(
     t, state, step, count = _rerun_and_return_end(
         dataclasses.replace(setup, throw=False), state0, ts
     )
+    # A torque that is a function may hold traced numbers, which are then in the result alone.
+    if not _checks.is_known((t, state, step, count)):
+        return error
     begun, end, t = float(ts[0]), float(ts[-1]), float(t)
     gone, step = abs(t - begun), float(step)
     words = f"simulate: the maximum number of solver steps, {int(count)}, "

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from types import FunctionType
 from typing import Any
 
 import diffrax as dfx
@@ -265,6 +266,12 @@ def _solve_to_accuracy(
       angle, rad; for any other array of the state it is a fraction of the largest length of this
       array in the run.
     """
+    if isinstance(setup.torque, FunctionType):
+        # The derivative of the search is a rule of our own, which does not see traced numbers that
+        # a function holds. They become arrays of the set-up, which the rule does see.
+        converted = eqx.filter_closure_convert(setup.torque, times[0], state0, setup.body)
+        if not _checks.is_known(converted):
+            setup = dataclasses.replace(setup, torque=converted)
     found, run, search = solve_to_accuracy(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
     sol = _solve_run(found, event, state0, times, None if event is not None else run)

@@ -422,3 +422,22 @@ def test_a_run_raises_once_whether_its_numbers_are_known_or_traced(torque, monke
         with pytest.raises(Exception, match=words):
             jax.block_until_ready(function(late))
     assert raised_in_program == [False, False, False, True]
+
+
+def last_rate_under_a_law_with_a_number(drag, **how):
+    body = rj.Inertia.from_principal(2.0, 2.0, 2.0)
+    law = lambda t, state, body: -drag * state.omega
+    return rj.simulate(body, rj.Spin([0.0, 0.0, 1.5]), [0.0, 4.0], law, **how).ys.omega[-1, 2]
+
+
+def test_a_law_that_holds_a_traced_number_raises_the_message_of_its_run():
+    end = lambda drag: last_rate_under_a_law_with_a_number(drag, max_steps=1)
+    for function in (jax.grad(end), lambda drag: jax.vmap(end)(jnp.array([drag, 2 * drag]))):
+        with pytest.raises(RuntimeError, match="the maximum number of solver steps, max_steps"):
+            function(0.3)
+
+
+def test_an_accuracy_sees_the_traced_number_that_a_law_holds():
+    # ω = ω₀ exp(−drag t / I); its derivative by the drag.
+    found = jax.grad(lambda drag: last_rate_under_a_law_with_a_number(drag, accuracy=1e-9))(0.3)
+    assert abs(float(found) + 1.5 * 2.0 * np.exp(-0.6)) < 1e-8
