@@ -437,7 +437,24 @@ def test_a_law_that_holds_a_traced_number_raises_the_message_of_its_run():
             function(0.3)
 
 
-def test_an_accuracy_sees_the_traced_number_that_a_law_holds():
+class PlainLaw:
+    """A law as a class of plain Python, which JAX does not look into."""
+
+    def __init__(self, drag):
+        self.drag = drag
+
+    def __call__(self, t, state, body):
+        return -self.drag * state.omega
+
+
+@pytest.mark.parametrize("kind", ["function", "class in a sum"])
+def test_an_accuracy_sees_the_traced_number_that_a_law_holds(kind):
     # ω = ω₀ exp(−drag t / I); its derivative by the drag.
-    found = jax.grad(lambda drag: last_rate_under_a_law_with_a_number(drag, accuracy=1e-9))(0.3)
-    assert abs(float(found) + 1.5 * 2.0 * np.exp(-0.6)) < 1e-8
+    def last(drag):
+        if kind == "function":
+            return last_rate_under_a_law_with_a_number(drag, accuracy=1e-9)
+        law = rj.torques.Sum(rj.torques.Damping([0.1, 0.1, 0.1]), PlainLaw(drag - 0.1))
+        body, start = rj.Inertia.from_principal(2.0, 2.0, 2.0), rj.Spin([0.0, 0.0, 1.5])
+        return rj.simulate(body, start, [0.0, 4.0], law, accuracy=1e-9).ys.omega[-1, 2]
+
+    assert abs(float(jax.grad(last)(0.3)) + 1.5 * 2.0 * np.exp(-0.6)) < 1e-8
