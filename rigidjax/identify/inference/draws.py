@@ -23,6 +23,7 @@ from rigidjax.identify.filtering.terms import cost_gradient_and_information
 from rigidjax.identify.inference.density import LogDensity, map_draws
 from rigidjax.identify.model.model import Unpacked
 from rigidjax.identify.model.normal import NormalMatrix
+from rigidjax.identify.model.terms import jacobian_and_value
 from rigidjax.identify.search.least_squares import Settings, minimise
 from rigidjax.identify.search.stages import order_one_indicator
 from rigidjax.identify.uncertainty.quantities import interval_about
@@ -385,10 +386,7 @@ class Refit(eqx.Module):
         def function_of_numbers(x: Array) -> Array:
             return jnp.asarray(function(self.density.unpack(x)))
 
-        centre, slope = (
-            np.asarray(a)
-            for a in (function_of_numbers(self.x), jax.jacfwd(function_of_numbers)(self.x))
-        )
+        slope, centre = map(np.asarray, jacobian_and_value(function_of_numbers, self.x))
         null, reach = np.zeros((0, self.x.size)), NormalDist().inv_cdf(0.5 + 0.5 * level)
         return interval_about(centre, slope, np.asarray(self.covariance), null, reach)
 
