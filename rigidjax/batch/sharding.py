@@ -168,11 +168,20 @@ def chunk_size(chunk: int | None, dtype: np.dtype, num_bodies: int) -> int:
     return min(chunk, num_bodies)
 
 
+def bodies_per_device(division: Division, per_body: PyTree) -> int:
+    """Return the number of bodies that each device computes.
+
+    `division` has the devices; `per_body` are arrays with a leading axis of bodies.
+    """
+    count = jax.tree.leaves(per_body)[0].shape[0]
+    return -(-count // (1 if division.mesh is None else division.mesh.devices.size))
+
+
 def fit_chunk_to_memory(
     division: Division, function: Callable[[Any, Any], Any], shared: PyTree, per_body: PyTree
 ) -> Division:
-    """Return the `division` of a batch with chunks that fit the memory of a GPU, if all bodies
-    would be computed at once.
+    """Return the `division` of a batch with chunks that fit the memory of a GPU, if all bodies of a
+    device would be computed at once.
 
     The memory is that of the record from which derivatives in reverse mode are computed. Its size
     for one body is found without running anything. On CPU, and for a few thousand bodies, the
@@ -182,14 +191,17 @@ def fit_chunk_to_memory(
     - `function`, `shared`, `per_body`: the arguments of `map_bodies`. The function must have
       derivatives in reverse mode.
     """
-    count = jax.tree.leaves(per_body)[0].shape[0]
-    if platform() == "cpu" or count < _FEW or division.chunk < count:
+    share = bodies_per_device(division, per_body)
+    if platform() == "cpu" or share < _FEW or division.chunk < share:
         return division
     row = jax.tree.map(lambda a: a[0], per_body)
     record = jax.eval_shape(lambda *args: jax.vjp(function, *args)[1], shared, row)
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(record))
     fitting = _SHARE * memory_of_device(division.mesh) / size
-    return division._replace(chunk=int(min(count, max(1, fitting))))
+    if fitting >= share:
+        return division
+    # The length of a chunk is odd for the reason given in `map_bodies`.
+    return division._replace(chunk=max(1, int(fitting) - 1 + int(fitting) % 2))
 
 
 def memory_of_device(mesh: Mesh | None) -> float:
@@ -222,7 +234,7 @@ def map_bodies(
     chunk, mesh, meter = division
     count = jax.tree.leaves(per_body)[0].shape[0]
     parts = 1 if mesh is None else mesh.devices.size
-    share = -(-count // parts)
+    share = bodies_per_device(division, per_body)
     chunk = min(chunk, share)
     if chunk == share and platform() != "cpu":
         # The length of the chunk is made odd: of an array of even length XLA gives each thread of a

@@ -18,6 +18,7 @@ from rigidjax.batch.sharding import (
     CompiledFunction,
     Devices,
     Division,
+    bodies_per_device,
     divide_batch,
     fit_chunk_to_memory,
     map_bodies,
@@ -121,9 +122,9 @@ def simulate(
       loop of rigidjax, which is faster than the loop of diffrax.
     - `rtol`, `atol`, `max_steps`, `adjoint`: as for `rigidjax.simulate`. On a GPU the memory of a
       gradient grows as the root of `max_steps`.
-    - `chunk`: the number of bodies that a device computes at a time. On a GPU it is by default as
-      many bodies as fit a quarter of the memory with the record of their steps; a derivative in
-      reverse mode computes each of several chunks once more.
+    - `chunk`: as for `rigidjax.batch.rollout`. But with times to save, a device that is no CPU
+      computes by default as many bodies at a time as fit a quarter of its memory with the record of
+      their steps; a derivative in reverse mode computes each of several chunks once more.
 
     All bodies of a chunk wait for the slowest body of this chunk. Each chunk therefore gets bodies
     with similar initial rates, which need similar numbers of steps. The results of a body do not
@@ -213,7 +214,7 @@ def _simulate_bodies(
         return map_bodies(simulate_body, (shared, ts), per_body, division)
     if options["adjoint"] is None:
         division = fit_chunk_to_memory(division, simulate_body, (shared, ts), per_body)
-    if platform() != "cpu" and division.chunk < jax.tree.leaves(per_body)[0].shape[0]:
+    if platform() != "cpu" and division.chunk < bodies_per_device(division, per_body):
         # On a GPU the record of a body is large, because bodies are computed many at a time. With
         # `jax.checkpoint` the reverse pass computes each chunk once more, and keeps the record of
         # one chunk at a time.

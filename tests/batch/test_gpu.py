@@ -153,6 +153,24 @@ def test_a_record_on_a_gpu_follows_the_largest_number_of_steps(monkeypatch):
     assert small < 0.2 * large and least < 0.5 * small
 
 
+def test_chunks_that_fit_a_memory_have_an_odd_length(monkeypatch):
+    """They are as long as a quarter of the memory allows; a memory that holds all needs none."""
+    monkeypatch.setattr(sharding, "platform", lambda: "gpu")
+    rows = jnp.arange(20_000.0)
+    division = sharding.divide_batch(None, None, None, rows.dtype, rows.size)
+    assert division.chunk == rows.size == sharding.bodies_per_device(division, rows)
+
+    def chunk(memory):
+        monkeypatch.setattr(sharding, "memory_of_device", lambda mesh: memory)
+        fit = sharding.fit_chunk_to_memory
+        return fit(division, lambda scale, row: jnp.sin(scale * row), jnp.asarray(2.0), rows).chunk
+
+    found = [chunk(memory) for memory in (1.0, 2e5, 4e5, np.inf)]
+    assert found[0] == 1 and found[3] == rows.size
+    assert found[1] % 2 == found[2] % 2 == 1
+    assert abs(found[2] - 2 * found[1]) <= 3 and found[2] * 8 <= 1e5
+
+
 def test_memory_of_a_device_is_what_jax_says(monkeypatch):
     class Card:
         memory_stats = staticmethod(lambda: {"bytes_limit": 5.0})
