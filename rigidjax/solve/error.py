@@ -624,9 +624,7 @@ def _times_of_sudden_torque(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Py
     # law is missed. These laws are therefore held fixed here, at their values at the first time.
     field = equations_of_motion(setup.body, state0, setup.torque)
     field = hold_piecewise_constant_laws_at(field, ts[0])
-    if not depends_on_time(
-        jax.make_jaxpr(lambda t: ravel_pytree(field(t, state0, None))[0])(ts[0])
-    ):
+    if not depends_on_time(lambda t: ravel_pytree(field(t, state0, None))[0], ts[0]):
         return ts[:0]
     # The samples are at uneven times: on an even grid, pulses that come once a second could all
     # fall between the samples.

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Int
 
 from rigidjax import _checks
@@ -381,12 +382,8 @@ def warn_of_missed_switches(
     state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
     form = equations_by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
-    analysis = find_switches(trace_program(lambda t, y: field(t, y, None), ts[0], state0).closed)
-    lines = (
-        []
-        if analysis is None
-        else list(dict.fromkeys(s.primitive_and_line for s in analysis.switches))
-    )
+    program = trace_program(lambda t, y: ravel_pytree(field(t, y, None))[0], ts[0], state0)
+    lines = dict.fromkeys(s.name_and_line for s in find_switches(program.closed).switches)
     warnings.warn(
         f"simulate: a law switches by the time more than {MOST} times ({'; '.join(lines)}): steps "
         "end at the first of these times, and the derivative with respect to the other times is "

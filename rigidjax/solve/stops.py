@@ -21,26 +21,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax.solve.batching import Arrays
-from rigidjax.solve.switching import MOST, Analysis, find_switches
-from rigidjax.solve.switching_times import (
-    find_switching_times,
-    replace_comparisons_by_stops,
-    separate_equal_times,
-)
-
-
-def warn_of_unsearchable_jumps(analysis: Analysis) -> None:
-    """Warn of each line of a law whose result may jump at times that are not found before the run.
-
-    `analysis` holds these lines, and the switches that were found in the traced vector field.
-    """
-    for line in dict.fromkeys(analysis.unseen):
-        warnings.warn(
-            f"simulate: a law may jump at a time that is not found before the run ({line}): steps "
-            "do not end there, and the derivative with respect to that time is lost. Give the law "
-            "`jump_times`, its jumps in s, or end the run there and begin another",
-            stacklevel=2,
-        )
+from rigidjax.solve.switching import MOST, find_switches
+from rigidjax.solve.switching_times import find_changes, separate_equal_times, values_between
 
 
 class TracedProgram(NamedTuple):
@@ -77,7 +59,11 @@ def trace_program(function: Callable[..., Any], *examples: Any) -> TracedProgram
     The returned `TracedProgram` is called as `call(constants, *args)`, where `constants` are the
     JAX arrays that the function closes over.
     """
-    closed, out = jax.make_jaxpr(function, return_shape=True)(*examples)
+
+    def traced(*args: Any) -> Any:  # its name shows in the lines of code of the equations
+        return function(*args)
+
+    closed, out = jax.make_jaxpr(traced, return_shape=True)(*examples)
     return TracedProgram(closed, jax.tree.structure(out))
 
 
@@ -134,10 +120,15 @@ def program_with_stops(
     declared = [times.astype(t0.dtype) for times in declared_jumps if times.size]
     likes = declared if len(declared) > 1 else []
     program = trace_program(function, t0, y, *likes)
-    analysis, number = find_switches(program.closed), len(program.jax_constants)
-    if analysis is not None:
-        warn_of_unsearchable_jumps(analysis)
-    if analysis is None or not analysis.switches:
+    found, number = find_switches(program.closed), len(program.jax_constants)
+    for line in found.unfound:
+        warnings.warn(
+            f"simulate: a law may jump at a time that is not found before the run ({line}): steps "
+            "do not end there, and the derivative with respect to that time is lost. Give the law "
+            "`jump_times`, its jumps in s, or end the run there and begin another",
+            stacklevel=2,
+        )
+    if not found.switches:
         if not likes:
             stops = jnp.clip(jnp.sort(declared[0]), t0, t1) if declared else jnp.zeros(0, t0.dtype)
             return ProgramWithStops(program.call, program.jax_constants, number, stops, None)
@@ -145,22 +136,26 @@ def program_with_stops(
         sides = _split_like(lax.stop_gradient(each), declared)
         call = lambda given, t, y: program.call(given[:number], t, y, *given[number:])  # noqa: E731
         return ProgramWithStops(call, [*program.jax_constants, *sides], number, stops, None)
-    found = find_switching_times(analysis, program.closed.consts, t0, t1)
-    stops, each = separate_equal_times(jnp.concatenate([*declared, found.times]), t0, t1)
-    *sides, own = _split_like(lax.stop_gradient(each), [*declared, found.times])
-    over, most = found.over, MOST + sum(times.shape[0] for times in declared)
+    changes = find_changes(found, program.closed.consts, t0, t1)
+    times = [*declared, changes.times]
+    stops, each = separate_equal_times(jnp.concatenate(times), t0, t1)
+    *sides, own = _split_like(lax.stop_gradient(each), times)
+    over, most = changes.over, MOST + sum(t.shape[0] for t in declared)
     if stops.shape[0] > most:
         stops, over = stops[:most], over | (stops[most] < t1)
-    # The arrays that describe the switches are joined to one array, because a loop that carries
-    # many arrays is slower.
-    places = lax.stop_gradient((own, found._replace(times=own[:0])))
+    # The arrays that describe the changes are joined to one, because a loop that carries many
+    # arrays is slower.
+    places = lax.stop_gradient((own, changes._replace(times=own[:0])))
     one, unpacked = ravel_pytree(jax.tree.map(lambda leaf: leaf.astype(t0.dtype), places))
-    more, field = [*(sides if likes else []), one], replace_comparisons_by_stops(analysis)
 
     def call(given: Arrays, t: Array, y: Array) -> Array:
         *sides, one = given[number:]
-        return field(program.replace_jax_constants(given[:number]), t, y, *sides, unpacked(one))
+        own, changes = unpacked(one)
+        values = values_between(found, changes, own, t)
+        consts = program.replace_jax_constants(given[:number])
+        return found.field(values, changes.over > 0, consts, t, y, *sides)
 
+    more = [*(sides if likes else []), one]
     return ProgramWithStops(call, [*program.jax_constants, *more], number, stops, over)
 
 

@@ -1,585 +1,412 @@
-"""Find the equations of a traced vector field that switch at times independent of the state.
+"""Interpret a traced vector field, and find its equations that switch at times of their own.
 
 A law that a user writes, such as `jnp.where(t < self.te, push, 0.0)`, declares no `jump_times`, but
-the traced program of the field contains its comparison. If the comparison depends on the time but
-not on the state, the times at which its result changes are found before the run, by halving
-intervals. This finds even the ends of a very short pulse, because many comparisons change only
-once: a comparison of two linear functions of time does, and a comparison of a constant with a
-function of time that only rises or only falls. The steps of the run end at the times found, which
-are called stops. During the run the comparison is not evaluated: its result follows from the stops
-that the step has passed. The result therefore does not depend on rounding, and two comparisons that
-change at the same time are treated separately.
+the traced field contains its comparison. One interpreter of the traced field is run twice. The
+first run skips what depends on the state, and meets each comparison that depends on the time alone:
+the module `switching_times` finds from it the times at which the comparisons change. The second run
+evaluates the whole field, but takes the results of these comparisons from the times that are
+passed. The results therefore do not depend on rounding, and two comparisons that change at the same
+time are treated separately.
 
-The switching function g of a comparison is the difference of its two operands. It is a function of
-the time t and of the constants p of the field. The equation `g(p, t) = 0` defines the switching
-time t as an implicit function of p, and gives the derivatives of this time.
+| written | what comes |
+|---|---|
+| <, <=, >, >=, sign, floor, ceil, round, rem, int(…), searchsorted of the time | stops, with \
+derivatives |
+| ==, !=, isnan, isfinite, a pole (1 / (t − p) > 0), atan2 that leaps by 2π | stops, with first \
+derivatives |
+| max, min, abs, clamp of at most `FEW_KINKS` elements | stops at the kinks |
+| cond, switch, jit, remat, custom_jvp, custom_vjp | as their bodies |
+| loops, callbacks, argmax, argmin, sort, bits of numbers, more than `MOST` elements | a warning |
+| what depends on the state | left alone |
 """
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from itertools import count
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.extend.core import (
     ClosedJaxpr,  # pyright: ignore[reportPrivateImportUsage]
     Jaxpr,
     Literal,
 )
 from jax.extend.source_info_util import summarize
+from jaxtyping import Array
 
 from rigidjax.solve.batching import Arrays
 
-# The name of the scope (`jax.named_scope`) in which a law that declares its jumps is called. No
-# switch is searched for in the equations of this scope.
+# The scope (`jax.named_scope`) in which a law that declares its jumps is called: it is not searched.
 DECLARED = "rigidjax_declared_jumps"
-_PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
-_EQUINOX = os.path.dirname(os.path.abspath(eqx.__file__)) + os.sep
-# The number of innermost calls among which a line outside of JAX and Equinox is looked for.
-_FRAMES = 8
+MOST = 256  # the most elements, and the most changes, of the switches of one law
+FEW_KINKS = 8  # steps do not end at the kinks of an operation that has more
 
-# `COMPARISONS`: primitives whose result changes when the first operand becomes equal to the second.
-# `_LEVELS`: primitives whose result changes when the first operand (for `rem` the quotient of the
-# two operands) passes a whole number. `sign`, whose result changes when its operand passes zero, is
-# in neither set; the function `_may_jump` adds it.
-COMPARISONS = {"lt", "le", "gt", "ge", "lt_to", "le_to"}
-_LEVELS = {"floor", "ceil", "round", "convert_element_type", "rem"}
-# Primitives whose result has a kink when two operands become equal or, for `abs`, when the operand
-# passes zero.
-KINKS = {"max", "min", "abs", "clamp"}
-# Primitives whose result may jump, but whose jumps are not searched for, because they choose or
-# order elements of an array, or work on the bits of a number.
-_CHOICES = {"argmax", "argmin", "sort", "top_k", "bitcast_convert_type", "nextafter"}
-# Primitives whose content cannot be read.
-_OPAQUE = {"pure_callback", "io_callback", "custom_call", "ffi_call"}
-# Primitives whose result jumps, but is not constant between its jumps, like a saw tooth.
-_SAWS = {"rem", "atan2", "sort", "top_k", "nextafter"}
-# A flat program is a traced function as one list of equations. `_CALLS`: calls whose body is
-# written out in the flat program. `_WHOLE`: calls that stay one equation of the flat program; their
-# bodies are nevertheless searched for switches.
+# How a value depends on the time: not at all, by jumps alone, as a straight line, only rising or
+# only falling, in any other way; or that it depends on the state.
+FIXED, PIECES, STRAIGHT, MONOTONE, BENT, STATEFUL = range(6)
+
+_COMPARISONS = {"lt", "le", "gt", "ge", "lt_to", "le_to", "eq", "ne"}
+_LEVELS = {"floor", "ceil", "round", "rem", "convert_element_type"}  # jump at each whole number
+_KINKS = {"max", "min", "abs", "clamp"}
+_KEPT = _KINKS | {"atan2"}  # the field evaluates them as they stand
+_FOUND = _COMPARISONS | _LEVELS | _KEPT | {"sign", "is_finite", "searchsorted"}
+_UNFOUND = {
+    "argmax", "argmin", "sort", "top_k", "bitcast_convert_type", "nextafter", "pure_callback",
+    "io_callback", "custom_call", "ffi_call",
+}  # fmt: skip
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2"}
-_WHOLE = {"cond", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
-# `_LINEAR`: primitives that are linear in all operands together. `_PRODUCTS`: primitives that are
-# linear in each of two operands alone.
-_LINEAR = {
+_RULES = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
+_SMOOTH = {"expm"}  # functions of JAX that compare only to choose between equal formulas
+_ELEMENTWISE = {
     "add", "sub", "add_any", "neg", "copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze",
-    "slice", "transpose", "rev", "concatenate", "reduce_sum", "cumsum", "expand_dims",
-    "convert_element_type", "stop_gradient", "optimization_barrier", "gather", "dynamic_slice",
+    "slice", "transpose", "rev", "concatenate", "expand_dims", "convert_element_type",
+    "stop_gradient", "optimization_barrier", "gather", "dynamic_slice", "select_n",
 }  # fmt: skip
-_PRODUCTS = {"mul", "dot_general"}
-# Primitives of one operand whose result only rises or only falls when the operand rises.
-_MONOTONE = {
+_SUMS = {"reduce_sum", "cumsum"}
+_PRODUCTS = {"mul", "div", "dot_general"}
+_RISING = {
     "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "tanh", "logistic", "erf", "sinh",
-    "asinh", "atan",
+    "asinh", "atan", "max", "min", "clamp",
 }  # fmt: skip
-# How a value depends on the time. `CONSTANT`: not at all. `PIECES`: it is constant except for
-# jumps. `STRAIGHT`: it is a linear function of the time. `MONOTONE`: it only rises or only falls.
-# `BENT`: in any other way.
-CONSTANT, PIECES, STRAIGHT, MONOTONE, BENT = range(5)
 
-MOST = 64  # the largest number of switching times of one law, or of one `floor`, `round`, …
-_FEW = 32  # a comparison of more elements than this is treated as a table, not as a switch
-_FEW_KINKS = 3  # steps do not end at the kinks of an operation that has more kinks than this
-# The changes of a switch whose operand may rise and fall in time (`BENT`) are searched for on a
-# grid of times. Between two points of the grid an element may change twice. Such changes are
-# searched for near at most `NEAR` points of the grid: those where the switch comes closest to a
-# change.
-NEAR = 16
+_HOME = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
+_SCHEDULES = os.path.join(_HOME, "motion", "torques", "piecewise.py")
+_EQUINOX = os.path.dirname(os.path.abspath(eqx.__file__)) + os.sep
 
 
-class Equation(NamedTuple):
-    """Hold an equation of a flat program, in which each value is identified by an integer.
-
-    A flat program is a traced function as one list of equations. An input of an equation is the
-    integer of a value or a literal, and an output is the integer of a value.
-    """
-
-    primitive: Any
-    params: dict[str, Any]
-    inputs: list[Any]
-    outputs: list[int]
-    dtypes: list[Any]  # the dtype of each input that has one
-    shapes: list[Any]  # the shape and dtype of each output
-    sources: tuple[Any, ...]  # where the equation and, from inside out, the calls around it stand
-    declared: bool  # whether it belongs to a part that declares its jumps
-
-    @property
-    def line_of_code(self) -> str:
-        """Return the line of code that wrote this equation: its file and its number.
-
-        Lines of JAX and Equinox are passed over. JAX traces some of its own functions only once,
-        such as `jnp.round`. Their equations name no other line, and the line that calls the
-        function is returned.
-        """
-        for source in self.sources:
-            for line in reversed(summarize(source, num_frames=_FRAMES).splitlines()):
-                if line and not line.startswith(_EQUINOX):
-                    return line
-        return ""
-
-    @property
-    def primitive_name(self) -> str:
-        """Return the name of the equation's primitive, or "searchsorted" for `jnp.searchsorted`."""
-        return _primitive_name(self)
-
-
-class Program(NamedTuple):
-    """Hold a function f(t, y, …) as a flat list of equations; integers identify its values.
-
-    Value 0 is the time t, and value 1 is the state y.
-    """
-
-    equations: list[Equation]  # the equations, in the order of evaluation
-    constants: list[int]  # the values that are constants of the traced function
-    inner: dict[int, Any]  # the constants of inner calls; the keys are the integers of these values
-    inputs: list[int]  # the values that are arguments of the function
-    output: Any  # the value that the function returns
-
-
-class Switch(NamedTuple):
-    """Hold an equation whose result jumps, or has a kink, at times independent of the state.
-
-    An example is the comparison in `jnp.where(t < 1, push, 0.0)`. A comparison of arrays has
-    several elements, each of which changes at times of its own.
-    """
-
-    equation: Equation
-    time_dependence: int  # how the operands depend on the time: `STRAIGHT`, …
-    size: int  # the number of elements that are compared
-    jumps: bool  # whether the result jumps; else it has a kink
-
-    @property
-    def most_changes_if_monotonic(self) -> int:
-        """Return how many changes of each element of this switch are stored, if it is monotonic.
-
-        An element is one number of the result of the switch, which may be an array. The switch is
-        monotonic if its operand only rises or only falls in time. A comparison changes at most once
-        in this case, so that the number is 1. A function such as `floor` may change any number of
-        times; at most `MOST` of its changes are stored.
-        """
-        return MOST if self.equation.primitive_name in _LEVELS else 1
-
-    @property
-    def storable_changes(self) -> int:
-        """Return how many changes of this switch, at its switching times, can be stored in all.
-
-        The number is for all elements together, such as those of a comparison of arrays.
-        """
-        return (
-            MOST + 2 * NEAR
-            if self.time_dependence == BENT
-            else self.size * self.most_changes_if_monotonic
-        )
-
-    @property
-    def stores_all_changes(self) -> bool:
-        """Return whether all changes of this switch can be stored, however many there are.
-
-        This is so, for example, for a comparison whose operand only rises or only falls in time,
-        because each element then changes at most once.
-        """
-        return self.time_dependence < BENT and self.most_changes_if_monotonic == 1
-
-    @property
-    def primitive_and_line(self) -> str:
-        """Return the name of the primitive of this switch, and the line of code that wrote it.
-
-        The line is one of the user's code, given by its file and its number.
-        """
-        return f"{self.equation.primitive_name}, {self.equation.line_of_code}"
-
-
-class Analysis(NamedTuple):
-    """Hold the switches of a program, and the lines of code whose switches cannot be found.
-
-    A switch is an equation, such as the comparison `t < 1`, whose result jumps or has a kink at
-    times that do not depend on the state.
-    """
-
-    program: Program
-    switches: list[Switch]
-    # Operations with so many kinks that no steps end at these kinks. The times of the kinks are
-    # computed only because they help to find the changes of switches whose operand may rise and
-    # fall in time (`BENT`).
-    kinks: list[Switch]
-    by_state: list[str]  # the lines of code whose result switches at values of the state
-    unseen: list[str]  # the lines of code that may switch at times that cannot be searched for
-
-
-def _inner_programs(params: dict[str, Any]) -> Iterator[tuple[Jaxpr, Sequence[Any]]]:
-    """Yield each program (a `Jaxpr`) among the parameters of an equation, and its constants.
-
-    - `params`: the parameters of an equation of a `Jaxpr`; a `cond`, for example, has one program
-      for each branch.
-    """
-    for value in params.values():
-        for part in value if isinstance(value, list | tuple) else (value,):
-            if isinstance(part, ClosedJaxpr):
-                yield part.jaxpr, part.consts
-            elif isinstance(part, Jaxpr):
-                yield part, ()
-
-
-def _primitive_name(eqn: Any) -> str:
-    """Return the name of an equation's primitive, or "searchsorted" for `jnp.searchsorted`.
-
-    - `eqn`: an equation of a `Jaxpr`, or an `Equation` of this module.
-    """
+def _name(eqn: Any) -> str:
     called = eqn.params.get("name")
-    return "searchsorted" if called == "searchsorted" else eqn.primitive.name
+    return called if called in {"searchsorted", *_SMOOTH} else eqn.primitive.name
 
 
-def _dtypes_of_inputs(eqn: Any) -> list[Any]:
-    """Return the dtypes of the inputs of `eqn`, an equation of a `Jaxpr`.
+def _kind(name: str, kinds: list[int]) -> int:
+    """Return how the result of a primitive depends on the time, from how its operands do."""
+    kind, moving = max(kinds, default=FIXED), sum(k > FIXED for k in kinds)
+    if kind in (FIXED, PIECES, STATEFUL):
+        return kind
+    if name in ("floor", "ceil", "round", "sign"):
+        return PIECES
+    linear = name in _ELEMENTWISE | _SUMS or (
+        name in _PRODUCTS and moving == 1 and (name != "div" or kinds[1] == FIXED)
+    )
+    linear = linear and all(k in (FIXED, kind) for k in kinds)
+    if linear and kind == STRAIGHT:
+        return STRAIGHT
+    rising = name in _RISING or (linear and name not in _SUMS | {"dot_general"})
+    return MONOTONE if moving == 1 and rising and kind < BENT else BENT
 
-    An input without a dtype is left out.
+
+def _bodies(eqn: Any) -> list[Any]:
+    """Return the programs among the parameters of an equation, such as the branches of `cond`."""
+    parts = [p for v in eqn.params.values() for p in (v if isinstance(v, list | tuple) else [v])]
+    return [getattr(p, "jaxpr", p) for p in parts if isinstance(p, ClosedJaxpr | Jaxpr)]
+
+
+def _may_switch(eqn: Any) -> bool:
+    name, to = _name(eqn), eqn.params.get("new_dtype")
+    real = eqn.invars and jnp.issubdtype(eqn.invars[-1].aval.dtype, jnp.floating)
+    inexact = to is not None and jnp.issubdtype(to, jnp.inexact)
+    return bool(real) and name in _FOUND | _UNFOUND and not inexact
+
+
+def _contains_switch(jaxpr: Any, kinks: bool = False) -> bool:
+    return any(
+        (_may_switch(eqn) and (kinks or _name(eqn) not in _KINKS))
+        or any(_contains_switch(body, kinks) for body in _bodies(eqn))
+        for eqn in jaxpr.eqns
+        if _name(eqn) not in _SMOOTH
+    )
+
+
+def _live_equations(
+    jaxpr: Any, results: Iterable[tuple[Any, bool]], roots: Iterable[int] = ()
+) -> tuple[list[Any], set[Any]]:
+    """Return the equations that the wanted `results` and the `roots` need, and their variables.
+
+    A root is the `id` of an equation. Equations with an effect, such as a print, are needed, too.
     """
-    return [atom.aval.dtype for atom in eqn.invars if hasattr(atom.aval, "dtype")]
-
-
-def _is_float(dtype: Any) -> bool:
-    """Return whether `dtype` is a floating-point dtype."""
-    return jnp.issubdtype(dtype, jnp.floating)
-
-
-def _may_jump(name: str, params: dict[str, Any], dtypes: list[Any]) -> bool:
-    """Return whether the result of an equation may jump while its operands change continuously.
-
-    The answer is no if the first operand is a boolean or a whole number, because such an operand
-    never changes continuously.
-
-    - `name`, `params`: the name of the primitive of the equation, such as "lt" for `t < 1`, and its
-      parameters.
-    - `dtypes`: the dtypes of the operands of the equation.
-    """
-    if not dtypes or not _is_float(dtypes[0]):
-        return False
-    if name == "convert_element_type":
-        return not _is_float(params["new_dtype"])
-    return name in COMPARISONS | _LEVELS | _CHOICES | {"sign", "atan2", "searchsorted"}
-
-
-def _may_have_kink(name: str, dtypes: list[Any]) -> bool:
-    """Return whether the result of an equation may have a kink although its operands have none.
-
-    At a kink the slope jumps and the value does not; `abs`, for example, has a kink at 0.
-
-    - `name`: the name of the primitive of the equation, such as "abs".
-    - `dtypes`: the dtypes of the operands of the equation.
-    """
-    return bool(dtypes) and _is_float(dtypes[-1]) and name in KINKS
-
-
-def _contains_switch(jaxpr: Jaxpr, with_kinks: bool = False) -> bool:
-    """Return whether a program, or a program inside it, has an equation whose result may jump.
-
-    The answer is also yes for an equation whose content cannot be read, such as a callback.
-
-    - `jaxpr`: the program.
-    - `with_kinks`: whether the answer is also yes for an equation whose result may have a kink, at
-      which its slope jumps.
-    """
-    for eqn in jaxpr.eqns:
-        name, dtypes = _primitive_name(eqn), _dtypes_of_inputs(eqn)
-        if (
-            _may_jump(name, eqn.params, dtypes)
-            or (with_kinks and _may_have_kink(name, dtypes))
-            or name in _OPAQUE
-        ):
-            return True
-        if any(_contains_switch(body, with_kinks) for body, _ in _inner_programs(eqn.params)):
-            return True
-    return False
-
-
-def flatten_traced_function(traced: ClosedJaxpr) -> Program:
-    """Return a traced function as one flat list of equations, in which calls are written out.
-
-    A call such as `jit` is replaced by the equations of its body. A call such as `cond` cannot be
-    replaced, and stays one equation; the equations of its body follow it in the list, so that
-    switches among them are found.
-
-    An equation on which the result does not depend is left out, unless it has an effect, such as a
-    print.
-
-    - `traced`: the traced function f(t, y, …).
-    """
-    numbers, equations, inner = count(), [], {}
-
-    def enter(
-        jaxpr: Any, consts: Any, inputs: list[Any], around: tuple[tuple[Any, ...], bool],
-        wanted: list[bool],
-    ) -> list[Any]:  # fmt: skip
-        # `around` describes the calls around this program: where they stand, and whether they
-        # belong to a part that declares its jumps. `wanted` says which results are used.
-        scope: dict[Any, Any] = dict(zip(jaxpr.invars, inputs, strict=True))
-        scope |= dict(zip(jaxpr.constvars, consts, strict=True))
-        read = lambda atom: atom if isinstance(atom, Literal) else scope[atom]  # noqa: E731
-        live, used = _live_equations(jaxpr, wanted)
-        for eqn in live:
-            args, name = [read(atom) for atom in eqn.invars], _primitive_name(eqn)
-            sources = (eqn.source_info, *around[0])
-            own = around[1] or DECLARED in str(eqn.source_info.name_stack)
-            if name in _CALLS:
-                ((body, held),) = _inner_programs(eqn.params)
-                asked = [variable in used for variable in eqn.outvars]
-                outputs = enter(body, kept(held), args, (sources, own), asked)
-            else:
-                outputs = [next(numbers) for _ in eqn.outvars]
-                shapes = [variable.aval for variable in eqn.outvars]
-                equation = Equation(
-                    eqn.primitive, eqn.params, args, outputs, _dtypes_of_inputs(eqn), shapes,
-                    sources, own,
-                )  # fmt: skip
-                equations.append(equation)
-                if name in _WHOLE:
-                    for body, held in _inner_programs(eqn.params):
-                        given, every = args[len(args) - len(body.invars) :], [True]
-                        enter(body, kept(held), given, (sources, own), every * len(body.outvars))
-            scope.update(zip(eqn.outvars, outputs, strict=True))
-        return [
-            read(atom) if use else None for atom, use in zip(jaxpr.outvars, wanted, strict=True)
-        ]
-
-    def kept(consts: Any) -> list[int]:
-        names = [next(numbers) for _ in consts]
-        inner.update(zip(names, consts, strict=True))
-        return names
-
-    inputs = [next(numbers) for _ in traced.jaxpr.invars]
-    constants = [next(numbers) for _ in traced.consts]
-    (output,) = enter(traced.jaxpr, constants, inputs, ((), False), [True])
-    return Program(equations, constants, inner, inputs, output)
-
-
-def _live_equations(jaxpr: Jaxpr, wanted: list[bool]) -> tuple[list[Any], set[Any]]:
-    """Return the equations of a program on which its wanted results depend, and their variables.
-
-    Equations with effects, such as a print, are returned, too.
-
-    - `jaxpr`: the program.
-    - `wanted`: for each result of the program, whether it is wanted.
-
-    **Returns** two things: the equations in the order of evaluation; and the set of the variables
-    that the equations, or the caller of the program, read.
-    """
-    results = zip(jaxpr.outvars, wanted, strict=True)
-    used = {atom for atom, use in results if use and not isinstance(atom, Literal)}
-    live = []
+    used = {atom for atom, wanted in results if wanted and not isinstance(atom, Literal)}
+    live, roots = [], set(roots)
     for eqn in reversed(jaxpr.eqns):
-        if eqn.effects or any(variable in used for variable in eqn.outvars):
+        if eqn.effects or id(eqn) in roots or any(v in used for v in eqn.outvars):
             live.append(eqn)
             used.update(atom for atom in eqn.invars if not isinstance(atom, Literal))
     return live[::-1], used
 
 
-def depends_on_time(traced_field: ClosedJaxpr) -> bool:
-    """Return whether the result of a traced field f(t, y, …) depends on the time t.
+def _asks_for_nan(eqn: Any) -> bool:
+    same = _name(eqn) in _COMPARISONS and eqn.invars[0] is eqn.invars[1]
+    return same or _name(eqn) == "is_finite"
 
-    A field may compute a number from the time that it does not use, as a uniformly turning frame
-    computes its rotation matrix.
+
+def _height_and_value(eqn: Any, inputs: Any, result: Array) -> tuple[Array, Array]:
+    """Return of each element what passes zero or whole numbers, and what jumps there."""
+    name, x = _name(eqn), inputs[0]
+    if _asks_for_nan(eqn):
+        height, value = x, result
+    elif name in _COMPARISONS:
+        height, value = x - inputs[1], result
+    elif name in ("max", "min"):
+        height, value = x - inputs[1], x > inputs[1]
+    elif name == "clamp":
+        height = jnp.stack(jnp.broadcast_arrays(inputs[1] - x, inputs[1] - inputs[2]))
+        value = height > 0
+    elif name == "searchsorted":  # of each edge and each time, whether the edge is passed
+        height = inputs[1][..., None] - x
+        value = result[..., None] > np.arange(x.shape[0], dtype=result.dtype)
+    elif name == "rem":
+        height, value = x / inputs[1], jnp.trunc(x / inputs[1])
+    elif name == "atan2":
+        height, value = x, (x < 0) & (inputs[1] < 0)
+    else:
+        height, value = x, x > 0 if name == "abs" else result
+    height, value = jnp.broadcast_arrays(height, value)
+    return height, value
+
+
+class Switch(NamedTuple):
+    """Hold an equation whose result jumps, or has a kink, at times independent of the state."""
+
+    path: tuple[Any, ...]  # the equations of the calls around it, the outermost first, and its own
+    kind: int  # how its height depends on the time
+    size: int
+    line: str
+
+    @property
+    def name_and_line(self) -> str:
+        return f"{_name(self.path[-1])}, {self.line}"
+
+    @property
+    def leaps(self) -> bool:
+        """Return whether an element may change many times while its height only rises."""
+        return _name(self.path[-1]) in _LEVELS and self.path[-1].outvars[0].aval.dtype != bool
+
+    @property
+    def asks_for_nan(self) -> bool:
+        return _asks_for_nan(self.path[-1])
+
+    def result(self, values: Array, inputs: Any, result: Array) -> Array:
+        """Return the result of the equation, from the values (m,) of its elements."""
+        name = _name(self.path[-1])
+        if name in _KEPT:
+            return result
+        if name == "searchsorted":
+            return jnp.sum(values.reshape(*result.shape, -1), -1).astype(result.dtype)
+        values = values.reshape(result.shape)
+        if name == "rem":
+            return inputs[0] - inputs[1] * values.astype(result.dtype)
+        return values > 0.5 if result.dtype == bool else values.astype(result.dtype)
+
+
+# What the interpreter calls at each equation that switches by the time: `meet(path, inputs, result,
+# kind of the height)` returns the result to go on with.
+Meet = Callable[[tuple[Any, ...], Any, Array, int], Array]
+
+
+class Interpreter(NamedTuple):
+    """Evaluate a traced function, and call `meet` at what switches by the time.
+
+    Each value goes with how it depends on the time. Unless `whole`, nothing that depends on the
+    state is evaluated, and its value is `None`.
     """
-    program = flatten_traced_function(traced_field)
-    time = program.inputs[0]
-    return program.output == time or any(time in each.inputs for each in program.equations)
 
+    meet: Meet
+    whole: bool
+    hidden: Callable[[tuple[Any, ...]], Any] = lambda path: None  # told what cannot be searched
+    around: tuple[Any, ...] = ()  # the equations of the calls around, the outermost first
 
-def time_dependence_of(equation: Equation, operand_dependences: list[int]) -> int:
-    """Return how the result of an equation depends on the time.
+    def run(self, jaxpr: Any, consts: Any, args: Any, asked: Any = None) -> list[tuple[Any, int]]:
+        """Return the results, of which only those that are `asked` for are computed."""
+        known = dict(zip(jaxpr.constvars, ((c, FIXED) for c in consts), strict=True))
+        known |= dict(zip(jaxpr.invars, args, strict=True))
 
-    The result is `CONSTANT`, `PIECES` (constant except for jumps), `STRAIGHT` (linear), `MONOTONE`
-    (only rising or only falling), or `BENT` (in any other way).
+        def read(atom: Any) -> tuple[Any, int]:
+            return (
+                (atom.val, FIXED) if isinstance(atom, Literal) else known.get(atom, (None, FIXED))
+            )
 
-    - `equation`: the equation.
-    - `operand_dependences`: how each operand depends on the time, as one of the same five values.
-    """
-    operands = operand_dependences
-    timed, name = [d for d in operands if d != CONSTANT], equation.primitive_name
-    if not timed:
-        return CONSTANT
-    if max(timed) == PIECES:
-        return PIECES
-    if _may_jump(name, equation.params, equation.dtypes):
-        return BENT if name in _SAWS else PIECES
-    if name in ("gather", "dynamic_slice") and max(operands[1:], default=CONSTANT) > CONSTANT:
-        return BENT
-    alone = len(timed) == 1
-    if name in _LINEAR:
-        return max(timed) if alone or set(timed) == {STRAIGHT} else BENT
-    if alone and (name in _PRODUCTS or (name == "div" and operands[1] == CONSTANT)):
-        return timed[0]
-    if alone and name in _MONOTONE | {"max", "min"} and timed[0] <= MONOTONE:
-        return MONOTONE
-    if alone and name == "clamp" and operands[1] in (STRAIGHT, MONOTONE):
-        return MONOTONE
-    if name == "select_n" and operands[0] == CONSTANT and len(set(timed)) == 1:
-        return timed[0]
-    return BENT
+        asked = asked or [True] * len(jaxpr.outvars)
+        live, used = _live_equations(jaxpr, zip(jaxpr.outvars, asked, strict=True))
+        for eqn in live:
+            wanted = [variable in used for variable in eqn.outvars]
+            found = self.equation(eqn, [read(atom) for atom in eqn.invars], wanted)
+            known.update(zip(eqn.outvars, found, strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
 
+    def equation(self, eqn: Any, args: list[Any], wanted: list[bool]) -> list[tuple[Any, int]]:
+        name, inputs, kinds = _name(eqn), [a for a, _ in args], [k for _, k in args]
+        kind, moves = _kind(name, kinds), any(STRAIGHT <= k <= BENT for k in kinds)
+        inside = self._replace(around=(*self.around, eqn))
+        if name == "cond" and any(PIECES <= k <= BENT for k in kinds):
+            return inside.cond(eqn, args)
+        of_body: list[tuple[Any, int]] = []
+        if name in _CALLS | _RULES and any(k > FIXED for k in kinds):
+            body = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
+            body = body if isinstance(body, ClosedJaxpr) else ClosedJaxpr(body, ())
+            of_body = inside.run(body.jaxpr, body.consts, args, wanted)
+            # A `custom_jvp` is called as it stands, so that its rule is kept.
+            if name in _CALLS or not self.whole:
+                return of_body
+        elif moves and name not in _FOUND | _SMOOTH:
+            if (name in _UNFOUND and _may_switch(eqn)) or any(map(_contains_switch, _bodies(eqn))):
+                self.hidden(inside.around)
+        if (kind == STATEFUL or eqn.effects) and not self.whole:
+            return [(None, STATEFUL)] * len(eqn.outvars)
+        out = eqn.primitive.bind(*inputs, **eqn.primitive.get_bind_params(eqn.params))
+        out = list(out) if eqn.primitive.multiple_results else [out]
+        timed = moves and kind < STATEFUL
+        if timed and name in _FOUND and _may_switch(eqn):
+            height = BENT if name in ("clamp", "atan2") else _kind("sub", kinds)
+            height = _kind("div", kinds) if name == "rem" else height
+            out = [self.meet(inside.around, inputs, out[0], height)]
+        whole = lambda x: timed and not jnp.issubdtype(jnp.result_type(x), jnp.inexact)  # noqa: E731
+        kinds = [k for _, k in of_body] or [PIECES if whole(x) else kind for x in out]
+        return list(zip(out, kinds, strict=True))
 
-def find_switches(traced_field: ClosedJaxpr) -> Analysis | None:
-    """Return the switches of a traced field f(t, y, …), or `None` if nothing in it can switch.
+    def cond(self, eqn: Any, args: list[Any]) -> list[tuple[Any, int]]:
+        """Enter the branches: in the whole field by `lax.switch`, else all, to choose from them."""
+        (index, by), *args = args
+        kinds: list[list[int]] = []
 
-    A switch is an equation, such as the comparison `t < 1`, whose result jumps or has a kink at
-    times that do not depend on the state. This function finds the equations; the module
-    `switching_times` finds the times.
+        def branch(body: Any) -> Callable[..., list[Any]]:
+            def enter(*inputs: Any) -> list[Any]:
+                given = [(x, k) for x, (_, k) in zip(inputs, args, strict=True)]
+                out = self.run(body.jaxpr, body.consts, given)
+                kinds.append([k for _, k in out])
+                return [x for x, _ in out]
 
-    - `traced_field`: the field after tracing, whose first two arguments are the time and the state.
-    """
-    if not _contains_switch(traced_field.jaxpr, with_kinks=True):
-        return None
-    program = flatten_traced_function(traced_field)
-    degrees, of_state = {program.inputs[0]: STRAIGHT}, set(program.inputs[1:])
-    switches, kinks, by_state, unseen = [], [], [], []
-    for equation in program.equations:
-        inputs = [i for i in equation.inputs if not isinstance(i, Literal)]
-        look = lambda i: CONSTANT if isinstance(i, Literal) else degrees.get(i, CONSTANT)  # noqa: E731
-        operands = [look(i) for i in equation.inputs]
-        stateful = any(i in of_state for i in inputs)
-        degrees.update(dict.fromkeys(equation.outputs, time_dependence_of(equation, operands)))
-        if stateful:
-            of_state.update(equation.outputs)
-        # If all operands are constant except for jumps, the result changes only at these jumps.
-        # Their times are searched for at the equations that cause them.
-        timed = max(operands, default=CONSTANT) > PIECES
-        if (
-            not (timed or stateful)
-            or equation.declared
-            or not _may_switch(equation)
-            or _is_of_this_package(equation)
-        ):
-            continue
-        where = f"{equation.primitive_name}, {equation.line_of_code}"
-        jumps = _may_jump(equation.primitive_name, equation.params, equation.dtypes)
-        if jumps and stateful:
-            by_state.append(where)
-        elif _may_hide_switches(equation):
-            unseen += [where] * timed
-        elif timed and not stateful:
-            switch = _switch_of(program, equation, operands, jumps)
-            if switch.size <= (_FEW if jumps else _FEW_KINKS):
-                switches.append(switch)
-            elif switch.size <= _FEW:
-                kinks.append(switch)
-    bent = any(switch.time_dependence == BENT for switch in switches)
-    return Analysis(program, switches, kinks if bent else [], by_state, unseen)
+            return enter
 
-
-def _is_of_this_package(equation: Equation) -> bool:
-    """Return whether this package, and not the user's code, wrote the equation `equation`.
-
-    The torque laws of this package state the times of their jumps themselves, so that these times
-    need not be searched for in their equations.
-    """
-    return equation.line_of_code.startswith(_PACKAGE)
-
-
-def _may_switch(equation: Equation) -> bool:
-    """Return whether the result of the equation `equation` may jump or have a kink.
-
-    At a kink the slope jumps and the value does not. The answer is also yes for an equation that
-    contains a program, such as `cond`, because there may be a jump inside this program, and for an
-    equation whose content cannot be read, such as a callback.
-    """
-    name = equation.primitive_name
-    jumps = _may_jump(name, equation.params, equation.dtypes) or _may_have_kink(
-        name, equation.dtypes
-    )
-    return jumps or name in _OPAQUE or any(True for _ in _inner_programs(equation.params))
-
-
-def _may_hide_switches(equation: Equation) -> bool:
-    """Return whether the result of an equation may jump at times that cannot be searched for.
-
-    Examples of such equations are `argmax` of an array, a callback, and a loop that contains a
-    comparison.
-    """
-    if equation.primitive_name in _CHOICES | {"atan2"}:
-        return True
-    if equation.primitive_name in _WHOLE | {"searchsorted"}:
-        return False
-    return equation.primitive_name in _OPAQUE or any(
-        _contains_switch(body) for body, _ in _inner_programs(equation.params)
-    )
-
-
-def _switch_of(
-    program: Program, equation: Equation, operand_dependences: list[int], jumps: bool
-) -> Switch:
-    """Return an equation as a `Switch`, which says how the result of the equation changes in time.
-
-    - `program`: the program that contains the equation.
-    - `equation`: the equation, whose result depends on the time but not on the state.
-    - `operand_dependences`: how each operand depends on the time: `CONSTANT` (not at all), `PIECES`
-      (constant except for jumps), `STRAIGHT` (linear), `MONOTONE` (only rising or only falling) or
-      `BENT` (in any other way).
-    - `jumps`: whether the result jumps; else it has a kink, at which its slope jumps.
-    """
-    name = equation.primitive_name
-    compared = operand_dependences[: 1 if name in _LEVELS - {"rem"} else 3]
-    timed = [d for d in compared if d != CONSTANT]
-    steady = len(timed) == 1 or set(timed) == {STRAIGHT}
-    steady = steady and not (name == "rem" and compared[1] != CONSTANT)
-    steady = steady and not (name == "searchsorted" and compared[0] != CONSTANT)
-    shape = equation.shapes[0].shape
-    size = int(np.prod(shape)) * (2 if name == "clamp" else 1)
-    if name == "searchsorted":
-        # A `searchsorted` for one time among sorted edges is a switch. A `searchsorted` for many
-        # times is treated as a table, which is no switch: its size is set to one that is too large
-        # for a switch.
-        size = _number_of_searchsorted_edges(equation) if shape == () else _FEW + 1
-    return Switch(equation, max(timed) if steady else BENT, size, jumps)
-
-
-def _number_of_searchsorted_edges(equation: Equation) -> int:
-    """Return the length of the sorted array (the edges) in which a call of `searchsorted` searches.
-
-    - `equation`: the equation that calls `searchsorted`.
-    """
-    body: Any
-    ((body, _),) = _inner_programs(equation.params)
-    return int(np.prod(body.invars[0].aval.shape))
-
-
-def evaluator(
-    program: Program, wanted: list[int | Literal], replaced: dict[int, Any] | None = None
-) -> Callable[..., list[Any]]:
-    """Return a function that evaluates the `wanted` values of a program, and nothing else.
-
-    - `program`: the program, in which each value is identified by an integer.
-    - `wanted`: the values to be returned: integers, or literals.
-    - `replaced`: a dict of equations that are not evaluated, or `None` for none. The key is the
-      integer of the output of the equation. The value is an object that computes this output: its
-      method `result(read, inputs)` returns the output, where `read(i)` is the value with the
-      integer i and `inputs` are the arguments of the program. Its member `needed_inputs` lists the
-      inputs of the equation that `result` reads.
-
-    **Returns** a function `(constants, *inputs)` that returns the list of the wanted values. Its
-    arguments are the constants of the program and the arguments of the program.
-    """
-    replaced = replaced or {}
-    needed, equations = {i for i in wanted if not isinstance(i, Literal)}, []
-    for equation in reversed(program.equations):
-        if any(output in needed for output in equation.outputs):
-            equations.append(equation)
-            own = replaced.get(equation.outputs[0])
-            inputs = equation.inputs if own is None else own.needed_inputs
-            needed.update(i for i in inputs if not isinstance(i, Literal))
-
-    def evaluate(constants: Arrays, *inputs: Any) -> list[Any]:
-        known = dict(zip(program.constants, constants, strict=True)) | program.inner
-        known |= dict(zip(program.inputs, inputs, strict=False))
-        read = lambda i: i.val if isinstance(i, Literal) else known[i]  # noqa: E731
-        for equation in reversed(equations):
-            if equation.outputs[0] in replaced:
-                known[equation.outputs[0]] = replaced[equation.outputs[0]].result(read, inputs)
+        branches, inputs = [branch(body) for body in eqn.params["branches"]], [x for x, _ in args]
+        results = lax.switch(index, branches, *inputs) if self.whole else None
+        each = [] if self.whole else [enter(*inputs) for enter in branches]
+        found = [_kind("select_n", [by, *k]) for k in zip(*kinds, strict=True)]
+        if results is not None:
+            return list(zip(results, found, strict=True))
+        chosen = []
+        for kind, *xs in zip(found, *each, strict=True):
+            if kind == STATEFUL:
+                chosen.append((None, kind))
                 continue
-            params = equation.primitive.get_bind_params(equation.params)
-            out = equation.primitive.bind(*(read(i) for i in equation.inputs), **params)
-            out = out if equation.primitive.multiple_results else [out]
-            known.update(zip(equation.outputs, out, strict=True))
-        return [read(i) for i in wanted]
+            xs = [jnp.asarray(x) for x in xs]
+            which = jnp.clip(index, 0, len(xs) - 1).astype(jnp.int32)
+            chosen.append((lax.select_n(jnp.broadcast_to(which, xs[0].shape), *xs), kind))
+        return chosen
 
-    return evaluate
+
+def _searched_line(path: tuple[Any, ...]) -> str:
+    """Return the line of code of an equation, "" for one that is not to be searched.
+
+    The line is that of the outermost call, since JAX traces its own functions only once. Not
+    searched are laws that declare their jumps, and the lines of this package, which compares to
+    choose between equal formulas, but for its tables. Within the derivative rule of a call, JAX
+    gives every equation the line of that call: a line of this package therefore counts only if
+    `trace_program` is among the frames.
+    """
+    if any(DECLARED in str(eqn.source_info.name_stack) for eqn in path):
+        return ""
+    frames = summarize(path[0].source_info, num_frames=1000).splitlines()
+    frames = [frame for frame in frames if not frame.startswith(_EQUINOX)]
+    line = frames[-1] if frames else "a line that is not known"
+    ours = line.startswith(_HOME) and not line.startswith(_SCHEDULES)
+    return "" if ours and any("trace_program" in frame for frame in frames) else line
+
+
+class Switches(NamedTuple):
+    """Hold a traced field f(t, y, …) of one result, and its switches, of m elements in all."""
+
+    traced: ClosedJaxpr
+    timed: Jaxpr  # the equations that the switches need
+    switches: list[Switch]
+    unfound: list[str]  # the primitives, and their lines, that may switch at times not found
+
+    def of_elements(self, fact: Callable[[Switch], Any]) -> np.ndarray:
+        """Return (m,) a fact of the switch of each element."""
+        return np.array([fact(s) for s in self.switches for _ in range(s.size)], int)
+
+    def heights_and_values(self, consts: Arrays, t: Array) -> tuple[Array, Array]:
+        """Return of each element what passes zero or whole numbers (m,), and what jumps (m,)."""
+        rows = {}
+
+        def meet(path: Any, inputs: Any, result: Array, kind: int) -> Array:
+            pair = _height_and_value(path[-1], inputs, result)
+            rows[_ids(path)] = [a.ravel().astype(t.dtype) for a in pair]
+            return result
+
+        args = [(t, STRAIGHT), *((None, STATEFUL) for _ in self.timed.invars[1:])]
+        Interpreter(meet, False).run(self.timed, consts, args)
+        height, value = zip(*(rows[_ids(s.path)] for s in self.switches), strict=True)
+        return jnp.concatenate(height), jnp.concatenate(value)
+
+    def field(self, values: Array, over: Array, consts: Arrays, t: Array, *rest: Any) -> Any:
+        """Return the field, in which the switches have the `values` (m,) unless `over`."""
+        parts = np.cumsum([s.size for s in self.switches])[:-1]
+        own = dict(
+            zip(
+                (_ids(s.path) for s in self.switches),
+                zip(self.switches, jnp.split(values, parts), strict=True),
+                strict=True,
+            )
+        )
+
+        def meet(path: Any, inputs: Any, result: Array, kind: int) -> Array:
+            if _ids(path) not in own:
+                return result
+            switch, values = own[_ids(path)]
+            return jnp.where(over, result, switch.result(values, inputs, result))
+
+        args = [(t, STRAIGHT), *((leaf, STATEFUL) for leaf in rest)]
+        ((out, _),) = Interpreter(meet, True).run(self.traced.jaxpr, consts, args)
+        return out
+
+
+def _ids(path: tuple[Any, ...]) -> tuple[int, ...]:
+    return tuple(map(id, path))
+
+
+def find_switches(traced: ClosedJaxpr) -> Switches:
+    """Return the switches of a traced field f(t, y, …) of one result.
+
+    The module `switching_times` finds the times at which they change.
+    """
+    jaxpr, switches, unfound = traced.jaxpr, [], []
+
+    def hidden(path: tuple[Any, ...], more: str = "") -> None:
+        # An interpolation in a long table has kinks, no jumps.
+        smooth = any(eqn.params.get("name") == "_interp" for eqn in path)
+        if not (more and smooth) and (line := _searched_line(path)):
+            unfound.append(f"{_name(path[-1])}{more}, {line}")
+
+    def meet(path: tuple[Any, ...], inputs: Any, result: Array, kind: int) -> Array:
+        kink, size = _name(path[-1]) in _KINKS, _height_and_value(path[-1], inputs, result)[0].size
+        if size > (FEW_KINKS if kink else MOST):
+            if not kink:
+                hidden(path, f" of {size} elements")
+        elif line := _searched_line(path):
+            switches.append(Switch(path, kind, size, line))
+        return result
+
+    def look(t: Array) -> None:
+        given = [(t, STRAIGHT), *((None, STATEFUL) for _ in jaxpr.invars[1:])]
+        Interpreter(meet, False, hidden).run(jaxpr, traced.consts, given)
+
+    if _contains_switch(jaxpr, kinks=True):
+        jax.eval_shape(look, traced.in_avals[0])
+    timed, _ = _live_equations(jaxpr, (), [id(s.path[0]) for s in switches])
+    lean = jaxpr.replace(eqns=timed, outvars=[v for eqn in timed for v in eqn.outvars])
+    return Switches(traced, lean, switches, list(dict.fromkeys(unfound)))
+
+
+def depends_on_time(function: Callable[[Array], Array], t: Array) -> bool:
+    """Return whether the result of a function of the time alone depends on the time."""
+    traced, kinds = jax.make_jaxpr(function)(t), []
+
+    def look(t: Array) -> None:
+        keep = Interpreter(lambda path, inputs, result, kind: result, True)
+        kinds.extend(k for _, k in keep.run(traced.jaxpr, traced.consts, [(t, STRAIGHT)]))
+
+    jax.eval_shape(look, t)
+    return max(kinds) > FIXED

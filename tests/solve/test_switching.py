@@ -185,8 +185,8 @@ def test_second_derivatives(power):
 def test_continuous_laws_have_no_switches(law, ends):
     program = trace_program(lambda t, y: law(t, y[2]) * y, jnp.asarray(0.0), jnp.asarray(AXIS))
     analysis = find_switches(program.closed)
-    assert analysis is None or not analysis.unseen
-    assert (0 if analysis is None else len(analysis.switches)) == ends
+    assert not analysis.unfound
+    assert len(analysis.switches) == ends
 
 
 def frame_of_a_tumbling_body():
@@ -213,13 +213,13 @@ def test_a_frame_has_no_switches(frame, depends):
     flat = lambda t, y: ravel_pytree(field(t, rj.Point(y[:3], y[3:]), None))[0]
     traced = trace_program(flat, jnp.asarray(0.0), jnp.ones(6)).closed
     assert not find_switches(traced).switches
-    assert depends_on_time(traced) == depends
+    assert depends_on_time(lambda t: flat(t, jnp.ones(6)), jnp.asarray(0.0)) == depends
 
 
 def test_a_switch_within_a_function_of_jax_has_the_line_that_calls_it():
     traced = trace_program(lambda t, y: jnp.clip(t, 0.5, y), jnp.asarray(0.0), jnp.asarray(1.0))
     (switch,) = find_switches(traced.closed).switches
-    assert "test_switching.py" in switch.equation.line_of_code
+    assert "test_switching.py" in switch.line
 
 
 @pytest.mark.parametrize(
@@ -238,8 +238,10 @@ def test_what_cannot_be_looked_for_is_said(value):
 
 
 def test_more_switches_than_places_are_said():
-    with pytest.warns(UserWarning, match=r"(?s)more than 64 times.*test_switching\.py.*jump_times"):
-        impulse(lambda t, w: jnp.floor(t / 0.011), atol=1e-3, rtol=1e-3)
+    with pytest.warns(
+        UserWarning, match=r"(?s)more than 256 times.*test_switching\.py.*jump_times"
+    ):
+        impulse(lambda t, w: jnp.floor(t / 0.003), atol=1e-3, rtol=1e-3)
 
 
 def pair(p, kinds, ts=SHORT):
