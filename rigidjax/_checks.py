@@ -129,6 +129,20 @@ def numeric_array(value: object, name: str, unit: str = "") -> Array:
     return array
 
 
+def differentiable_array(value: object, name: str) -> Array:
+    """Return `value` as a float32 or float64 array of any shape, of which a derivative is to be
+    taken. **Raises:** as `numeric_array`, and `TypeError` for whole numbers and truth values, whose
+    derivative would be zero; the text `name` is for the message.
+    """
+    dtype = jnp.result_type(value) if isinstance(value, int | Array | np.ndarray) else None
+    if dtype is not None and not jnp.issubdtype(dtype, jnp.inexact):
+        raise TypeError(
+            f"{name}: wanted numbers that vary smoothly, got {dtype}: a whole number or a truth "
+            "value has no derivative, from which an interval is made"
+        )
+    return numeric_array(value, name)
+
+
 def data_and_mask(value: object) -> tuple[Any, np.ndarray | None]:
     """Return two things: the data of a masked array; and its mask, true where an entry has no
     value.

@@ -139,6 +139,12 @@ def verdict(fit: Fit) -> str:
             lines.append(f"time stamps of the {type(sensor).__name__} scatter by {size} ms")
     lines += [f"- {line}" for line in fit.identifiability]
     lines += [fit.place] if fit.place else []
+    if fit.x.dtype == np.float32:
+        lines.append(
+            "A fit is better in float64: this one was computed in float32, with seven digits. "
+            "jax.config.update('jax_enable_x64', True) at the start of the program, before any "
+            "array is made, gives float64."
+        )
     return "\n".join(lines)
 
 

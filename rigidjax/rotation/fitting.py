@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3Like
+from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.kernels import left_jacobian_inverse, matrix_to_quaternion
 from rigidjax.rotation.linalg3 import (
@@ -37,9 +37,8 @@ from rigidjax.rotation.validation import (
     require_unit_quaternion,
 )
 
-# `wahba` raises each positive weight to at least this fraction of the largest weight, in its first
-# estimate only.
-_LIGHT = 1e-3
+# Newton's method of `wahba` takes three to six steps where the directions fix the rotation well.
+_MOST_STEPS = 20
 
 
 def project(matrix: Mat3Like) -> Mat3:
@@ -48,8 +47,8 @@ def project(matrix: Mat3Like) -> Mat3:
 
     **Arguments:** `matrix` (3, 3), det > 0. **Returns:** (3, 3) with RᵀR = 1 to round-off.
     **Raises:** `ValueError` if a known matrix is left-handed (no rotation is nearest to a mirror
-    image), singular, or not finite. Traced values are not checked: under `jit`, test det > 0 in
-    your own program.
+    image), singular to round-off, or not finite. Traced values are not checked: under `jit`, test
+    det > 0 in your own program.
 
     >>> project(2.0 * jnp.eye(3)).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -59,12 +58,17 @@ def project(matrix: Mat3Like) -> Mat3:
         _checks.require_finite(matrix, "matrix")
         require_nonzero_and_finite(matrix.reshape(9), "matrix")
         size = np.max(np.abs(np.asarray(matrix)))
+        scaled = np.asarray(matrix) / size
         # The determinant is that of the matrix divided by its largest entry: without the division
         # the determinant may overflow.
-        det = np.linalg.det(np.asarray(matrix) / size)
+        det, singular = np.linalg.det(scaled), np.linalg.svd(scaled)[1]
         if det <= 0:
             words = f"left-handed frame or singular, det = {det:.3g}; wanted det > 0, without which"
             raise ValueError(f"matrix: {words} no rotation is nearest")
+        # A turn about the longest axis then changes the distance by less than its round-off.
+        if singular[1] + singular[2] < float(jnp.finfo(matrix.dtype).eps) ** 0.5 * singular[0]:
+            words = "all but singular: many rotations are equally near to round-off"
+            raise ValueError(f"matrix: {words}; its singular values are {singular * size}")
     return nearest_rotation(matrix)
 
 
@@ -82,7 +86,8 @@ def wahba(
 
     **Raises:** an error, also under `jit`, if the directions do not determine the rotation: if
     there are fewer than two, or if all are parallel to within 5e-4 rad (float32: 4°), where half
-    the digits would be lost; `ValueError` for known NaN, and for directions that are all zero.
+    the digits would be lost, or if they contradict each other so that two rotations fit about
+    equally well; `ValueError` for known NaN, and for directions that are all zero.
 
     >>> wahba(jnp.eye(3)[:2], jnp.eye(3)[:2]).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -95,19 +100,7 @@ def wahba(
     w, world, body = (scale_to_order_one(x) for x in (w, world, body))
     words = "wahba: these directions do not fix the attitude; two that are not parallel are needed"
     heavy, those, these = lax.stop_gradient((w, world, body))
-    # The first estimate comes from one sum over all directions, in which a direction of small
-    # weight would lose its digits beside one of large weight: here small weights are raised.
-    closer = jnp.where(heavy > 0, jnp.maximum(heavy, _LIGHT * jnp.max(heavy)), 0)
-    try:
-        best = nearest_rotation(_weighted_outer_products(closer, those, these))
-        for _ in range(4):
-            best = _newton_step_of_wahba(best, heavy, those, these)
-        # Only these last two Newton steps are differentiated: after one step the first derivatives
-        # are right, after two steps the second derivatives, too.
-        for _ in range(2):
-            best = _newton_step_of_wahba(best, w, world, body)
-    except ValueError:
-        raise ValueError(words) from None
+    best, last = _newton_of_wahba(w, world, body)
     # The determinant `firmness` in the loop below is (σ1 + σ2)(σ2 + σ3)(σ3 + σ1) with the singular
     # values σ of b, a sum of products of directions; σ3 has the sign of det b. The determinant is 0
     # if the directions leave the turn about some axis free.
@@ -117,13 +110,91 @@ def wahba(
     # weights. They use the identity, the best rotation from these directions to themselves; the
     # third row tests the weighted pairs, which `best` fits.
     for turn, b, least in (
-        (one, _weighted_outer_products(seen, those, those), 4 * np.sqrt(eps)),
-        (one, _weighted_outer_products(seen, these, these), 4 * np.sqrt(eps)),
+        (one, _weighted_outer_products(seen, those, those), 4 * eps**0.5),
+        (one, _weighted_outer_products(seen, these, these), 4 * eps**0.5),
         (lax.stop_gradient(best), _weighted_outer_products(heavy, those, these), 64 * eps),
     ):
         firmness = determinant(_curvature_of_rotation_fit(turn, b / jnp.sqrt((b * b).sum())))
         loose = loose | ~(firmness > least)
-    return _checks.error_if(best, loose, words)
+    best = _checks.error_if(best, loose, words)
+    words = (
+        f"wahba: Newton's method did not arrive in {_MOST_STEPS} steps: the directions contradict "
+    )
+    words += (
+        "each other so that two attitudes fit about equally well; look at them and their weights"
+    )
+    return _checks.error_if(best, ~(last <= eps**0.5), words)
+
+
+# `_newton_of_wahba` is compiled once: outside of `jit` its loop would be compiled at each call.
+@partial(jax.jit, inline=True)
+def _newton_of_wahba(
+    weights: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
+) -> tuple[Mat3, Scalar]:
+    """Return the rotation matrix (3, 3) that solves Wahba's problem, and the size of the last step
+    of the search, rad, which is small if Newton's method has arrived.
+    """
+    fixed = lax.stop_gradient((weights, world, body))
+
+    def step(state: tuple[Array, Mat3, Scalar]) -> tuple[Array, Mat3, Scalar]:
+        count, rotation, _ = state
+        turn = _newton_turn_of_wahba(rotation, *fixed)
+        rotation = product(quaternion.to_matrix(quaternion.exp(turn)), rotation)
+        return count + 1, rotation, jnp.max(jnp.abs(turn))
+
+    # A step smaller than this leaves an error of round-off, as Newton's method squares errors.
+    least = float(jnp.finfo(weights.dtype).eps) ** 0.5
+    begin = jnp.asarray(0), _first_estimate_of_wahba(*fixed), jnp.ones((), weights.dtype)
+    _, best, last = lax.while_loop(lambda s: ~(s[2] <= least) & (s[0] < _MOST_STEPS), step, begin)
+    # Only these last two Newton steps are differentiated: after one step the first derivatives
+    # are right, after two steps the second derivatives, too.
+    for _ in range(2):
+        turn = _newton_turn_of_wahba(best, weights, world, body)
+        best = product(quaternion.to_matrix(quaternion.exp(turn)), best)
+    return best, last
+
+
+def _first_estimate_of_wahba(
+    weights: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
+) -> Mat3:
+    """Return the better of two rotations near the solution of Wahba's problem.
+
+    The first one, from one sum over all pairs, loses the digits of light pairs beside a heavy one.
+    The second one is the limit of an infinite weight of the heaviest pair: it fits this pair
+    exactly, and the others by the turn about its direction.
+    """
+    size = weights * jnp.sqrt((world * world).sum(-1) * (body * body).sum(-1))
+    heaviest = jnp.argmax(size)
+    axis = world[heaviest] / jnp.sqrt(dot(world[heaviest], world[heaviest]))
+    aligned = align(body[heaviest], axis)
+    moved = (aligned[None] * body[:, None, :]).sum(-1)
+    light = jnp.where(jnp.arange(size.size) == heaviest, 0, weights)
+    along, beside = ((x * axis[None]).sum(-1) for x in (world, moved))
+    across = (world * moved).sum(-1) - along * beside
+    around = (jax.vmap(cross)(moved, world) * axis[None]).sum(-1)
+    angle = jnp.arctan2((light * around).sum(), (light * across).sum())
+    limit = product(quaternion.to_matrix(quaternion.exp(angle * axis)), aligned)
+    both = nearest_rotation(_weighted_outer_products(weights, world, body)), limit
+    misfits = []
+    for rotation in both:
+        _, ratio, apart = _apart_from_world(rotation, world, body)
+        misfits.append((weights * (apart * apart).sum(-1) / jnp.where(ratio > 0, ratio, 1)).sum())
+    return jnp.where(misfits[1] < misfits[0], *reversed(both))
+
+
+def _apart_from_world(
+    rotation: Mat3, world: Float[Array, "n 3"], body: Float[Array, "n 3"]
+) -> tuple[Float[Array, "n 3"], Float[Array, "n"], Float[Array, "n 3"]]:
+    """Return the turned directions M bᵢ (n, 3), their lengths over those of aᵢ (n,), and M bᵢ minus
+    aᵢ times this ratio (n, 3): small numbers where M fits, so that their round-off is small, too.
+    """
+    moved = (rotation[None] * body[:, None, :]).sum(-1)
+    # The derivative of the ratio of the lengths makes the derivative of the difference small, too,
+    # if the length of a direction with a large weight changes.
+    squares = [(x * x).sum(-1) for x in (moved, world)]
+    lengths = [jnp.sqrt(jnp.where(square > 0, square, 1)) for square in squares]
+    ratio = lengths[0] / lengths[1]
+    return moved, ratio, moved - ratio[:, None] * world
 
 
 def _weighted_outer_products(
@@ -139,39 +210,23 @@ def _weighted_outer_products(
     return (weights[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
 
 
-def _newton_step_of_wahba(
+def _newton_turn_of_wahba(
     rotation: Mat3,
     weights: Float[Array, "n"],
     world: Float[Array, "n 3"],
     body: Float[Array, "n 3"],
-) -> Mat3:
-    """Return the rotation matrix M (3, 3), body → world, after one step of Newton's method for
-    Wahba's problem: to find the M with the largest Σ wᵢ aᵢ · M bᵢ, the best fit to n pairs of
-    directions aᵢ and bᵢ with the weights wᵢ.
+) -> Vec3:
+    """Return one step of Newton's method for Wahba's problem, a rotation vector (3,) in the world
+    frame: to find the M with the largest Σ wᵢ aᵢ · M bᵢ, from the M given as `rotation`.
 
-    The cross product of aᵢ and M bᵢ is computed from the small difference of these two vectors, so
-    that its rounding error is small, too. Otherwise the rounding of a direction with a large weight
-    would turn the body about this direction.
-
-    - `rotation`: (3, 3), the matrix M before the step
-    - `weights`: w (n,)
-    - `world`: a (n, 3), each direction in the world frame
-    - `body`: b (n, 3), the same direction in the body frame
+    The cross product of aᵢ and M bᵢ is computed from the small difference of these two vectors:
+    otherwise the rounding of a direction with a large weight would turn the body about it.
     """
-    moved = (rotation[None] * body[:, None, :]).sum(-1)
-    # The ratio of the lengths makes the difference below small. Its derivative makes the derivative
-    # of the difference small, too, if the length of a direction with a large weight changes.
-    squares = [(x * x).sum(-1) for x in (moved, world)]
-    lengths = [jnp.sqrt(jnp.where(square > 0, square, 1)) for square in squares]
-    ratio = lengths[0] / lengths[1]
-    moment = (weights[:, None] * jax.vmap(cross)(moved - ratio[:, None] * world, world)).sum(0)
-    turn = solve(
-        _curvature_of_rotation_fit(
-            jnp.eye(3, dtype=weights.dtype), _weighted_outer_products(weights, moved, world)
-        ),
-        moment,
-    )
-    return product(quaternion.to_matrix(quaternion.exp(turn)), rotation)
+    moved, _, apart = _apart_from_world(rotation, world, body)
+    moment = (weights[:, None] * jax.vmap(cross)(apart, world)).sum(0)
+    one = jnp.eye(3, dtype=weights.dtype)
+    outer = _weighted_outer_products(weights, moved, world)
+    return solve(_curvature_of_rotation_fit(one, outer), moment)
 
 
 def align(a: Vec3Like, b: Vec3Like) -> Mat3:
@@ -317,7 +372,7 @@ def _signed_singular_value_sum_and_zeta(b: Mat3) -> tuple[Scalar, Scalar]:
 
     # Newton's method for the quartic equation starts at √3, which is not below the largest root,
     # and comes down to this root without overshooting.
-    root = lax.fori_loop(0, 24, newton, jnp.full_like(det, np.sqrt(3)))
+    root = lax.fori_loop(0, 40, newton, jnp.full_like(det, np.sqrt(3)))
     return root, 0.5 * (root * root - 1) * root - det
 
 

@@ -69,6 +69,26 @@ def test_a_masked_reading_is_an_absent_one(tumble):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.usefixtures("unhooked")
+def test_an_interval_of_a_whole_number_is_refused_and_float32_is_said(tumble):
+    _, ts, ys = tumble
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), ys.omega))
+    found = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()), starts=1)
+    for function, kind in (
+        (lambda point: 3, "int"),
+        (lambda point: jnp.argmax(point.body.moments), "int"),
+        (lambda point: point.body.moments > 0.5, "bool"),
+    ):
+        with pytest.raises(TypeError, match=f"wanted numbers that vary smoothly, got {kind}"):
+            found.interval_of(function)
+    low, high = found.interval_of(lambda point: [point.state0.omega[0], 2.0])
+    assert low[0] < high[0] and low[1] == high[1] == 2.0
+    assert "float64" not in str(found)
+    single = eqx.tree_at(lambda f: f.x, found, found.x.astype(np.float32))
+    last = rj.identify.report.verdict(single).splitlines()[-1]
+    assert last.startswith("A fit is better in float64: this one was computed in float32")
+
+
 @pytest.mark.slow
 def test_estimated_noise_is_the_noise(tumble):
     _, ts, ys = tumble

@@ -456,6 +456,16 @@ MISTAKES = [
     (lambda r: identify.Free(lambda s: s.sensors[3], "x"), "nothing is there"),
     (lambda r: identify.Free(lambda s: s.sensors[0], "x"), "wanted one array, got Gyro"),
     (lambda r: identify.Free(lambda s: s.sensors[0].bias, "x", positive=True), "wanted a positive starting value"),
+    (lambda r: identify.Free(lambda s: s.sensors[0].scale[0], "scale"), "None is there; give it a starting value"),
+    (lambda r: identify.Free(lambda s: 3 * s.sensors[0].bias, "x"), "a function of them is no place"),
+    (lambda r: identify.Free(lambda s: -s.sensors[0].bias[1], "x"), "a function of them is no place"),
+    (lambda r: identify.Free(lambda s: jnp.sum(s.sensors[0].bias), "x"), "a function of them is no place"),
+    (lambda r: identify.Free(lambda s: s.sensors[0].bias.T, "x"), "a function of them is no place"),
+    (lambda r: identify.Free(lambda s: s.sensors[0].bias[[0, 0]], "x"), r"each once, got \[0, 0\]"),
+    (lambda r: identify.Free(lambda s: s.sensors[0].bias[3], "x"), "nothing is there .*out of bounds"),
+    (lambda r: identify.Free(lambda s: s.body.com, "x"), "numbers of the body are those of the model's chart"),
+    (lambda r: identify.Free(lambda s: s.body, "x"), "numbers of the body are those of the model's chart"),
+    (lambda r: identify.Free(lambda s: s.start.omega, "x"), "the initial state needs no Free"),
 ]  # fmt: skip
 
 
@@ -467,6 +477,41 @@ def test_what_is_free_is_checked(records, free, words):
 
 
 @pytest.mark.usefixtures("unhooked")
+def test_entries_of_an_array_are_free_by_themselves(records):
+    """Some entries of a drag and a bias move, the others keep their values; no entry is free twice."""
+    free = [
+        identify.Free(lambda s: s.torque.parts[1].coefficient[2], "drag z", scale=0.05),
+        identify.Free(
+            lambda s: s.torque.parts[1].coefficient[:1], "drag", scale=0.05, positive=True
+        ),
+        identify.Free(lambda s: s.sensors[0].bias[jnp.array([2, 0])], "bias", scale=0.1, each=True),
+    ]
+    law = law_of(rj.torques.Input("speed"), [0.2, 0.3, 0.4])
+    model = identify.Model(records, identify.Known(BODY), torque=law, free=free)
+    assert model.size == 1 + 1 + 3 * 2 + 3 * 3
+    x = model.start()
+    drag_z, drag, bias = model.slots
+    x = x.at[drag_z.shared[0]].set(2.0).at[drag.shared[0, 0]].set(10.0)
+    x = x.at[bias.own].set(jnp.arange(6.0).reshape(3, 2))
+    scenes = model.scenes(x)
+    moved = [0.2 * np.exp(0.5), 0.3, 0.5]
+    np.testing.assert_allclose(scenes.torque.parts[1].coefficient, [moved] * 3, rtol=1e-12)
+    biases = [[0.1, 0.0, 0.0], [0.3, 0.0, 0.2], [0.5, 0.0, 0.4]]
+    np.testing.assert_allclose(scenes.sensors[0].bias, biases, atol=1e-12)
+    values = model.values(x)
+    np.testing.assert_allclose(values["drag z"], 0.5)
+    np.testing.assert_allclose(values["drag"], [moved[0]])
+    np.testing.assert_allclose(values["bias"], np.array(biases)[:, [2, 0]])
+    again = identify.Free(lambda s: s.torque.parts[1].coefficient, "drag again")
+    with pytest.raises(ValueError, match="another Free already frees the same numbers"):
+        identify.Model(records, identify.Known(BODY), torque=law, free=[*free, again])
+    walk = identify.Walk(lambda s: s.sensors[0].bias[1], 0.1, 1e-3)
+    drifting = identify.Model(records[1], identify.Known(BODY), torque=law, walks=walk)
+    belief = identify.first_belief(drifting, rate=0.1)
+    assert belief.walks[0].shape == () and belief.deviation.shape == (4,)
+
+
+@pytest.mark.usefixtures("unhooked")
 def test_other_mistakes_are_named(records, short_record):
     with pytest.raises(ValueError, match="the one at index 1 differs from the first"):
         identify.Model([records[0], short_record], identify.Tensor(1.5))
@@ -475,8 +520,12 @@ def test_other_mistakes_are_named(records, short_record):
     with pytest.raises(ValueError, match="it reads 'speed', and recording 0 has no inputs; give"):
         identify.Model(short_record, identify.Tensor(1.5), torque=LAW)
     marker = identify.Recording([0.0, 1.0], (identify.Marker([0.0, 0, 0]), np.zeros((2, 3))))
-    with pytest.raises(ValueError, match=r"wanted Mass\(guess\) or Known"):
-        identify.Model(marker, identify.Tensor(1.0))
+    words = (
+        r"Marker needs .*wanted Mass\(guess\) or Known.*take Mass\(guess, \['inertia'\]\).*origin="
+    )
+    for chart in (identify.Tensor(1.0), identify.Ratios()):
+        with pytest.raises(ValueError, match=words):
+            identify.Model(marker, chart)
     with pytest.raises(ValueError, match="wanted a positive moment of inertia"):
         identify.Tensor(-1.0)
     with pytest.raises(ValueError, match="substeps: wanted a whole number of at least 1, got 0"):

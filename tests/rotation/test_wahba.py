@@ -9,7 +9,7 @@ from once import once
 from scipy.linalg import solve_sylvester
 from scipy.spatial.transform import Rotation
 
-from rigidjax.rotation import quaternion, so3
+from rigidjax.rotation import fitting, quaternion, so3
 
 DTYPES = [np.float64, np.float32]
 
@@ -219,3 +219,65 @@ def test_a_heavy_direction_beside_a_light_one(ratio):
     )
     with pytest.raises(ValueError, match="do not fix the attitude"):
         so3.wahba(body[[0, 0, 0]], world, weights)
+
+
+@pytest.mark.parametrize("top", [0, 4, 8])
+def test_random_weights_and_directions_that_contradict_each_other(top):
+    """Against SciPy's SVD, which loses digits with the ratio of the weights; and the derivative."""
+    rng = np.random.default_rng(40 + top)
+    fit = jax.jit(so3.wahba)
+    for scatter in (0.05, 1.0, 30.0):
+        for _ in range(20):
+            body, noise = rng.normal(size=(2, 4, 3))
+            world = Rotation.random(random_state=int(rng.integers(1 << 30))).apply(body)
+            world, weights = world + scatter * noise, 10 ** rng.uniform(0, top, 4)
+            found = np.asarray(fit(body, world, weights))
+            right, _ = Rotation.align_vectors(world, body, weights=weights)
+            off = np.linalg.norm((Rotation.from_matrix(found) * right.inv()).as_rotvec())
+            assert off < 1e-13 * 30**2 * 10.0**top
+            change = rng.normal(size=(4, 3))
+            _, slope = jvp_of_wahba(body, world, weights, change)
+            true = derivative_of_wahba(body, world, weights, change)
+            assert np.abs(slope - true).max() < 1e-9 * np.abs(true).max() + 1e-12
+
+
+@jax.jit
+def jvp_of_wahba(body, world, weights, change):
+    return jax.jvp(lambda world: so3.wahba(body, world, weights), (world,), (change,))
+
+
+@pytest.mark.parametrize("ratio", [3e5, 2e9, 1e12])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_one_heavy_direction_that_the_others_contradict(ratio, dtype):
+    """The limit is SciPy's infinite weight; the others are wild, so that no first guess is near."""
+    rng = np.random.default_rng(7)
+    ratio = min(ratio, 1e4) if dtype == np.float32 else ratio
+    for _ in range(10):
+        body, world = rng.normal(size=(2, 3, 3)).astype(dtype)
+        found = np.asarray(so3.wahba(body, world, np.array([2.0, ratio, 1.0], dtype)))
+        limit, _ = Rotation.align_vectors(world, body, weights=[2.0, np.inf, 1.0])
+        assert np.abs(found - limit.as_matrix()).max() < 200 / ratio + 1e-13
+
+
+@pytest.mark.parametrize("world", [-np.eye(3), np.diag([1.0, 1.0, -1.0])])
+def test_two_attitudes_that_fit_equally_well_are_refused(world, unhooked):
+    with pytest.raises(ValueError, match="wahba: these directions do not fix the attitude"):
+        so3.wahba(np.eye(3), world)
+
+
+def test_a_search_that_does_not_arrive_says_so(monkeypatch, unhooked):
+    body, world = np.random.default_rng(3).normal(size=(2, 3, 3))
+    monkeypatch.setattr(fitting, "_MOST_STEPS", 0)
+    jax.clear_caches()
+    with pytest.raises(ValueError, match="Newton's method did not arrive in 0 steps"):
+        so3.wahba(body, world)
+    jax.clear_caches()
+
+
+def test_projection_of_matrices_that_are_nearly_singular(unhooked):
+    u, v = Rotation.random(2, random_state=8).as_matrix()
+    for small in (1e-4, 1e-7):
+        found = so3.project(u @ np.diag([3.0, small, 0.7 * small]) @ v.T)
+        np.testing.assert_allclose(found, u @ v.T, rtol=0, atol=1e-14 / small)
+    with pytest.raises(ValueError, match="many rotations are equally near"):
+        so3.project(u @ np.diag([3.0, 2e-9, 1e-9]) @ v.T)

@@ -11,7 +11,7 @@ from rigidjax.identify.model.model import Model
 from rigidjax.identify.uncertainty.considered import (
     Consideration,
     describe_considered_errors,
-    slot_of_sensor_member,
+    slots_of_sensor,
 )
 from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
 from rigidjax.identify.uncertainty.quantities import Quantity
@@ -82,10 +82,13 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
     hold the fitted biases.
     """
     out = []
-    for index, reading in enumerate(model.records.readings):
-        slot, sensor = slot_of_sensor_member(model, index, "bias"), reading.sensor
-        if slot is None or slot.prior is not None:
-            continue
+    slots = [
+        (slot, reading)
+        for index, reading in enumerate(model.records.readings)
+        for slot in slots_of_sensor(model, index, "bias")
+        if slot.prior is None
+    ]
+    for slot, reading in slots:
         largest = max(
             (abs(one.value) for one in quantities if f"{one.name} ".startswith(f"{slot.name} ")),
             default=0.0,
@@ -94,9 +97,10 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
         size = float(np.sqrt(np.mean(np.sum(rows.reshape(len(rows), -1) ** 2, axis=1))))
         if largest > REMARKABLE * size:
             out.append(
-                f"{slot.name!r}, a bias without a prior, came out as {largest:.2g} {sensor.unit}, "
-                f"{100 * largest / size:.0f} % of the readings: it may stand for a part of the "
-                f"motion that the model lacks. Give what is known of it, such as Free(…, prior=…)."
+                f"{slot.name!r}, a bias without a prior, came out as {largest:.2g} "
+                f"{reading.sensor.unit}, {100 * largest / size:.0f} % of the readings: it may "
+                "stand for a part of the motion that the model lacks. Give what is known of it, "
+                "such as Free(…, prior=…)."
             )
     return " ".join(out)
 

@@ -165,13 +165,21 @@ class Fit(eqx.Module):
         """
         # Do not use χ² under a robust loss: outliers would dominate χ².
         error_ratio = np.sqrt(self.chi2 / self.dof) if self.model.loss is None else 1.0
-        return answers.advice_on_intervals(
+        words = answers.advice_on_intervals(
             self.search,
             self.explanation,
             self.causes,
             self.covariance_kind,
             error_ratio,
             self.allowance,
+        )
+        lost = ["the unknown torque as zero"] if self.model.process is not None else []
+        lost += ["the walks as constant"] if self.model.walks else []
+        if not lost:
+            return words
+        return (
+            f"A fit takes {' and '.join(lost)}: for the motion use identify.filter or smooth, for "
+            f"the numbers identify.refit(identify.LogDensity(fit)). {words}"
         )
 
     def __str__(self) -> str:
@@ -308,7 +316,7 @@ class Fit(eqx.Module):
           values of all `Free`s. It returns an array.
         - `level`: the probability that the interval holds the true value.
 
-        **Raises** as `interval`.
+        **Raises** as `interval`, and `TypeError` for a function that returns whole numbers.
         """
         _, low, high = value_and_interval_of(self, function, level)
         return low, high
@@ -359,7 +367,7 @@ def value_and_interval_of(
 
     def value(point: Unpacked) -> Array:
         point = dataclasses.replace(point, noise=fit.noises)
-        return _checks.numeric_array(function(point), "function(point)")
+        return _checks.differentiable_array(function(point), "function(point)")
 
     point, slopes = unpack_with_slopes(fit.model, fit.derivative_point)
 

@@ -1,5 +1,6 @@
 """Describe in words which numbers a fit determines, and which numbers it leaves undetermined."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -48,6 +49,8 @@ EVEN = 0.01
 # Readings change along a direction if a small step along it (of at most 0.01 in each free number)
 # moves all readings together by more than this number of standard deviations.
 CHANGED = 0.01
+# A step that tells a constant sum from a constant product changes each number by this fraction.
+FAR = 0.3
 # A sentence on a combination lists at most MOST numbers, and a report has sentences on at most
 # SEVERAL combinations.
 MOST, SEVERAL = 6, 5
@@ -69,7 +72,9 @@ class Combination(eqx.Module):
     >>> Combination(("I1", "I2"), (0.01, 0.01), ("", ""), (True, True)).in_words
     'I1 and I2 rise together: only I1/I2 is determined.'
     >>> Combination(("Ωx", "bias x"), (0.1, -0.1), ("rad/s", "rad/s"), (False, False)).in_words
-    'No reading changes where these change together: Ωx by +0.1 rad/s, bias x by −0.1 rad/s.'
+    'Ωx rises as bias x falls: only Ωx + bias x is determined.'
+    >>> Combination(("Ωx", "bias x"), (0.1, 0.2), ("rad/s", "rad/s"), (False, False)).in_words
+    'No reading changes where these change together: Ωx by +0.1 rad/s, bias x by +0.2 rad/s.'
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -91,15 +96,17 @@ class Combination(eqx.Module):
         if len(names) == 1:
             name = names[0][0].upper() + names[0][1:]
             return f"{name} is not determined: no reading changes with it."
-        even = all(self.relative) and np.ptp(np.abs(sizes)) < EVEN * np.abs(sizes).max()
+        # All numbers change by one factor, or all by one amount.
+        alike = all(self.relative) or (not any(self.relative) and len(set(self.units)) == 1)
+        even = alike and np.ptp(np.abs(sizes)) < EVEN * np.abs(sizes).max()
         if even and (sizes > 0).all():
             listed = f"{', '.join(names[:-1])} and {names[-1]}"
-            only = f"{names[0]}/{names[1]} is" if len(names) == 2 else "their ratios are"
+            apart, kind = ("/", "ratios") if self.relative[0] else (" − ", "differences")
+            only = f"{names[0]}{apart}{names[1]} is" if len(names) == 2 else f"their {kind} are"
             return f"{listed} rise together: only {only} determined."
         if even and len(names) == 2:
-            return (
-                f"{names[0]} rises as {names[1]} falls: only {names[0]}·{names[1]} is determined."
-            )
+            both = (" + ", "·")[self.relative[0]].join(names)
+            return f"{names[0]} rises as {names[1]} falls: only {both} is determined."
         parts = []
         for name, size, unit, ratio in zip(names, sizes, self.units, self.relative, strict=True):
             size = f"{100 * size if ratio else size:+.2g}".replace("-", "−")
@@ -152,16 +159,18 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
         )
         echelon = _reduced_echelon_form(changes)
         if best is None or np.count_nonzero(echelon) < np.count_nonzero(best[0]):
-            best, basis = (echelon, here, size, values[rows]), changes
+            best, basis = (echelon, here, size, values[rows], slope), changes
     assert best is not None and basis is not None
     # Sort the combinations by the index of their first number: the order in which the elimination
     # returns the combinations depends on round-off.
     rows = sorted((row for row in best[0] if row.any()), key=lambda row: np.flatnonzero(row)[0])
-    switches = [
-        _readings_change_along(fit, np.linalg.lstsq(basis.T, row)[0] @ null) for row in rows
-    ]
-    both = zip(rows, switches, strict=True)
-    return tuple(_combination_from_echelon_row(row, *best[1:], switch) for row, switch in both)
+    out = []
+    for row in rows:
+        direction = np.linalg.lstsq(basis.T, row)[0] @ null
+        switch = _readings_change_along(fit, direction)
+        one = _combination_from_echelon_row(row, *best[1:3], switch)
+        out.append(_by_one_factor_if_so(fit, one, row, *best[2:], direction))
+    return tuple(out)
 
 
 def _readings_change_along(fit: "Fit", direction: np.ndarray) -> bool:
@@ -177,20 +186,28 @@ def _readings_change_along(fit: "Fit", direction: np.ndarray) -> bool:
     """
     if fit.model.torque is None:
         return False
+    step = 0.01 * direction / np.abs(direction).max()
+    return 0.5 * _change_of_readings(fit, (step, -step)) > CHANGED
+
+
+def _change_of_readings(fit: "Fit", steps: tuple[np.ndarray, np.ndarray]) -> float:
+    """Return the length, in standard deviations, of the difference of all predicted readings after
+    two steps (n,) from the best point of a `fit`.
+    """
     x = fit.derivative_point
-    step = 0.01 * jnp.asarray(direction / np.abs(direction).max(), x.dtype)
-    after, before = (errors_and_slopes(fit.model, x + h)[0] for h in (step, -step))
-    total = 0.0
-    for one, other, noise in zip(after, before, fit.noises, strict=True):
-        total += float(np.sum((0.5 * np.asarray(one - other) / np.asarray(noise)[:, None]) ** 2))
-    return total > CHANGED**2
+    after, before = (
+        errors_and_slopes(fit.model, x + jnp.asarray(step, x.dtype))[0] for step in steps
+    )
+    parts = zip(after, before, fit.noises, strict=True)
+    return float(
+        np.sqrt(sum(np.sum((np.asarray(a - b) / np.asarray(n)[:, None]) ** 2) for a, b, n in parts))
+    )
 
 
 def _combination_from_echelon_row(
     row: np.ndarray,
     names: list[tuple[str, str, bool]],
     size: np.ndarray,
-    values: np.ndarray,
     switch: bool,
 ) -> Combination:
     """Return the undetermined combination of numbers that one row describes.
@@ -205,7 +222,6 @@ def _combination_from_echelon_row(
     - `names`: the name and unit of each number, and whether its change is given as a relative
       change.
     - `size`: (M,) the size of each number.
-    - `values`: (M,) the value of each number.
     - `switch`: whether the readings change along the combination although their derivative is zero,
       because the combination moves a time or a state at which a torque switches.
     """
@@ -213,18 +229,51 @@ def _combination_from_echelon_row(
     # Scale the row so that its largest entry is a hundredth, and so that the first number rises.
     # Multiply each entry by the size of its number.
     changes = 0.01 * np.sign(row[order[0]]) * row / np.abs(row).max() * size
-    relative = np.array([name[2] for name in names])
-    # If all numbers change by the same factor, give relative changes: the sentence is then shorter.
-    shares = np.where(relative, changes, changes / np.where(values == 0, np.inf, values))[order]
-    if np.ptp(np.abs(shares)) < EVEN * np.abs(shares).max():
-        changes[order] = 0.01 * shares / np.abs(shares).max()
-        relative[order] = True
     return Combination(
         tuple(names[i][0] for i in order),
         tuple(float(changes[i]) for i in order),
-        tuple("" if relative[i] else names[i][1] for i in order),
-        tuple(bool(relative[i]) for i in order),
+        tuple("" if names[i][2] else names[i][1] for i in order),
+        tuple(names[i][2] for i in order),
         switch,
+    )
+
+
+def _by_one_factor_if_so(
+    fit: "Fit",
+    one: Combination,
+    row: np.ndarray,
+    size: np.ndarray,
+    values: np.ndarray,
+    slope: np.ndarray,
+    direction: np.ndarray,
+) -> Combination:
+    """Return a combination with relative changes if all of its numbers change by the same factor.
+
+    Near the best point a common factor and a common amount look alike if the numbers are equal in
+    magnitude. Then large steps decide, from a point at which the first number alone is changed:
+    along `direction` (n,) numbers of one unit change by equal amounts, which changes no reading
+    only where a sum or a difference is all that readings show.
+    """
+    order = np.flatnonzero(row)
+    relative, changes = np.array(one.relative), np.array(one.changes)
+    here = np.where(values[order] == 0, np.inf, values[order])
+    shares = np.where(relative, changes, changes / here)
+    largest = np.abs(shares).max()
+    if relative.all() or len(order) < 2 or not np.ptp(np.abs(shares)) < EVEN * largest:
+        return one
+    same_unit = not relative.any() and len(set(one.units)) == 1
+    if same_unit and np.ptp(np.abs(changes)) < EVEN * np.abs(changes).max():
+        # `direction` changes the numbers by `row * size`, this step each by `FAR` of itself.
+        step = FAR * direction / np.abs(row[order] * size[order] / here).max()
+        first = slope[order[0]]
+        aside = -0.5 * FAR * values[order[0]] * first / (first @ first)
+        if _change_of_readings(fit, (aside + step, aside)) < CHANGED:
+            return one
+    return dataclasses.replace(
+        one,
+        changes=tuple(map(float, 0.01 * shares / (np.sign(shares[0]) * largest))),
+        units=("",) * len(order),
+        relative=(True,) * len(order),
     )
 
 
@@ -246,8 +295,7 @@ def _names_units_and_relative_flags(model: Model) -> list[tuple[str, str, bool]]
     """
     out = names_units_and_signs(model)
     for name, chart in name_suffixes_and_charts(model):
-        unit = chart.unit.replace("SI", "kg m²")
-        out += [(f"{part}{name}", unit, False) for part in TENSOR]
+        out += [(f"{part}{name}", chart.unit, False) for part in TENSOR]
     for part, name, unit in (
         ("q", "attitude about the world's", "rad"),
         ("q", "attitude about the body's", "rad"),

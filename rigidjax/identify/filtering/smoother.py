@@ -5,6 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -24,16 +25,18 @@ from rigidjax.identify.filtering.linear import LinearEstimate, linear_estimate
 from rigidjax.identify.filtering.steps import Dynamics, ExtendedState, ReadNumbers, Stops
 from rigidjax.identify.model.model import Model
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.manifold import minus, plus
+from rigidjax.motion.manifold import dimension, minus, plus
+from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
+from rigidjax.motion.torques.composite import parts_of
 
 
 class Push(NamedTuple):
-    """Hold the estimate of a white-noise torque, averaged over each of the N steps of a smoother.
+    """Hold the estimate of an unknown torque in each of the N steps of a smoother.
 
     **Fields:** `mean` (N, 3) is the mean and `deviation` (N, 3) the standard deviation of the
-    averaged torque, in newton metres, body frame. The deviation is large for short steps, since
-    white noise has no value at one time: the shorter a step, the larger the variance of its
-    average.
+    torque, in newton metres, body frame. A `CorrelatedTorque` is taken at the end of each step. A
+    `RandomTorque` is averaged over each step: white noise has no value at one time, and the shorter
+    a step, the larger the variance of its average.
     """
 
     mean: Float[Array, "stops 3"]
@@ -48,8 +51,7 @@ class Smoothed(eqx.Module):
     - `belief`: a `Belief` at each of N stops. The stops are the T times of the recording and, if
       the intervals between these times are long, some times between them.
     - `rows`: (T,) for each time of the recording, its index among the stops.
-    - `pushes`: a `Push` for each `RandomTorque`; the estimate of a `CorrelatedTorque` is in
-      `belief.torques`.
+    - `pushes`: a `Push` for each unknown torque, in the order of the model's `process`.
     - `readings`: for each sensor a `ReadNumbers` with arrays (N, k) for the k components of a
       reading: the innovations (reading minus prediction) of the last iteration, their variances,
       and a mask, true for a component that was read.
@@ -187,13 +189,21 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
         is_running, iterate, (path, blank, far, jnp.asarray(0))
     )
     h = jnp.diff(stops.t, prepend=first.t).astype(first.root.dtype)
-    pushes = []
+    white = []
     for index, root in enumerate(dynamics.white):
         mine = slice(6 * index, 6 * index + 3)
         size = roots.inverse_sqrt_or_zero(h)[:, None] * root[None]
         variance = jnp.diagonal(estimate.kick_covariance, axis1=1, axis2=2)[:, mine]
-        pushes.append(Push(size * estimate.kicks[:, mine], size * jnp.sqrt(variance)))
+        white.append(Push(size * estimate.kicks[:, mine], size * jnp.sqrt(variance)))
     belief = Belief(stops.t, jax.tree.map(lambda leaf: leaf[1:], path), estimate.root[1:])
+    # The rows of the correlated torques come after those of the motion.
+    first_row = dimension(first.x.motion)
+    rows = (first_row + 3 * index + np.arange(3) for index in range(len(belief.torques)))
+    coloured = [
+        Push(mean, belief.deviation[:, row]) for mean, row in zip(belief.torques, rows, strict=True)
+    ]
+    kinds = {RandomTorque: iter(white), CorrelatedTorque: iter(coloured)}
+    pushes = [next(kinds[type(part)]) for part in parts_of(run.scene.process)]
     last_read = ReadNumbers(estimate.innovation[1:], estimate.variance[1:], kept[1].mask)
     reads = steps.split_by_sensor(sensors, last_read)
     status = jnp.where(jnp.isfinite(change), status, 2)

@@ -384,7 +384,7 @@ class Refit(eqx.Module):
             return np.asarray(low), np.asarray(high)
 
         def function_of_numbers(x: Array) -> Array:
-            return jnp.asarray(function(self.density.unpack(x)))
+            return _checks.differentiable_array(function(self.density.unpack(x)), "function(point)")
 
         slope, centre = map(np.asarray, jacobian_and_value(function_of_numbers, self.x))
         null, reach = np.zeros((0, self.x.size)), NormalDist().inv_cdf(0.5 + 0.5 * level)

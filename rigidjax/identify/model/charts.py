@@ -288,7 +288,7 @@ class Mass(AbstractBodyChart):
     size: int = eqx.field(static=True)
     log_names: tuple[str, ...] = eqx.field(static=True)
     plain_names: tuple[str, ...] = eqx.field(static=True)  # pyright: ignore
-    unit: ClassVar[str] = "SI"
+    unit: ClassVar[str] = "kg m²"
 
     def __init__(self, guess: MassProperties, free: Sequence[str] = tuple(_PARTS)):
         self.guess = _checks.require_unbatched_instance(guess, MassProperties, "guess")

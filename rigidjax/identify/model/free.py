@@ -1,7 +1,7 @@
 """Find the free numbers of a scene: which leaf of the scene each number changes, and how."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,8 +21,9 @@ class Free(eqx.Module):
     **Arguments:**
 
     - `where`: a function that picks the number from a `Scene`, such as
-      `lambda s: s.sensors[0].bias` or `lambda s: s.torque.coefficient`. The value in the scene is
-      the starting value.
+      `lambda s: s.sensors[0].bias` or `lambda s: s.torque.coefficient`, or entries of an array,
+      such as `lambda s: s.torque.coefficient[0]`. The value in the scene is the starting value. The
+      numbers of the body are those of the model's chart.
     - `name`: the name of the number in reports.
     - `scale`: the natural size of the number, in the unit of the number; inside the fit the number
       is in units of this size.
@@ -225,7 +226,7 @@ def find_slots(free: Sequence[Free], scene: Scene, body_names: Sequence[str]) ->
         _checks.require_instance(item, Free, "free", requirement="Free(where, name)")
         here = f"Free {item.name!r}"
         path, value = leaf_at(item.where, scene, here, "it")
-        if any(slot.path == path for slot in slots):
+        if any(share_numbers(slot.path, path) for slot in slots):
             raise ValueError(
                 f"{here}: another Free already frees the same numbers; give each array one Free"
             )
@@ -267,13 +268,54 @@ def find_slots(free: Sequence[Free], scene: Scene, body_names: Sequence[str]) ->
     return slots
 
 
+class Entries(NamedTuple):
+    """Hold the last key of a path that leads to some entries of an array: their `places` in the
+    array as one row, and the `shape` in which they were picked.
+    """
+
+    places: tuple[int, ...]
+    shape: tuple[int, ...]
+
+
+class _Picked:
+    """Hold the place of a leaf of a tree, or of entries of it, for a function that picks one.
+
+    Entries are picked as in an array; any arithmetic fails, since its result is no place.
+    """
+
+    def __init__(self, leaf: int, places: np.ndarray):
+        self.leaf, self.places = leaf, places
+
+    def __getitem__(self, index: Any) -> "_Picked":
+        return _Picked(self.leaf, np.asarray(self.places[index]))
+
+
+class _NotHere:
+    """Raise an error, which says why, if a number of this part of a scene is picked."""
+
+    def __init__(self, why: str):
+        self.why = why
+
+    def __getattr__(self, name: str) -> Any:
+        raise ValueError(self.why)
+
+
+_ELSEWHERE = {
+    "body": "the numbers of the body are those of the model's chart; instead of Known(body) take "
+    'a chart of what is free, such as Ratios(), Tensor() or Mass(guess, ["inertia"])',
+    "start": "the initial state needs no Free: it is free in every recording",
+}
+
+
 def leaf_at(
     where: Callable[[Any], Any], tree: PyTree, name: str, role: str
 ) -> tuple[tuple[Any, ...], Any]:
-    """Return two things: the path of the leaf that the function `where` picks from a tree; and the
-    leaf, an array of numbers or a float.
+    """Return two things: the path of the numbers that the function `where` picks from a tree; and
+    the numbers, an array or a float.
 
-    - `where`: a function of the `tree` that returns one of its leaves.
+    The path is that of a leaf; if only some entries of the leaf are picked, an `Entries` follows.
+
+    - `where`: a function of the `tree` that returns one of its leaves, or entries of it.
     - `tree`: a tree of JAX, such as a `Scene`.
     - `name`: what the object that has the function `where` is called in an error.
     - `role`: what the object that needs a starting value is called in an error.
@@ -282,28 +324,73 @@ def leaf_at(
     """
     pairs, structure = jax.tree.flatten_with_path(tree)
     paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
+    places = [np.arange(np.size(leaf)).reshape(np.shape(leaf)) for leaf in leaves]
+    marked = jax.tree.unflatten(structure, list(map(_Picked, range(len(leaves)), places)))
+    if isinstance(tree, Scene):
+        for part in (part for part in _ELSEWHERE if getattr(tree, part) is None):
+            object.__setattr__(marked, part, _NotHere(f"{name}: {_ELSEWHERE[part]}"))
     try:
-        index = where(jax.tree.unflatten(structure, list(range(len(leaves)))))
+        picked = where(marked)
     except (AttributeError, IndexError, TypeError) as error:
-        raise ValueError(
-            f"{name}: wanted numbers at the place that `where` picks, but nothing is there "
-            f"({error})"
-        ) from None
-    if index is None:
+        if "'NoneType' object is not subscriptable" not in str(error):
+            nothing = "wanted numbers at the place that `where` picks, but nothing is there"
+            if "_Picked" in str(error):
+                nothing = (
+                    "`where` picks numbers of the scene as they stand, or entries of them, such as "
+                    "s.torque.coefficient[0]; a function of them is no place"
+                )
+            words = f"{name}: {nothing} ({error})".replace("_Picked", "array")
+            raise ValueError(words) from None
+        picked = None
+    if picked is None:
         raise ValueError(
             f"{name}: wanted numbers at the place that `where` picks, but None is there; give "
             f"{role} a starting value, such as Gyro(bias=[0.0, 0.0, 0.0])"
         )
-    if not isinstance(index, int):
+    if isinstance(picked, _NotHere):
+        raise ValueError(picked.why)
+    if not isinstance(picked, _Picked):
         kind = name.split()[0]
         raise ValueError(
-            f"{name}: wanted one array, got {type(index).__name__}; give one {kind} for each array"
+            f"{name}: wanted one array, got {type(picked).__name__}; give one {kind} for each array"
         )
+    leaf = leaves[picked.leaf]
     # This is not `equinox.is_inexact_array_like`, which raises an error for a leaf that JAX traces,
     # because this leaf has a `__jax_array__` of `None`.
-    if not (eqx.is_inexact_array(leaves[index]) or isinstance(leaves[index], float)):
-        raise ValueError(f"{name}: wanted numbers, got {type(leaves[index]).__name__}")
-    return paths[index], leaves[index]
+    if not (eqx.is_inexact_array(leaf) or isinstance(leaf, float)):
+        raise ValueError(f"{name}: wanted numbers, got {type(leaf).__name__}")
+    if np.array_equal(picked.places, places[picked.leaf]):
+        return paths[picked.leaf], leaf
+    flat = picked.places.ravel().tolist()
+    if not flat or len(set(flat)) < len(flat):
+        raise ValueError(f"{name}: wanted entries of an array, each once, got {flat}")
+    path = (*paths[picked.leaf], Entries(tuple(flat), picked.places.shape))
+    return path, entries_at(leaf, path)
+
+
+def leaf_and_entries(path: tuple[Any, ...]) -> tuple[tuple[Any, ...], Entries | None]:
+    """Return two things: the path of the leaf to which a path leads; and the entries of the leaf
+    that it picks, or `None` for all of them.
+    """
+    return (path[:-1], path[-1]) if isinstance(path[-1], Entries) else (path, None)
+
+
+def share_numbers(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+    """Return whether two paths lead to the same leaf and have an entry of it in common."""
+    (leaf, mine), (same, theirs) = leaf_and_entries(one), leaf_and_entries(other)
+    apart = mine is not None and theirs is not None and not set(mine.places) & set(theirs.places)
+    return leaf == same and not apart
+
+
+def entries_at(leaf: Any, path: tuple[Any, ...], axes: int = 0) -> Array:
+    """Return the numbers of a `leaf` to which its `path` leads. The first `axes` axes of the leaf
+    count recordings, and are kept.
+    """
+    leaf, (_, some) = jnp.asarray(leaf), leaf_and_entries(path)
+    if some is None:
+        return leaf
+    rows = leaf.shape[:axes]
+    return leaf.reshape(*rows, -1)[..., np.array(some.places)].reshape(*rows, *some.shape)
 
 
 # This maps the name of a number in the scene to its unit. A bias is not in this dict: its unit is
@@ -322,7 +409,7 @@ def _unit_implied_by_name(scene: Scene, path: tuple[Any, ...]) -> str:
     - `path`: the path (a tuple of keys of JAX) of the numbers in the tree; its last key has the
       name.
     """
-    *way, last = path
+    *way, last = leaf_and_entries(path)[0]
     name = getattr(last, "name", "")
     if name != "bias":
         return _UNITS.get(name, "")
@@ -347,6 +434,7 @@ def _tolerance_of_sensor(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
     - `scene`: the body, torque, sensors and initial state of a recording, as a tree of JAX.
     - `path`: the path (a tuple of keys of JAX) of the numbers in the tree.
     """
+    path, _ = leaf_and_entries(path)
     if len(path) != 3 or getattr(path[0], "name", "") != "sensors":
         return None
     tolerance = getattr(scene.sensors[path[1].idx], "tolerance", None)
@@ -371,12 +459,12 @@ def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"
 
 def leaves_at(scene: Scene, paths: Sequence[tuple[Any, ...]]) -> tuple[Array, ...]:
     """Return the leaves (arrays of numbers) of a `scene` at the `paths`, which are tuples of keys
-    of JAX, as JAX arrays.
+    of JAX, or entries of leaves, as JAX arrays.
 
     A scene is the body, torques, sensors and initial state of a recording, as a tree of JAX.
     """
     leaves = dict(jax.tree.leaves_with_path(scene))
-    return tuple(jnp.asarray(leaves[path]) for path in paths)
+    return tuple(entries_at(leaves[leaf_and_entries(path)[0]], path) for path in paths)
 
 
 def with_leaves(scene: Scene, paths: Sequence[tuple[Any, ...]], values: Sequence[Array]) -> Scene:
@@ -386,5 +474,12 @@ def with_leaves(scene: Scene, paths: Sequence[tuple[Any, ...]], values: Sequence
     A scene is the body, torques, sensors and initial state of a recording, as a tree of JAX.
     """
     pairs, structure = jax.tree.flatten_with_path(scene)
-    leaves = dict(pairs) | dict(zip(paths, values, strict=True))
+    leaves = dict(pairs)
+    for path, value in zip(paths, values, strict=True):
+        leaf, some = leaf_and_entries(path)
+        if some is not None:
+            whole = jnp.asarray(leaves[leaf])
+            value = whole.reshape(-1).at[np.array(some.places)].set(value.reshape(-1))
+            value = value.reshape(whole.shape)
+        leaves[leaf] = value
     return jax.tree.unflatten(structure, [leaves[path] for path, _ in pairs])

@@ -42,8 +42,10 @@ from rigidjax.identify.model.free import (
     Free,
     Slot,
     checked_labels,
+    entries_at,
     find_slots,
     group_of_each_recording,
+    leaf_and_entries,
 )
 from rigidjax.identify.model.index import Index, build_index
 from rigidjax.identify.model.predict import AbstractIntegrator, HeldSteps, integrator_for
@@ -685,8 +687,8 @@ def starting_values_of_free_numbers(model: Model) -> list[Float[Array, "records 
     scene, out = scene_at_starting_values(model, model.records), []
     leaves = dict(jax.tree.leaves_with_path(scene))
     for slot in model.slots:
-        leaf = jnp.asarray(leaves[slot.path])
         of_each = slot.path[0].name == "sensors"
+        leaf = entries_at(leaves[leaf_and_entries(slot.path)[0]], slot.path, int(of_each))
         out.append(leaf if of_each else jnp.broadcast_to(leaf, (model.count, *leaf.shape)))
     return out
 
@@ -733,6 +735,8 @@ def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
     require_single_model(model)
     hint = "model.start(body) makes them"
     numbers = _checks.numeric_array(x, "x")
+    if numbers.ndim == 1 and numbers.size > model.size:
+        hint += "; the x of a LogDensity, such as refit(density).x, goes with density.model"
     if numbers.shape != (model.size,):
         raise ValueError(
             f"x: wanted the {model.size} free numbers of this model, got shape {numbers.shape}; "
@@ -996,14 +1000,17 @@ def _smallest_state_type(
     needed = [sensor.feels for sensor in sensors]
     if torque is not None:
         needed.append(getattr(torque, "feels", HasAttitude))
-    forced = any(isinstance(part, AbstractForce) for part in parts_of(torque))
-    if HasPose in needed or forced:
+    movers = [type(sensor).__name__ for sensor in sensors if sensor.feels is HasPose]
+    movers += [type(part).__name__ for part in parts_of(torque) if isinstance(part, AbstractForce)]
+    if HasPose in needed or movers:
         for chart in chart_list(charts):
             if not has_mass(chart):
+                pivot = "; of a body on a pivot give Marker(origin=…)" if "Marker" in movers else ""
                 raise ValueError(
-                    "Model: a sensor or force needs a body that moves, whose mass is known or "
-                    "free: wanted Mass(guess) or Known(MassProperties), got "
-                    f"{type(chart).__name__}"
+                    f"Model: {movers[0] if movers else 'the torque'} needs a body that moves, "
+                    "whose mass is known or free: wanted Mass(guess) or Known(MassProperties), got "
+                    f"{type(chart).__name__}. Without forces take Mass(guess, ['inertia']), or "
+                    f"['inertia', 'com']: the motion shows no mass{pivot}"
                 )
         return Rigid
     return Attitude if HasAttitude in needed else Spin

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import NumbersLike
-from rigidjax.identify.model.free import leaf_at, leaves_at
+from rigidjax.identify.model.free import leaf_at, leaves_at, share_numbers
 from rigidjax.identify.model.scene import Scene
 
 
@@ -84,7 +84,7 @@ def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]
                 f"Walk: wanted a number of a sensor, such as s.sensors[0].bias, got one of the "
                 f"{path[0].name}; give an unknown torque as process="
             )
-        if any(drift.path == path for drift in drifts):
+        if any(share_numbers(drift.path, path) for drift in drifts):
             raise ValueError("Walk: another Walk moves the same numbers; give each array one Walk")
         value = jnp.asarray(value)
         parts = (

@@ -1,5 +1,8 @@
 """Describe how far the scale, axes, bias and clock of a sensor may be off."""
 
+from types import NoneType
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -8,15 +11,16 @@ from rigidjax import _checks
 from rigidjax._types import NumbersLike, Scalar
 
 
-def _checked_tolerance_deviation(value: NumbersLike | None) -> Scalar | None:
-    """Return a standard deviation of a `Tolerance` as an array; `None` stays `None`.
+def _deviation_field(name: str) -> Any:
+    """Return a field of `Tolerance`: a positive standard deviation, or `None`."""
 
-    **Raises** `ValueError` unless the `value` is positive.
-    """
-    if value is None:
-        return None
-    wanted = "a positive standard deviation"
-    return jnp.asarray(np.asarray(_checks.positive_float(value, "tolerance", wanted)))
+    def convert(value: NumbersLike | None) -> Scalar | None:
+        if value is None:
+            return None
+        wanted = f"a positive standard deviation; leave {name} out for no error"
+        return jnp.asarray(np.asarray(_checks.positive_float(value, f"Tolerance: {name}", wanted)))
+
+    return eqx.field(converter=convert, default=None)
 
 
 class Tolerance(eqx.Module):
@@ -46,7 +50,15 @@ class Tolerance(eqx.Module):
     (0.01, None)
     """
 
-    scale: Scalar | None = eqx.field(converter=_checked_tolerance_deviation, default=None)
-    cross_axis: Scalar | None = eqx.field(converter=_checked_tolerance_deviation, default=None)
-    bias: Scalar | None = eqx.field(converter=_checked_tolerance_deviation, default=None)
-    clock: Scalar | None = eqx.field(converter=_checked_tolerance_deviation, default=None)
+    scale: Scalar | None = _deviation_field("scale")
+    cross_axis: Scalar | None = _deviation_field("cross_axis")
+    bias: Scalar | None = _deviation_field("bias")
+    clock: Scalar | None = _deviation_field("clock")
+
+
+def tolerance_of(tolerance: object) -> Tolerance | None:
+    """Return `tolerance` if it is a `Tolerance` or `None`; raise `TypeError` for anything else."""
+    wanted = "Tolerance(scale=…, cross_axis=…, bias=…, clock=…) or None"
+    return _checks.require_instance(
+        tolerance, (Tolerance, NoneType), "tolerance", requirement=wanted
+    )

@@ -11,7 +11,7 @@ from rigidjax._types import HasAttitude, HasPose, HasSpin, Vec3
 from rigidjax.identify.sensors import base
 from rigidjax.identify.sensors.base import ClockedSensor, SensorInput
 from rigidjax.identify.sensors.lowpass import LowPass, lowpass_of
-from rigidjax.identify.sensors.tolerance import Tolerance
+from rigidjax.identify.sensors.tolerance import Tolerance, tolerance_of
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross
 
@@ -35,7 +35,7 @@ class VectorSensor(ClockedSensor):
         default=None,
     )
     lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
-    tolerance: Tolerance | None = None
+    tolerance: Tolerance | None = eqx.field(converter=tolerance_of, default=None)
 
     def _reading_of_vector(self, vector: Vec3) -> Vec3:
         """Return the predicted reading (3,) of a `vector` v (3,) in the body frame, in the unit of

@@ -9,12 +9,13 @@ Statistical Orbit Determination, ch. 6.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from rigidjax.identify.model.free import TOLERANCES, Slot
+from rigidjax.identify.model.free import TOLERANCES, Slot, leaf_and_entries
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, standardised_error_changes
 from rigidjax.identify.sensors import AbstractSensor
@@ -84,7 +85,8 @@ def compute_considered_errors(
         tolerance = getattr(sensor, "tolerance", None)
         for kind, member in MEMBERS.items():
             width = getattr(tolerance, kind, None)
-            if width is None or slot_of_sensor_member(model, index, member) is not None:
+            some = [leaf_and_entries(one.path)[1] for one in slots_of_sensor(model, index, member)]
+            if width is None or None in some:
                 continue
             # The tolerance of one sensor may differ between recordings. The largest tolerance is
             # used.
@@ -92,27 +94,24 @@ def compute_considered_errors(
             shifts = deviation * shifts_by_unit_errors(
                 model, linear, noise, covariance, index, kind
             )
+            # Entries that a `Free` estimates by itself are not considered once more. The three
+            # entries of a skew are these of the six errors of the axes.
+            columns = np.array([0, 1, 3] if kind == "cross_axis" else [0, 1, 2])
+            shifts[:, [columns[i] for part in some if part for i in part.places]] = 0.0
             out.append(Consideration(index, kind, deviation, shifts))
     return tuple(out)
 
 
-def slot_of_sensor_member(model: Model, sensor_index: int, member: str) -> Slot | None:
-    """Return the slot of one attribute of a sensor, such as "bias", or `None` if a fit does not
-    estimate this attribute.
-
-    A slot describes a `Free`, a number that a fit estimates.
-
-    **Arguments:**
-
-    - `model`: the model.
-    - `sensor_index`: the index of the sensor.
-    - `member`: the name of the attribute of the sensor.
+def slots_of_sensor(model: Model, sensor_index: int, member: str) -> list[Slot]:
+    """Return the slots of one attribute of a sensor, such as "bias": several if a fit estimates
+    entries of it by themselves, and none if a fit does not estimate it.
     """
-    for slot in model.slots:
-        path = tuple(getattr(key, "name", getattr(key, "idx", None)) for key in slot.path)
-        if path == ("sensors", sensor_index, member):
-            return slot
-    return None
+
+    def names(slot: Slot) -> tuple[Any, ...]:
+        path, _ = leaf_and_entries(slot.path)
+        return tuple(getattr(key, "name", getattr(key, "idx", None)) for key in path)
+
+    return [slot for slot in model.slots if names(slot) == ("sensors", sensor_index, member)]
 
 
 def shifts_by_unit_errors(
@@ -292,7 +291,7 @@ def quantity_shifts_by_usual_errors(
             continue
         shifts_by_kind = {}
         for kind, size in USUAL.items():
-            if slot_of_sensor_member(model, index, MEMBERS[kind]) is None:
+            if not slots_of_sensor(model, index, MEMBERS[kind]):
                 shifts = size * shifts_by_unit_errors(model, linear, noise, covariance, index, kind)
                 shifts_by_kind[kind] = np.abs(slopes @ shifts).max(axis=1)
         if shifts_by_kind:

@@ -105,6 +105,10 @@ def interval_cut_at_flat_bodies(
     return low, high
 
 
+# The units of quantities of a body that are not in the unit of its moments.
+_UNITS = {"mass": "kg", "com x": "m", "com y": "m", "com z": "m"}
+
+
 def names_units_and_signs(model: Model) -> list[tuple[str, str, bool]]:
     """Return three things for each quantity that a fit of the `model` reports: its name; its unit;
     and whether it is always positive.
@@ -113,8 +117,8 @@ def names_units_and_signs(model: Model) -> list[tuple[str, str, bool]]:
     """
     out = []
     for name, chart in name_suffixes_and_charts(model):
-        out += [(f"{log}{name}", chart.unit, True) for log in chart.log_names]
-        out += [(f"{plain}{name}", chart.unit, False) for plain in chart.plain_names]
+        for names, positive in ((chart.log_names, True), (chart.plain_names, False)):
+            out += [(f"{n}{name}", _UNITS.get(n, chart.unit), positive) for n in names]
     names = recording_suffixes(model)
     for where in names if reports_initial_states(model) else ():
         out += [(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]

@@ -108,6 +108,22 @@ def test_a_torque_that_is_not_in_the_equations_is_seen():
     away = np.abs(torque - np.stack([0 * push, push, 0 * push], axis=1))
     calm = (np.abs(ts - 1) > 0.1) & (np.abs(ts - 2) > 0.1)
     assert (away[calm] < band[calm]).mean() > 0.85
+    (push_found,) = found.pushes
+    np.testing.assert_allclose(push_found.mean[found.rows], torque, atol=1e-15)
+    np.testing.assert_allclose(push_found.deviation[found.rows], 0.5 * band, rtol=1e-12)
+
+
+def test_pushes_stand_in_the_order_of_the_process(short):
+    """The equal of a long memory and a slow drift: the torque that is correlated comes first."""
+    model, _, first, found = short
+    process = rj.torques.Sum(rj.torques.CorrelatedTorque(1e-12, 1.0), model.process)
+    both = identify.Model(model.recording, model.chart, process=process)
+    first = identify.first_belief(both, state=first.state, rate=0.3, attitude=0.3)
+    again = identify.smooth(both, first, substeps=1, tolerance=1e-9, iterations=30)
+    correlated, white = again.pushes
+    np.testing.assert_allclose(white.mean, found.pushes[0].mean, atol=1e-5)
+    assert float(jnp.max(jnp.abs(correlated.mean))) < 1e-5
+    assert float(jnp.max(correlated.deviation)) < 1e-5
 
 
 def test_a_motion_that_does_not_settle_is_told(short):

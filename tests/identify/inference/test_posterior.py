@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 import sys
 
 import equinox as eqx
@@ -168,6 +169,12 @@ def test_the_process_of_the_model_is_that_of_the_density(fitted):
     of_filter = identify.log_likelihood(scene, known, x, substeps=scene.filter_steps)
     prior = -0.5 * float(0.01 / 2.0) ** 2
     np.testing.assert_allclose(of_filter + prior, ours(x), rtol=1e-12)
+    # The model itself has fewer numbers, and a fit of it leaves the torque out: both are said.
+    for use in (other.model.unpack, lambda x: identify.filter(other.model, known, x)):
+        with pytest.raises(ValueError, match=r"got shape \(6,\).*goes with density.model"):
+            use(x)
+    assert re.search("takes the unknown torque as zero: .*filter.* identify.refit", other.advice)
+    assert "as zero" not in fitted.advice
 
 
 def test_a_process_of_two_parts_has_the_numbers_of_both(fitted):
@@ -459,6 +466,8 @@ def test_weighted_draws_stand_for_the_density(fitted):
     low2, high2 = found.interval_of(lambda point: point.x[SPIN])
     np.testing.assert_allclose(high2 - low2, high - low, rtol=0.15)
     early = eqx.tree_at(lambda f: f.converged, poor, jnp.asarray(False))
+    with pytest.raises(TypeError, match="wanted numbers that vary smoothly, got int"):
+        poor.interval_of(lambda point: jnp.argmax(point.body.moments))
     with pytest.raises(ValueError, match="the search did not reach the maximum"):
         early.interval_of(lambda point: point.x[SPIN])
     with pytest.raises(ValueError, match="draws: wanted"):

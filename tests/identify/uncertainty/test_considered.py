@@ -126,7 +126,9 @@ def test_intervals_hold_with_a_scale_off_by_one_percent(axis):
 
 @pytest.mark.parametrize("value", [0.0, -0.01, np.nan])
 def test_mistakes_are_named(value):
-    with pytest.raises(ValueError, match="tolerance: wanted a positive standard deviation"):
+    with pytest.raises(
+        ValueError, match="Tolerance: scale: wanted a positive standard deviation; leave scale out"
+    ):
         identify.Tolerance(scale=value)
 
 
@@ -141,3 +143,19 @@ def test_a_large_bias_without_a_prior_is_told():
     assert "without a prior" not in small
     known = identify.Free(lambda s: s.sensors[0].bias, "gyro bias", prior=2.0)
     assert "without a prior" not in fitted(RATES + off, free=(known,), bias=np.zeros(3)).advice
+
+
+def test_an_entry_that_is_estimated_is_not_considered_once_more():
+    """The scale of one axis is free, with the tolerance as its prior: the same as all that are."""
+    gyro = identify.Gyro(0.01, tolerance=TOLERANCE, scale=[1.0, 1.0, 1.0], skew=[0.0, 0.0, 0.0])
+    record = identify.Recording(T, (gyro, RATES))
+    free = [
+        identify.Free(lambda s: s.sensors[0].scale[1], "scale y", scale=0.01),
+        identify.Free(lambda s: s.sensors[0].skew[0], "skew xy", scale=0.01),
+    ]
+    model = identify.Model(record, identify.PrincipalRatios(), free=free)
+    found = identify.fit(model, starts=1)
+    scale, skew = (np.abs(part.shifts).max(axis=0) > 0 for part in found.considered)
+    np.testing.assert_array_equal(scale, [True, False, True])
+    np.testing.assert_array_equal(skew, [False, True, True, True, True, True])
+    assert all(slot.prior is not None for slot in model.slots)
