@@ -107,7 +107,7 @@ def integrate_with_diffrax(
 
     **Returns** an `AdaptiveRun`: the states and how the run ended.
     """
-    missed = None
+    missed, looks_at_error = None, isinstance(controller, dfx.AbstractAdaptiveStepSizeController)
     if jumps is not None:
         numbers, tree = ravel_pytree(y0)
         of_one = lambda t, y, *sides: ravel_pytree(field(t, tree(y), sides or None))[0]  # noqa: E731
@@ -136,7 +136,7 @@ def integrate_with_diffrax(
     numbers, tree = ravel_pytree(y0)
     ys = jax.vmap(tree)(jnp.concatenate([numbers[None], *rows]))
     ill = ~done
-    if not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
+    if not looks_at_error:
         # A controller of equal steps does not look at the error estimate. After a NaN it therefore
         # goes on to the end of the run and reports success.
         ill = ill | ~finite(ys)

@@ -68,6 +68,7 @@ from rigidjax.solve.run import (
     convert_to_forward_time,
     direction_of_times,
     equations_of_motion,
+    hoist_traced_numbers,
     solve,
 )
 from rigidjax.solve.stops import extract_constants, program_with_stops
@@ -224,7 +225,10 @@ def crossings(
     body, state0, times = validation.checked_body_state_and_times(
         body, state0, ts, torque, throw=False
     )
+    torque = hoist_traced_numbers(torque, times[0], state0, body)
     state0 = check_condition_and_add_torque_states(event, body, state0, torque, times[0])
+    condition = hoist_traced_numbers(condition, times[0], state0, body)
+    event = Event(condition, direction, max_step)
     if torque is None and solver is None and body is not None:
         return _crossings_of_run(ClosedFormRun(body, False), event, many, max_steps, state0, times)
     solver = require_explicit(solver)

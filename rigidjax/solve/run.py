@@ -30,6 +30,7 @@ from rigidjax.motion.equations import (
     project_to_group,
 )  # fmt: skip
 from rigidjax.motion.torques.base import Torque
+from rigidjax.motion.torques.composite import Sum
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import integrate_with_diffrax
 from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_or_nonfinite_input
@@ -98,7 +99,8 @@ class DiffraxRun(eqx.Module):
         # not have.
         solver = self.solver.solver if isinstance(self.solver, Projected) else self.solver
         reads_field = isinstance(solver, AbstractSplitting | Magnus4 | FreeSolver)
-        return self.controller is None and not reads_field
+        stops = self.controller is None or isinstance(self.controller, dfx.ConstantStepSize)
+        return stops and not reads_field
 
     @property
     def records_steps_for_derivatives(self) -> bool:
@@ -167,6 +169,20 @@ def equations_of_motion(
     elif isinstance(state0, Attitude):
         kind = AttitudeEquations
     return kind(body, torque)
+
+
+def hoist_traced_numbers(function: Any, *args: Any) -> Any:
+    """Return an equal function of `args` whose arrays include the traced numbers that it holds.
+
+    `function` is a torque or a condition. A derivative rule of our own sees no traced number in the
+    closure of a function of Python.
+    """
+    if isinstance(function, Sum):
+        return Sum(*(hoist_traced_numbers(part, *args) for part in function.parts))
+    if function is None or isinstance(function, eqx.Module):
+        return function
+    converted = eqx.filter_closure_convert(function, *args)
+    return function if _checks.is_known(converted) else converted
 
 
 def direction_of_times(times: Array) -> Int[Array, ""] | None:

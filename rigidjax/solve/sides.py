@@ -69,23 +69,23 @@ class Sided(eqx.Module):
         It is `t` itself, unless `t` is on the wrong side of a jump. In this case it is the nearest
         time on the correct side of the jump.
         """
-        if self.sign is None and self.stops is None:
-            return t
         still = lax.stop_gradient(jnp.asarray(t))
-        low = jnp.full_like(still, -jnp.inf)
-        now = still
+        # The oldest supported JAX has no derivative of `nextafter`, not even inside
+        # `stop_gradient`: `stop_gradient` is therefore applied to its argument.
+        low, high = (jnp.full_like(still, end) for end in (-jnp.inf, jnp.inf))
+        jumps = lax.stop_gradient(self.jumps.astype(still.dtype))
+        # A law may have the value before a jump at the time of the jump, as tables do at their last
+        # row. A step that begins there needs the value after it: in a run backwards that of the
+        # number before, else that of the next number.
+        closed = jumps[-1:] if isinstance(self.law, _OWN) else jumps
+        now = jnp.where(jnp.any(still == closed), jnp.nextafter(still, high), still)
         if self.sign is not None:
-            # At the time of a jump a law has the value after the jump. A step backwards in time
-            # that begins at the jump needs the value before the jump, so that the time is moved
-            # back by one floating-point number. The oldest supported JAX has no derivative of
-            # `nextafter`, not even inside `stop_gradient`: `stop_gradient` is therefore applied to
-            # its argument.
-            now = jnp.where(self.sign < 0, jnp.nextafter(still, low), still)
+            now = jnp.where(self.sign < 0, jnp.nextafter(still, low), now)
         if self.stops is not None:
-            jumps, stops = (a.astype(still.dtype) for a in (self.jumps, self.stops))
-            jumps = lax.stop_gradient(jumps)
-            new, before = now >= stops, jnp.nextafter(jumps, jnp.full_like(jumps, -jnp.inf))
-            now = jnp.maximum(now, jnp.max(jnp.where(new, jumps, -jnp.inf)))
+            stops = self.stops.astype(still.dtype)
+            new, after = now >= stops, jnp.nextafter(jumps, jnp.full_like(jumps, jnp.inf))
+            before = jnp.nextafter(jumps, jnp.full_like(jumps, -jnp.inf))
+            now = jnp.maximum(now, jnp.max(jnp.where(new, after, -jnp.inf)))
             now = jnp.minimum(now, jnp.min(jnp.where(new, jnp.inf, before)))
         return t + (now - still)
 

@@ -14,7 +14,6 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame
 from rigidjax.motion.coupled import Coupled
-from rigidjax.motion.torques.composite import Sum
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
 from rigidjax.solve.crossings import Event, check_condition_and_add_torque_states, solve_until_event
@@ -26,6 +25,7 @@ from rigidjax.solve.run import (
     DiffraxRun,
     direction_of_times,
     explain_max_steps_error,
+    hoist_traced_numbers,
     raise_if_scene_ended_run,
     raise_unless_complete,
     solve,
@@ -268,29 +268,13 @@ def _solve_to_accuracy(
     """
     # The derivative of the search is a rule of our own, which does not see traced numbers that a
     # function holds. They become arrays of the set-up, which the rule does see.
-    torque = _with_traced_numbers_as_arrays(setup.torque, times[0], state0, setup.body)
+    torque = hoist_traced_numbers(setup.torque, times[0], state0, setup.body)
     setup = dataclasses.replace(setup, torque=torque)
     found, run, search = solve_to_accuracy(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
     sol = _solve_run(found, event, state0, times, None if event is not None else run)
     error = estimate_error_of_run(found, times, sol._states, sol.stats["num_steps"], search)
     return store_error_and_warn(sol, error, accuracy)
-
-
-def _with_traced_numbers_as_arrays(torque: Any, t: Array, state: Any, body: Any) -> Any:
-    """Return a torque with equal values, whose arrays include the traced numbers that functions in
-    `torque` hold.
-
-    `t`, `state` and `body` are arguments of the torque, of which only the types are used. A torque
-    without such a function is returned unchanged.
-    """
-    if isinstance(torque, Sum):
-        parts = [_with_traced_numbers_as_arrays(part, t, state, body) for part in torque.parts]
-        return Sum(*parts)
-    if torque is None or isinstance(torque, eqx.Module):
-        return torque
-    converted = eqx.filter_closure_convert(torque, t, state, body)
-    return torque if _checks.is_known(converted) else converted
 
 
 def _solve_run(

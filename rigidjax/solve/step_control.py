@@ -24,15 +24,16 @@ from rigidjax.solve.adaptive_loop import (
 # The default norm of an error. It has the same value for a state as for the vector of all its
 # numbers.
 NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
+_SLIVER = 16  # units of round-off: no step is left that is so short
 
 
 def _make_property_of_controller(attribute: str) -> Any:
     """Define a property that reads an attribute of the step controller `self.controller`.
 
     The property is for a class that wraps a step controller. `attribute` is the name of the
-    attribute.
+    attribute. Equal steps have no tolerance: 0.
     """
-    return property(lambda self: getattr(self.controller, attribute))
+    return property(lambda self: getattr(self.controller, attribute, 0.0))
 
 
 class StandardController(dfx.AbstractAdaptiveStepSizeController):
@@ -233,9 +234,10 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
     A step that reaches a stop ends at the last floating-point number before the stop. The next step
     begins at the stop. It is at least as long as the previous step would have been without the
     stop. (`diffrax.ClipStepSizeController` chooses the next step by the length of the step that was
-    cut short at the stop, so that each stop costs several short steps.)
+    cut short at the stop, so that each stop costs several short steps.) A step that would end just
+    before a stop ends at the stop.
 
-    **Arguments:** `controller` is any adaptive controller of diffrax; `stops` (J,) are times in
+    **Arguments:** `controller` is any adaptive controller of diffrax, or `ConstantStepSize`; `stops` (J,) are times in
     increasing order.
 
     >>> Stopping(dfx.PIDController(rtol=1e-6, atol=1e-9), jnp.array([0.5])).rtol
@@ -275,11 +277,13 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
     ) -> tuple[Any, Any]:
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         index = jnp.sum(self.stops <= t0, dtype=jnp.int32)
-        return jnp.minimum(first, self._stop_and_last_time_before(index)[1]), (
-            inner,
-            first - t0,
-            index,
-        )
+        return self._end_of_step(t0, first - t0, index), (inner, first - t0, index)
+
+    def _end_of_step(self, t: RealLike, length: Any, stop_index: Array) -> Array:
+        """Return the end of a step from t, s, which is the next stop if that is not far beyond."""
+        end = self._stop_and_last_time_before(stop_index)[1]
+        near = end - _SLIVER * jnp.finfo(end.dtype).eps * jnp.abs(lax.stop_gradient(end))
+        return jnp.where(t + length > jnp.where(jnp.isinf(end), end, near), end, t + length)
 
     def _stop_and_last_time_before(self, stop_index: Array) -> tuple[Array, Array]:
         """Return the time of a stop, s, and the last floating-point time before it, s.
@@ -315,5 +319,5 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         length = jnp.where(reached, jnp.maximum(length, kept), length)
         left = jnp.where(reached, stop, left)
         index = jnp.where(reached, row_of_each_body(self.following, index), index)
-        right = jnp.minimum(left + length, self._stop_and_last_time_before(index)[1])
+        right = self._end_of_step(left, length, index)
         return keep, left, right, jumped | reached, (inner, length, index), result

@@ -117,7 +117,7 @@ class Tabulated(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         t = jnp.asarray(t, self.times.dtype)
-        inside = (t >= self.times[0]) & (t < self.times[-1])
+        inside = (t >= self.times[0]) & (t <= self.times[-1])
         value = _interpolate_linearly(self.times, self.torques, t)
         return jnp.where(inside, value, jnp.zeros_like(value))
 
@@ -164,7 +164,7 @@ class Pulses(AbstractTorque):
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         t = jnp.asarray(t, self.edges.dtype)
-        inside = (t >= self.edges[0]) & (t < self.edges[-1])
+        inside = (t >= self.edges[0]) & (t <= self.edges[-1])
         value = self.torques[
             jnp.clip(_index_of_row_at(self.edges, t), 0, self.torques.shape[0] - 1)
         ]
