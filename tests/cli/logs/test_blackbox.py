@@ -150,7 +150,7 @@ def test_without_the_parser_the_extra_is_named(tmp_path, monkeypatch):
     path = tmp_path / "flight.bbl"
     path.write_bytes(blackbox_log(ROWS))
     monkeypatch.setitem(sys.modules, "orangebox.reader", None)
-    with pytest.raises(LogError, match=r"pip install 'rigidjax\[blackbox\]'"):
+    with pytest.raises(LogError, match=r"pip install '.\[blackbox\]'"):
         read_table(path, ["time"])
 
 
