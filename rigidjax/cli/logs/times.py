@@ -158,7 +158,7 @@ def warn_of_gap_or_wrong_unit(
     ):
         warn(
             f"{path}: the step between two times is exactly 1 s: are they the numbers of rows or "
-            "frames? name the column of the times, or divide the numbers by those of a second"
+            "frames? name the column of the times, or divide by the number of frames a second"
         )
         return
     turns = step * typical_rate / (2 * np.pi)
