@@ -42,8 +42,10 @@ ACCELERATIONS = ("accSmooth", "accADC")
 # With the header `blackbox_high_resolution` these fields, and the rates, are ten times finer.
 _FINER = (*(f"rcCommand[{i}]" for i in range(4)), *(f"setpoint[{i}]" for i in range(3)))
 _SCALES = ("gyro_scale", "gyro.scale", "acc_1G", "blackbox_high_resolution")
-# A header with such a name changes a unit, except those of the voltage of the battery.
-_LIKE_A_SCALE = re.compile(r"(?!vbat|battery).*(scale|resolution|unit|lsb|_1g)", re.IGNORECASE)
+# A header with such a name may change the unit of the rates or of the accelerations.
+_LIKE_A_SCALE = re.compile(
+    r"(?=.*(gyro|acc|imu|log|blackbox))(?=.*(scale|resolution|unit|lsb|1g))", re.IGNORECASE
+)
 
 
 def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
@@ -411,7 +413,7 @@ def _factors_to_deg_per_s_and_g(
         (scale,) = struct.unpack("f", struct.pack("I", scale))
     # Some firmwares, such as Baseflight, have a scale to rad/µs; none to deg/s is so small.
     scale *= 1e6 * 180 / math.pi if scale < 1e-6 else 1.0
-    factors = dict.fromkeys(columns, 1.0)
+    factors, unscaled = dict.fromkeys(columns, 1.0), []
     for name in columns:
         stem = name.partition("[")[0]
         if stem in RATES or name in _FINER:
@@ -419,7 +421,10 @@ def _factors_to_deg_per_s_and_g(
         elif stem in ACCELERATIONS and one_g:
             factors[name] = 1.0 / float(one_g)
         if (stem in RATES and not gyro) or (stem in ACCELERATIONS and not one_g):
-            warn(f"{path}: no scale of {name} is in the header; it is read as logged")
+            unscaled.append(name)
+    if unscaled:
+        listed = ", ".join(unscaled)
+        warn(f"{path}: the header has no scale of the fields {listed}; they are read as logged")
     odd = [name for name in headers if _LIKE_A_SCALE.match(name) and name not in _SCALES]
     odd += ["blackbox_high_resolution"] if finer not in (0, 1) else []
     if odd and any(name.partition("[")[0] in RATES + ACCELERATIONS for name in columns):

@@ -104,7 +104,7 @@ def test_of_a_high_resolution_rates_and_commands_are_ten_times_finer(tmp_path):
 @pytest.mark.parametrize(
     ("lines", "words"),
     [
-        (["acc_1G:2048"], r"no scale of gyroADC\[0\] is in the header; it is read as logged"),
+        (["acc_1G:2048"], r"no scale of the fields gyroADC\[0\], gyroADC\[1\]; they are read as logged"),
         ([*SCALES, "gyro_resolution:3"], "change a unit in a way that is not known: gyro_resolution:3"),
         ([*SCALES, "blackbox_high_resolution:2"], "is not known: blackbox_high_resolution:2"),
     ],
@@ -113,7 +113,7 @@ def test_a_scale_that_is_not_known_is_said(lines, words, tmp_path):
     path = tmp_path / "flight.bbl"
     path.write_bytes(blackbox_log(ROWS, *lines))
     with pytest.warns(LogWarning, match=words):
-        read_table(path, ["gyroADC[0]"])
+        read_table(path, ["gyroADC[0]", "gyroADC[1]"])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert read_table(path, ["time"])["time"].size == len(ROWS)
