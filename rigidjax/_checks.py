@@ -524,15 +524,17 @@ def _accepts_arguments(value: Callable[..., Any], count: int) -> bool:
     return True
 
 
-def integer(value: object, name: str, least: int) -> int:
+def integer(value: object, name: str, least: int, most: int | None = None) -> int:
     """Return `value` as a Python integer. **Raises:** `TypeError` for anything but an integer of
-    Python or NumPy, such as a traced number; `ValueError` for one below `least`. The text `name`
-    names the argument in messages.
+    Python or NumPy, such as a traced number; `ValueError` for one below `least` or above `most`.
+    The text `name` names the argument in messages.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name}: wanted a whole number of Python, got {_number_or_type(value)}")
     if value < least:
         raise ValueError(f"{name}: wanted a whole number of at least {least}, got {value}")
+    if most is not None and value > most:
+        raise ValueError(f"{name}: wanted a whole number of at most {most}, got {value}")
     return int(value)
 
 
@@ -661,7 +663,7 @@ def random_key(value: object, name: str = "key") -> Array:
 
 def import_library(module: str, extra: str, caller: str) -> ModuleType:
     """Import the module of an optional package, and return it. **Raises:** `ModuleNotFoundError`
-    if the package is missing, with the command `pip install 'rigidjax[extra]'`.
+    if the package is missing, with the command that installs it.
 
     - `module`: the name of the module
     - `extra`: the name of the group of optional packages of rigidjax that contains the package
@@ -670,7 +672,7 @@ def import_library(module: str, extra: str, caller: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        words = f"{caller}: {module} is missing; pip install 'rigidjax[{extra}]'"
+        words = f"{caller}: {module} is missing; in the clone: pip install '.[{extra}]'"
         raise ModuleNotFoundError(words, name=module) from error
 
 

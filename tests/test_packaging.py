@@ -36,6 +36,20 @@ def test_the_version_is_one():
     assert re.search(r"^## (\S+)", changes, re.M)[1] == PROJECT["version"]
 
 
+def test_the_package_is_installed_from_a_clone():
+    """It is on no index: no message or page asks one for it."""
+    places = [
+        *ROOT.glob("rigidjax/**/*.py"),
+        *ROOT.glob("notebooks/**/*.ipynb"),
+        *ROOT.glob("notebooks/**/*.md"),
+    ]
+    for path in [ROOT / "README.md", *places]:
+        text = path.read_text(encoding="utf-8")
+        assert not re.search(r"pip install (-\w+ )*['\"]?rigidjax\[", text), path
+        for extra in re.findall(r"pip install ['\"]?\.\[([\w,]+)\]", text):
+            assert set(extra.split(",")) <= set(PROJECT["optional-dependencies"]), path
+
+
 def test_python_of_the_classifiers_is_allowed():
     named = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["classifiers"]))
     assert f">={named[0]}" == PROJECT["requires-python"]

@@ -70,7 +70,8 @@ def mesh_file(
 ) -> MassProperties:
     """Return the solid inside a closed mesh read from a file, such as STL, OBJ, PLY, OFF or GLB.
 
-    The package `trimesh` is needed (`pip install "rigidjax[mesh]"`); it also merges equal vertices.
+    The package `trimesh` is needed (`pip install '.[mesh]'` in the clone); it also merges equal
+    vertices.
 
     **Arguments:** `path` of the file; `density` kg/m³; `scale` metres per unit of the file (most
     STL files are in millimetres: 1e-3). **Raises:** `FileNotFoundError`; `ImportError` without
@@ -88,11 +89,7 @@ def mesh_file(
     path = os.fspath(path)
     if not os.path.isfile(path):
         raise FileNotFoundError(f"mesh_file: there is no file {path!r}")
-    try:
-        import trimesh
-    except ImportError as error:
-        words = 'mesh_file: reading meshes needs trimesh: pip install "rigidjax[mesh]"'
-        raise ImportError(words) from error
+    trimesh = _checks.import_library("trimesh", "mesh", "mesh_file")
     surface = trimesh.load_mesh(path)
     if not isinstance(surface, trimesh.Trimesh) or len(surface.faces) == 0:
         raise ValueError(f"mesh_file: wanted a file with triangles, {path!r} holds no triangles")

@@ -121,7 +121,7 @@ def _check_output_files(options: argparse.Namespace, parser: argparse.ArgumentPa
         # so that messages name the right file.
         options.figure = figure.with_name(figure.name.rstrip(".") + ".png")
     if figure is not None and not _prepare_matplotlib_if_installed():
-        parser.error("--figure: needs matplotlib: pip install 'rigidjax[view]'")
+        parser.error("--figure: matplotlib is missing; in the clone: pip install '.[view]'")
     if figure is not None and figure.suffix.strip("."):
         from matplotlib.backend_bases import FigureCanvasBase
 
@@ -587,7 +587,7 @@ def _prepare_matplotlib_if_installed() -> bool:
     try:
         import matplotlib
     except ModuleNotFoundError:
-        _print_line("no figures: matplotlib is missing (pip install 'rigidjax[view]')")
+        _print_line("no figures: matplotlib is missing (in the clone: pip install '.[view]')")
         return False
     matplotlib.use("Agg")
     return True

@@ -11,12 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax.cli.logs.errors import LogError
+from rigidjax.cli.logs.errors import LogError, warn
 from rigidjax.cli.logs.layouts import known_unit_of_column
 from rigidjax.cli.logs.table import read_table
 from rigidjax.cli.logs.times import mask_of_increasing, rows_to_use, warn_of_gap_or_wrong_unit
 from rigidjax.cli.logs.units import TIME_UNITS, UNITS, unit_of_columns
 from rigidjax.identify.data.recording import Recording
+from rigidjax.identify.data.reference_states import require_turning
 from rigidjax.identify.model import charts
 from rigidjax.identify.model.free import Free
 from rigidjax.identify.model.model import Model
@@ -45,6 +46,8 @@ SENSOR_UNITS = {
     "euler": ("rad", "deg"),
 }
 
+# No gyro reads much more than 4000 deg/s; this bound is in rad/s.
+FASTEST_GYRO = 70.0
 _WHEEL_UNITS = ("rad/s", "rpm")
 
 
@@ -188,9 +191,9 @@ def read_log(
       flight.
 
     It **warns** as `read_table` does, of rows that are left out because their times do not
-    increase, of a long gap, of times that are plainly in another unit, and of an unknown unit in
-    the name of a column. **Raises** `LogError` as `read_table` does, and for rates that are all
-    zero.
+    increase, of a long gap, of times that are plainly in another unit or no times, of rates that no
+    gyro reads, and of an unknown unit in the name of a column. **Raises** `LogError` as
+    `read_table` does, and for rates that are all zero.
     """
     unit = unit_of_time(path, time, time_unit)
     # The dict has each column once: two wheels may have their speeds in the same column, and
@@ -212,7 +215,7 @@ def read_log(
         values *= factor
         mask = np.isfinite(values).all(axis=1)
         if one.kind == "gyro":
-            rate = _median_body_rate(path, one, values[kept][mask[kept]])
+            rate = _median_body_rate(path, one, factor, values[kept][mask[kept]])
         sensor, values = _sensor_and_readings(one, values, factor, "bias" in free)
         readings.append((sensor, values[kept], mask[kept]))
     warn_of_gap_or_wrong_unit(path, t[kept], unit, rate)
@@ -257,24 +260,34 @@ def unit_of_time(path: str | Path, column: str, stated_unit: str | None) -> str:
     return unit_of_columns([column], stated_unit, usual, TIME_UNITS, str(path))
 
 
-def _median_body_rate(path: str | Path, channel: Channel, rates: np.ndarray) -> float:
-    """Return the median magnitude of the body rates, rad/s. Raise `LogError` if there are no rates,
-    or if all rates are zero.
+def _median_body_rate(
+    path: str | Path, channel: Channel, factor: float, rates: np.ndarray
+) -> float:
+    """Return the median magnitude of the body rates, rad/s, or zero after a warning that no gyro
+    reads such rates. Raise `LogError` if there are no rates, or if all rates are zero.
 
     - `path`: the path of the log, for the message.
     - `channel`: the gyro, with the names of its columns, for the message.
+    - `factor`: the factor from the unit of the gyro to rad/s.
     - `rates`: (n, 3) the rates, rad/s.
     """
     names = ", ".join(channel.columns)
     if not rates.size:
         raise LogError(f"{path}: no row has a rate in each of the columns {names}")
-    if not rates.any():
-        raise LogError(
-            f"{path}: the rates ({names}) are all zero: a body at rest shows nothing of its "
-            "inertia, or the sensor was off; choose other columns by --columns, another part by "
-            "--window"
-        )
-    return float(np.median(np.linalg.norm(rates, axis=1)))
+    try:
+        require_turning(rates, f"{path}: the rates ({names})")
+    except ValueError as error:
+        raise LogError(f"{error} (--columns, --window)") from None
+    # Single rates may be wrong: the largest hundredth does not count.
+    fastest = float(np.quantile(np.abs(rates).max(axis=1), 0.99, method="lower"))
+    if fastest < FASTEST_GYRO:
+        return float(np.median(np.linalg.norm(rates, axis=1)))
+    unit = ", or deg/s (--unit deg/s)" if factor == 1 else ""
+    warn(
+        f"{path}: the rates ({names}) reach {fastest:.3g} rad/s, which no gyro reads: are they raw "
+        f"counts of the sensor (divide them by its scale, such as 16.4 for each deg/s){unit}?"
+    )
+    return 0.0
 
 
 def _sensor_and_readings(

@@ -1,9 +1,9 @@
 """Provide the position and attitude of the Moon, 1900 to 2199, from JPL's ephemeris DE421.
 
 W. M. Folkner, J. G. Williams, D. H. Boggs, "The planetary and lunar ephemeris DE421", IPN Progress
-Report 42-178 (2009). The numbers are read from the package `de421` (`pip install
-'rigidjax[moon]'`). World axes are those of the ICRF, body axes the Moon's principal axes; times are
-barycentric dynamical time.
+Report 42-178 (2009). The numbers are read from the package `de421` (`pip install '.[moon]'` in the
+clone). World axes are those of the ICRF, body axes the Moon's principal axes; times are barycentric
+dynamical time.
 """
 
 from importlib.util import find_spec
@@ -75,7 +75,7 @@ class Moon(eqx.Module):
         spec = find_spec("de421")
         if spec is None or spec.origin is None:
             raise ModuleNotFoundError(
-                "datasets.moon reads the package de421: pip install 'rigidjax[moon]'", name="de421"
+                "datasets.moon: de421 is missing; in the clone: pip install '.[moon]'", name="de421"
             )
         days = [(_checks.python_float(year, "year") - 2000) * 365.25 + 2451545.0 - _FIRST
                 for year in (first, last)]  # fmt: skip

@@ -215,11 +215,7 @@ def player(
     seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
     _, q = evenly_spaced_times_and_attitudes(ts, states, pictures)
     box = _box_corners_axis_end_and_half_diagonal(body)
-    try:
-        import viser
-    except ModuleNotFoundError as error:
-        words = "rigidjax.plot.player needs viser: pip install 'rigidjax[view]'"
-        raise ModuleNotFoundError(words) from error
+    viser = _checks.import_library("viser", "view", "plot.player")
     import rich
 
     # The server of viser only records the commands that it gets; no browser has to connect to it.

@@ -26,12 +26,7 @@ def pyplot() -> Any:
 
     **Raises:** `ModuleNotFoundError` without matplotlib; the message names the extra `view`.
     """
-    try:
-        import matplotlib.pyplot as plt
-    except ModuleNotFoundError as error:
-        words = "rigidjax.plot needs matplotlib: pip install 'rigidjax[view]'"
-        raise ModuleNotFoundError(words) from error
-    return plt
+    return _checks.import_library("matplotlib.pyplot", "view", "plot")
 
 
 def unit_factor(unit: str, units: dict[str, float], name: str) -> float:

@@ -28,7 +28,7 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
 
     **Returns** a `matplotlib` figure.
 
-    **Raises:** `ModuleNotFoundError` if matplotlib is missing (`pip install 'rigidjax[view]'`);
+    **Raises:** `ModuleNotFoundError` if matplotlib is missing (`pip install '.[view]'`);
     `ValueError` if there is nothing to draw.
     """
     records = [r for r in require_measurements(records) if r.error == r.error]

@@ -327,6 +327,7 @@ REFUSED = [
     (["log.csv", "--figure", "."], "is a folder"),
     (["log.csv", "--json", "absent/n.json"], "there is no folder absent"),
     (["log.csv", "--starts", "0"], "starts: wanted a whole number of at least 1, got 0"),
+    (["log.csv", "--starts", "100000000000"], "starts: wanted a whole number of at most 10000, got 100000000000"),
     (["log.csv", "--sensor", "gyro=wx,wy,wz", "--unit", "deg/s"], "--unit: not together with --sensor"),
     (["log.csv", "--sensor", "gyro=wx,wy,wz", "--noise", "1"], "--noise: not together with --sensor"),
     (["log.csv", "--flight", "2"], "log.csv: flight 2: only a Blackbox log (.bbl, .bfl) has flights"),

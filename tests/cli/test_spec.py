@@ -1,5 +1,6 @@
 """Recordings from files as loggers write them: times, windows, units."""
 
+import re
 import warnings
 
 import numpy as np
@@ -143,6 +144,29 @@ def test_times_in_another_unit_are_remarked_upon(tmp_path):
 def test_a_kind_of_sensor_that_is_none_is_refused(kind):
     with pytest.raises(LogError, match="wanted gyro, accelerometer, quaternion or euler-SEQUENCE"):
         spec.parse_channel(f"{kind}=a,b,c")
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "hint"),
+    [("rad/s", 131 * 180 / np.pi, r", or deg/s \(--unit deg/s\)\?"), ("deg/s", 131 * 180 / np.pi, r"\?$")],
+)  # fmt: skip
+@pytest.mark.parametrize("time_unit", ["s", "ms"])
+def test_rates_that_no_gyro_reads_are_said(unit, factor, hint, time_unit, tmp_path):
+    """And nothing about the unit of the times, as one wrong row says nothing about the rates."""
+    scale = 1.0 if time_unit == "s" else 1e3
+    gyro = [spec.Channel("gyro", ("wx", "wy", "wz"), unit, None)]
+    path = written(tmp_path, scale * T, np.round(factor * RATES))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        spec.read_log(path, gyro, time_unit=time_unit)
+    words = r"log.csv: the rates \(wx, wy, wz\) reach .* rad/s, which no gyro reads: are they raw counts"
+    (only,) = map(str, (w.message for w in said if issubclass(w.category, LogWarning)))
+    assert re.search(words + ".*" + hint, only), only
+    values = RATES.copy()
+    values[3] = 9e9
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", LogWarning)
+        spec.read_log(written(tmp_path, T, values), GYRO)
 
 
 @pytest.mark.parametrize("window", [None, (0.5, 1.0)])

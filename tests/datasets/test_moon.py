@@ -13,7 +13,7 @@ import rigidjax as rj
 from rigidjax.datasets import moon
 
 there = pytest.mark.skipif(
-    find_spec("de421") is None, reason="the ephemeris is missing: pip install 'rigidjax[moon]'"
+    find_spec("de421") is None, reason="the ephemeris is missing: pip install '.[moon]'"
 )
 
 
@@ -63,7 +63,7 @@ def test_years_outside_are_refused():
 
 def test_without_the_package_it_says_what_to_install(monkeypatch):
     monkeypatch.setattr(moon, "find_spec", lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'rigidjax\[moon\]'"):
+    with pytest.raises(ModuleNotFoundError, match=r"pip install '.\[moon\]'"):
         moon.Moon(1970.0, 1971.0)
 
 

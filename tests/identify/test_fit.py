@@ -244,6 +244,7 @@ def test_what_cannot_be_seen_is_said():
 MISTAKES = [
     (([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]])), r"Gyro: wanted readings of shape \(2, 3\), got \(1, 3\)"),
     (([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0], [np.nan, 0, 0]])), "Gyro: the reading at index 1 contains NaN; mask it"),
+    (([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0], [-np.inf, 0, 0]])), "Gyro: the reading at index 1 is infinite; mask it"),
     (([0.0, 1.0], (rj.identify.AttitudeSensor(), [[1.0, 0, 0, 0], [2.0, 0, 0, 0]])), "quaternion at index 1 is not unit.*scalar first"),
     (([1.0, 0.0], (rj.identify.Gyro(), np.zeros((2, 3)))), r"t\[1\] is not above"),
     (([0.0, np.nan], (rj.identify.Gyro(), np.zeros((2, 3)))), "t: contains NaN or infinity at index 1"),
@@ -259,6 +260,33 @@ def test_mistakes_in_a_recording_are_named(arguments, words):
         rj.identify.Recording(*arguments)
 
 
+@pytest.mark.parametrize(
+    ("sensor", "values"),
+    [
+        (rj.identify.Gyro(0.01), np.zeros((40, 3))),
+        (rj.identify.AttitudeSensor(0.01), np.tile([0.6, 0.48, 0.64, 0.0], (40, 1))),
+    ],
+)
+def test_a_body_at_rest_is_refused_in_words(sensor, values):
+    """As the command line says it, also with a start of one's own."""
+    record = rj.identify.Recording(0.1 * np.arange(40), (sensor, values))
+    model = rj.identify.Model(record, rj.identify.Ratios())
+    words = (
+        "fit: the rates of recording 1 are all zero: a body at rest shows nothing of its inertia"
+    )
+    for how in ({}, {"starts": 1, "initial": jnp.zeros(model.size)}):
+        with pytest.raises(ValueError, match=words):
+            rj.identify.fit(model, **how)
+
+
+def test_a_recording_at_rest_beside_one_in_motion_is_named(tumble):
+    _, ts, ys = tumble
+    rates = [ys.omega, jnp.zeros_like(ys.omega)]
+    records = [rj.identify.Recording(ts, (rj.identify.Gyro(0.01), one)) for one in rates]
+    with pytest.raises(ValueError, match="fit: the rates of recording 2 are all zero"):
+        rj.identify.fit(rj.identify.Model(records, rj.identify.Ratios()))
+
+
 @pytest.mark.usefixtures("unhooked")
 def test_other_mistakes_are_named(tumble):
     _, ts, ys = tumble
@@ -266,6 +294,9 @@ def test_other_mistakes_are_named(tumble):
     problem = rj.identify.Model(record, rj.identify.Ratios())
     with pytest.raises(TypeError, match="wanted a Model, got Recording"):
         rj.identify.fit(record)
+    for many in (10_001, 10**11):
+        with pytest.raises(ValueError, match=f"starts: wanted .* at most 10000, got {many}"):
+            rj.identify.fit(problem, starts=many)
     half = eqx.tree_at(lambda r: r.t, record, record.t.astype(jnp.float16))
     with pytest.raises(TypeError, match="recording: wanted float32 or float64, got float16"):
         rj.identify.Model(half, rj.identify.Ratios())

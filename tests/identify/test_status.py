@@ -208,6 +208,15 @@ RIGHT = (
 )  # fmt: skip
 
 
+def test_numbers_of_frames_as_times_are_among_the_causes():
+    """A motion in 50 frames a second: its rates are then as wrong as those in deg/s."""
+    ts = 0.02 * np.arange(80)
+    rates = rj.simulate(BODY, rj.Spin([3.0, 1.5, 2.0]), ts).ys.omega
+    rates += 0.01 * np.random.default_rng(5).normal(size=rates.shape)
+    (cause,) = gyro(rates, ts=50 * ts).causes
+    assert cause.words == "most likely numbers of frames read as times, or deg/s read as rad/s"
+
+
 @pytest.mark.parametrize(
     "name", [*FEW_WRONG, *(pytest.param(name, marks=pytest.mark.slow) for name in WRONG)]
 )

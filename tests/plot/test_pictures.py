@@ -369,7 +369,7 @@ def test_words_on_mistakes(flip, monkeypatch):
     with pytest.raises(ValueError, match="fps: wanted a positive number, got 0"):
         rj.plot.tumble(BODY, flip.ts, flip.ys, fps=0)
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'rigidjax\[view\]'"):
+    with pytest.raises(ModuleNotFoundError, match=r"pip install '.\[view\]'"):
         rj.plot.motion(flip.ts, flip.ys)
 
 

@@ -21,17 +21,31 @@ from rigidjax import _checks
 from rigidjax.cli.logs.columns import Columns
 from rigidjax.cli.logs.errors import LogError, warn
 
-# The first three numbers are bounds of the flight controllers' own decoder: the longest frame in
-# bytes, and the largest jumps of the iteration and of the time, µs, between two frames. The
-# counters of iteration and time have 32 bits, so that they start again from zero where they would
-# reach _WRAP.
-_LONGEST_FRAME, _ITERATION_JUMP, _TIME_JUMP, _WRAP = 256, 5_000, 10_000_000, 2**32
+# The first two numbers are bounds of the flight controllers' own decoder: the largest jumps of the
+# iteration and of the time, µs, between two frames. The counters of iteration and time have 32
+# bits, so that they start again from zero where they would reach _WRAP. That decoder has a bound on
+# the length of a frame, too, 256 bytes; it is not used here, since frames of many fields are
+# longer.
+_ITERATION_JUMP, _TIME_JUMP, _WRAP = 5_000, 10_000_000, 2**32
 # An event is a record of the log without readings. For each kind of event this table has the number
 # of integers of variable length that follow the kind in the log.
 _EVENT_NUMBERS = {0: 1, 14: 2, 15: 1, 30: 2}
 _RESUME, _ADJUSTMENT, _LOG_END = 14, 13, 255
 _END_MARK = b"End of log\0"
 _ERASED = re.compile(rb"[\xff\0]*\Z")
+_HEADER = re.compile(rb"(?:H [^\n]*\n)*")
+# A flight with frames: behind the lines of its header somewhere is the letter of an I frame.
+_WITH_FRAMES = re.compile(rb"(?:H [^\n]*\n)+(?!H ).*?I", re.DOTALL)
+# Fields of rates and of accelerations, by their names in old and new logs of several firmwares.
+RATES = ("gyroADC", "gyroData", "gyroUnfilt", "gyroRaw", "gyroRAW")
+ACCELERATIONS = ("accSmooth", "accADC")
+# With the header `blackbox_high_resolution` these fields, and the rates, are ten times finer.
+_FINER = (*(f"rcCommand[{i}]" for i in range(4)), *(f"setpoint[{i}]" for i in range(3)))
+_SCALES = ("gyro_scale", "gyro.scale", "acc_1G", "blackbox_high_resolution")
+# A header with such a name may change the unit of the rates or of the accelerations.
+_LIKE_A_SCALE = re.compile(
+    r"(?=.*(gyro|acc|imu|log|blackbox))(?=.*(scale|resolution|unit|lsb|1g))", re.IGNORECASE
+)
 
 
 def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
@@ -44,26 +58,34 @@ def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None)
     the end of the file.
 
     Rates are in deg/s and accelerations in g, by the scales in the header, as in the flight
-    controllers' own viewer; other fields are as logged. **Raises** `LogError` if there are several
-    flights and `flight` is `None`.
+    controllers' own viewer; other fields are as logged. It **warns** of a scale that is missing or
+    not known. **Raises** `LogError` if no flight has frames, if several have and `flight` is
+    `None`, and for a flight without frames.
     """
     library = _checks.import_library("orangebox.reader", "blackbox", str(path))
-    pointers = library.Reader(str(path)).log_pointers
-    if flight is None and len(pointers) > 1 and columns:
-        ends = [*pointers[1:], path.stat().st_size]
-        sizes = ", ".join(f"{(b - a) / 1e3:.3g}" for a, b in zip(pointers, ends, strict=True))
+    begins, whole = library.Reader(str(path)).log_pointers, path.read_bytes()
+    if flight is not None and not 1 <= flight <= len(begins):
+        raise LogError(f"{path}: wanted a flight from 1 to {len(begins)}, got {flight}")
+    flights = dict(enumerate(map(slice, begins, [*begins[1:], len(whole)]), 1))
+    full = [n for n, at in flights.items() if _WITH_FRAMES.match(whole, at.start, at.stop)]
+    some = ", ".join(map(str, full))
+    if not full:
+        raise LogError(f"{path}: no frames in this log; is it whole, and a Blackbox log?")
+    if flight is None and len(full) > 1:
+        sizes = ", ".join(f"{(flights[n].stop - flights[n].start) / 1e3:.3g}" for n in full)
+        rest = len(flights) - len(full)
         raise LogError(
-            f"{path}: {len(pointers)} flights are in this log, of {sizes} kB; choose one: "
-            f"--flight 1 to {len(pointers)} (flight= in Python)"
+            f"{path}: {len(full)} flights are in this log, of {sizes} kB"
+            + (f" ({rest} more have a header only)" if rest else "")
+            + f"; choose one: --flight {some if rest else f'1 to {len(full)}'} (flight= in Python)"
         )
-    if flight is not None and not 1 <= flight <= len(pointers):
-        raise LogError(f"{path}: wanted a flight from 1 to {len(pointers)}, got {flight}")
-    index = flight or 1
-    data = path.read_bytes()[pointers[index - 1] : (*pointers, None)[index]]
+    index = flight or full[0]
+    if index not in full:
+        raise LogError(f"{path}: flight {index} has a header only; flights with frames: {some}")
+    data = whole[flights[index]]
     log = _Flight(library.Reader(str(path), index), data)
-    factors = _factors_to_deg_per_s_and_g(log.headers)
-    wanted = [name for name in columns if name in log.names]
-    rows, groups = {name: array("d") for name in wanted}, array("q")
+    rows = {name: array("d") for name in columns if name in log.names}
+    factors, groups = _factors_to_deg_per_s_and_g(path, log.headers, list(rows)), array("q")
     for group, frame in log.decode_frames_with_groups():
         groups.append(group)
         for name, numbers in rows.items():
@@ -76,8 +98,7 @@ def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None)
             "that is missing, or on a frame that is damaged"
         )
     return log.names, {
-        name: log.wrap_to_32_bits(name, np.frombuffer(numbers, float)[keep])
-        * factors.get(name.partition("[")[0], 1.0)
+        name: log.wrap_to_32_bits(name, np.frombuffer(numbers, float)[keep]) * factors[name]
         for name, numbers in rows.items()
     }
 
@@ -145,7 +166,7 @@ class _Flight:
         """
         order, lost = self.order, 0
         stream, others = (
-            _Bytes(self.data, self._header_size_in_bytes()),
+            _Bytes(self.data, _HEADER.match(self.data).end()),  # pyright: ignore
             dict.fromkeys(self.others, np.nan),
         )
         while stream.place < len(self.data):
@@ -173,8 +194,7 @@ class _Flight:
                 values = self._decode_frame(stream, kind)
             except IndexError:
                 values = ()
-            size = stream.place - begin
-            if not values or size > _LONGEST_FRAME or not self._is_frame_or_end_at(stream.place):
+            if not values or not self._is_frame_or_end_at(stream.place):
                 # This frame is damaged, so that its decoder may have read beyond the letter with
                 # which the next frame begins. Reading therefore begins again after the letter of
                 # this frame.
@@ -220,13 +240,6 @@ class _Flight:
         except IndexError:
             return False
         return stream.place == len(self.data) or self.data[stream.place] in self.kinds
-
-    def _header_size_in_bytes(self) -> int:
-        """Return the index of the first byte after the header of this flight in the data."""
-        place = 0
-        while self.data.startswith(b"H ", place):
-            place = self.data.index(b"\n", place) + 1
-        return place
 
     def _decode_frame(self, stream: _Bytes, frame_type: Any) -> tuple[Any, ...]:
         """Return the numbers of one frame (a record of the log), decoded from the bytes that begin
@@ -382,22 +395,39 @@ def _closely_follows_frame(last_frame: Sequence[int], frame: Sequence[int]) -> b
     return iteration < _ITERATION_JUMP and time < _TIME_JUMP
 
 
-def _factors_to_deg_per_s_and_g(headers: Mapping[str, Any]) -> dict[str, float]:
-    """Return the factors that convert the raw integers of a log: rates to deg/s, accelerations to
-    g.
+def _factors_to_deg_per_s_and_g(
+    path: Path, headers: Mapping[str, Any], columns: Sequence[str]
+) -> dict[str, float]:
+    """Return the factor of each of the `columns`, which converts the integers of the log at `path`:
+    rates to deg/s, accelerations to g, and commands to their usual unit.
 
-    `headers` holds the entries of the header of the log, by name. The keys of the result are the
-    names of the fields, `gyroADC` (rates) and `accSmooth` (accelerations), without an index; a
-    field whose scale is not in the header has no factor.
+    It warns of a scale that is missing in the `headers`, and of a header that may change a unit in
+    a way that is not known.
     """
-    factors = {}
-    if "gyro_scale" in headers:
-        value = headers["gyro_scale"]
-        # In the header the scale of the gyro is a float of 32 bits, whose bits the parser of the
-        # header may have read as an integer.
-        scale = struct.unpack("f", struct.pack("I", value))[0] if isinstance(value, int) else value
-        baseflight = "baseflight" in str(headers.get("Firmware type", "")).lower()
-        factors["gyroADC"] = scale * (1e6 * 180 / math.pi if baseflight else 1.0)
-    if "acc_1G" in headers:
-        factors["accSmooth"] = 1.0 / float(headers["acc_1G"])
+    finer = headers.get("blackbox_high_resolution", 0)
+    gyro, one_g = headers.get("gyro_scale", headers.get("gyro.scale")), headers.get("acc_1G")
+    # In the header the scale of the gyro is a float of 32 bits, whose bits the parser of the header
+    # may have read as an integer.
+    scale = gyro or 1.0
+    if isinstance(scale, int):
+        (scale,) = struct.unpack("f", struct.pack("I", scale))
+    # Some firmwares, such as Baseflight, have a scale to rad/µs; none to deg/s is so small.
+    scale *= 1e6 * 180 / math.pi if scale < 1e-6 else 1.0
+    factors, unscaled = dict.fromkeys(columns, 1.0), []
+    for name in columns:
+        stem = name.partition("[")[0]
+        if stem in RATES or name in _FINER:
+            factors[name] = (scale if stem in RATES else 1.0) / (10 if finer else 1)
+        elif stem in ACCELERATIONS and one_g:
+            factors[name] = 1.0 / float(one_g)
+        if (stem in RATES and not gyro) or (stem in ACCELERATIONS and not one_g):
+            unscaled.append(name)
+    if unscaled:
+        listed = ", ".join(unscaled)
+        warn(f"{path}: the header has no scale of the fields {listed}; they are read as logged")
+    odd = [name for name in headers if _LIKE_A_SCALE.match(name) and name not in _SCALES]
+    odd += ["blackbox_high_resolution"] if finer not in (0, 1) else []
+    if odd and any(name.partition("[")[0] in RATES + ACCELERATIONS for name in columns):
+        listed = ", ".join(f"{name}:{headers[name]}" for name in odd)
+        warn(f"{path}: a header may change a unit in a way that is not known: {listed}")
     return factors

@@ -3,6 +3,7 @@ part or whose units are doubtful.
 """
 
 import warnings
+from collections.abc import Sequence
 
 from rigidjax import _checks
 
@@ -24,6 +25,14 @@ class LogWarning(UserWarning):
     """Describe which part of a log (a file of measurements) is left out, or why the units of the
     log are doubtful.
     """
+
+
+def list_names(names: Sequence[str]) -> str:
+    """Return the `names` of the columns of a log for a message; of many names or a long one only
+    the first part.
+    """
+    more = f", and {len(names) - 40} more" if len(names) > 40 else ""
+    return ", ".join(name[:60] for name in names[:40]) + more
 
 
 def warn(words: str) -> None:

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
+from rigidjax.cli.logs.blackbox import ACCELERATIONS, RATES
 from rigidjax.cli.logs.table import BINARY, lowercase_file_ending
 from rigidjax.cli.logs.text import open_text, read_header
 from rigidjax.cli.logs.units import TIME_UNITS, unit_in_column_name
@@ -28,7 +29,7 @@ USUAL = ImuColumns(("t", "wx", "wy", "wz"), "rad/s", "s")
 # For each ending of the file name of a binary log, this table has the units of fields whose names
 # do not contain a unit.
 _UNITS = {
-    ".bbl": {"time": "us", "gyroADC": "deg/s", "accSmooth": "g"},
+    ".bbl": {"time": "us"} | dict.fromkeys(RATES, "deg/s") | dict.fromkeys(ACCELERATIONS, "g"),
     ".ulg": {"timestamp": "us"},
     ".usd": {"timestamp": "us", "gyro": "deg/s", "acc": "g"},
 }

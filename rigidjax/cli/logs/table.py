@@ -14,7 +14,7 @@ from rigidjax.cli.logs import text
 from rigidjax.cli.logs.arrays import read_mat, read_npz
 from rigidjax.cli.logs.blackbox import read_blackbox
 from rigidjax.cli.logs.crazyflie import FIRST_BYTE, read_crazyflie
-from rigidjax.cli.logs.errors import LogError, LogWarning
+from rigidjax.cli.logs.errors import LogError, LogWarning, list_names
 from rigidjax.cli.logs.mcap import read_mcap
 from rigidjax.cli.logs.ulog import read_ulog
 
@@ -42,8 +42,8 @@ def read_table(
       such line may be the header itself, as in files of `numpy.savetxt`. Text is read line by line,
       so that reading needs up to three times the memory of the numbers that are read.
     - `.npz`, `.mat` (MATLAB up to v7), or a Crazyflie's µSD log (without ending, or `.usd`).
-    - With the extra of the same name (`pip install 'rigidjax[blackbox]'`): `blackbox` (`.bbl`,
-      `.bfl`), `ulog` of PX4 (`.ulg`), `mcap` (JSON and ROS 2).
+    - With the extra of the same name (`pip install '.[blackbox]'` in the clone): `blackbox`
+      (`.bbl`, `.bfl`), `ulog` of PX4 (`.ulg`), `mcap` (JSON and ROS 2).
 
     **Arguments:**
 
@@ -141,9 +141,7 @@ def _read_binary_columns(
     out = {}
     for name in columns:
         if name not in arrays:
-            more = f", and {len(names) - 40} more" if len(names) > 40 else ""
-            listed = ", ".join(names[:40]) + more
-            raise LogError(f"{path}: no array {name!r}; the arrays are {listed}")
+            raise LogError(f"{path}: no array {name!r}; the arrays are {list_names(names)}")
         if np.asarray(arrays[name]).dtype.kind not in "biuf":
             raise LogError(f"{path}: array {name!r} does not hold real numbers")
         out[name] = np.asarray(arrays[name], float).reshape(-1)

@@ -16,9 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidjax.cli.logs.errors import LogError
+from rigidjax.cli.logs.errors import LogError, list_names
 
 SEPARATORS = ",;\t"
+# A packed log is refused if it unpacks to more than _LARGE bytes and _MOST_TIMES its size; readings
+# unpack to some ten times their size.
+_LARGE, _MOST_TIMES = 10_000_000, 100
 
 
 def open_text(path: Path) -> io.TextIOWrapper:
@@ -26,12 +29,29 @@ def open_text(path: Path) -> io.TextIOWrapper:
     from its first bytes.
     """
     packed = path.suffix.lower() == ".gz"
+    if packed:
+        _refuse_if_packed_too_well(path)
     raw: Any = gzip.open(path, "rb") if packed else path.open("rb")
     try:
         return io.TextIOWrapper(raw, encoding=_encoding_of_first_bytes(raw.peek(8192)), newline="")
     except BaseException:
         raw.close()
         raise
+
+
+def _refuse_if_packed_too_well(path: Path) -> None:
+    """Raise `LogError` if a packed file unpacks to far more than its size, as no readings do: it
+    would fill the memory, or take minutes.
+    """
+    most, unpacked = max(_LARGE, _MOST_TIMES * path.stat().st_size), 0
+    with gzip.open(path, "rb") as file:
+        while piece := file.read(2**20):
+            unpacked += len(piece)
+            if unpacked > most:
+                raise LogError(
+                    f"{path}: unpacks to more than {_MOST_TIMES} times its size: nearly all its "
+                    "lines are the same, so that it holds no readings"
+                )
 
 
 def _encoding_of_first_bytes(first_bytes: bytes) -> str:
@@ -106,6 +126,8 @@ def read_columns(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dic
     header, separator, top, after = read_header(file)
     if not any(header):
         raise LogError(f"{path}: line 1: wanted a header with the columns {', '.join(columns)}")
+    if any("\0" in name for name in header):
+        raise LogError(f"{path}: line {top}: holds zero bytes, so that it is no text")
     for name in columns:
         if name not in header:
             advice = (
@@ -114,7 +136,7 @@ def read_columns(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dic
                 else "name yours with --columns or --sensor"
             )
             raise LogError(
-                f"{path}: line {top}: no column {name!r}; the columns are {', '.join(header)} "
+                f"{path}: line {top}: no column {name!r}; the columns are {list_names(header)} "
                 f"({advice})"
             )
         if header.count(name) > 1:
@@ -169,7 +191,7 @@ class _NumberReader:
             value = float(plain if plain.isascii() and "_" not in plain else "")
         except ValueError:
             comma = "; a decimal comma? wanted a point" if "," in cell else ""
-            raise ValueError(f"{cell!r} is not a number{comma}") from None
+            raise ValueError(f"{cell[:60]!r} is not a number{comma}") from None
         if not math.isfinite(value):
             raise ValueError(f"{cell} is not a finite number; leave the cell empty for a gap")
         return value

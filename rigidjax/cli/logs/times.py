@@ -17,6 +17,8 @@ _FEWEST = 4
 # step outside of the range _ODD_STEPS is doubtful.
 _USUAL_STEPS = (1e-5, 1.0)
 _ODD_STEPS = (1e-7, 1e3)
+# Times 0, 1, 2, … s are believed if the body turns by less than this, rad, from one to the next.
+_SLOW = 0.1
 # A gap longer than this many median steps means that the clock was set, or that the logger was off.
 _GAP = 1e5
 
@@ -147,6 +149,18 @@ def warn_of_gap_or_wrong_unit(
             f"{path}: no time between {t[row]:.6g} and {t[row + 1]:.6g} s, other steps are "
             f"{step:.3g} s; choose a part by --window"
         )
+    counts = (t - t[0]) / UNITS[time_unit]
+    if (
+        time_unit == "s"
+        and np.median(np.diff(counts)) == 1
+        and (counts == np.round(counts)).all()
+        and not 0 < typical_rate < _SLOW
+    ):
+        warn(
+            f"{path}: the step between two times is exactly 1 s: are they the numbers of rows or "
+            "frames? name the column of the times, or divide by the number of frames a second"
+        )
+        return
     turns = step * typical_rate / (2 * np.pi)
     if _ODD_STEPS[0] <= step <= _ODD_STEPS[1] and turns < 1:
         return

@@ -118,6 +118,9 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None
     if not least < min(bound, LITTLE):
         return None
     words = " or ".join(name for name, left in ratios.items() if left <= EQUAL * least)
+    if all(np.median(np.diff(recording.t)) == 1 for recording in recordings):
+        # The motion shows the product of rates and times only.
+        words = words.replace("deg/s read", "numbers of frames read as times, or deg/s read")
     return Cause("misread", "Gyro", 1.0, f"most likely {words}", f"read the log again: {words}")
 
 

@@ -18,6 +18,7 @@ from rigidjax import _checks
 from rigidjax.identify.answer.assess import assess
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
+from rigidjax.identify.data.reference_states import rates, require_turning
 from rigidjax.identify.model.model import Model, require_numbers
 from rigidjax.identify.model.predict import AbstractIntegrator, Adaptive
 from rigidjax.identify.model.terms import all_errors
@@ -59,6 +60,8 @@ _MATTERS = 0.05
 # itself. A spread does not fall below _LEAST times its first value; this least value stands for
 # zero.
 _ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
+# All starting points are in memory at once.
+_MOST_STARTS = 10_000
 
 
 def fit(
@@ -113,9 +116,10 @@ def fit(
     CPU, and the report says so. Within `jax.default_device(…)`, or if an array of the model was put
     on a device, the fit runs on that device.
 
-    **Raises:** `TypeError` unless `model` is a `Model`. `ValueError` for fewer than one start; for
-    more than 1000 free numbers that recordings share (`descend` takes any number); and for a
-    checkpoint that is damaged, belongs to another model, or lies in a folder that does not exist.
+    **Raises:** `TypeError` unless `model` is a `Model`. `ValueError` for fewer than one start or
+    more than 10 000; for a body whose rates in a recording are all zero; for more than 1000 free
+    numbers that recordings share (`descend` takes any number); and for a checkpoint that is
+    damaged, belongs to another model, or lies in a folder that does not exist.
 
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
@@ -126,7 +130,7 @@ def fit(
     ('ok', True)
     """
     _checks.require_instance(model, Model, "fit", requirement="a Model")
-    starts = _checks.integer(starts, "starts", 1)
+    starts = _checks.integer(starts, "starts", 1, _MOST_STARTS)
     max_steps = _checks.integer(max_steps, "max_steps", 1)
     tolerance = _checks.positive_float(tolerance, "tolerance")
     key = None if key is None else _checks.random_key(key)
@@ -153,6 +157,10 @@ def fit(
                 max_steps=max_steps, descent=descent, checkpoint=checkpoint, progress=progress,
             )  # fmt: skip
         return dataclasses.replace(result, place=_ON_CPU)
+    if model.index.bodies:
+        recordings = stacking.recordings_on_host(model.records, model.counts)
+        for number, recording in enumerate(recordings, 1):
+            require_turning(rates(recording)[1], f"fit: the rates of recording {number}")
     padded = stacking.pad_to_few_lengths(model)
     task = Task(padded, initial_noise(padded), tolerance, max_steps)
     points = [] if initial is None else [initial]

@@ -114,9 +114,9 @@ class Recording(eqx.Module):
 
     **Raises:** `TypeError` for traced numbers, because the readings decide which times are kept,
     and for anything but a sensor in place of a sensor. `ValueError` for times that do not increase,
-    also after rounding to float32; for a wrong shape; for an unmasked NaN, whose index the error
-    gives; and for a quaternion that is not of unit length. It warns if rounding the times to
-    float32 changes a step by more than a tenth.
+    also after rounding to float32; for a wrong shape; for an unmasked NaN or infinity, whose index
+    the error gives; and for a quaternion that is not of unit length. It warns if rounding the times
+    to float32 changes a step by more than a tenth.
 
     >>> Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]])).t.shape
     (2,)
@@ -366,10 +366,9 @@ def _checked_reading(
     across = tuple(range(1, values.ndim))
     bad = mask & ~np.isfinite(values).all(axis=across)
     if bad.any():
-        raise ValueError(
-            f"{name}: the reading at index {int(np.argmax(bad))} contains NaN; mask it if it is "
-            "a gap"
-        )
+        index = int(np.argmax(bad))
+        what = "contains NaN" if np.isnan(values[index]).any() else "is infinite"
+        raise ValueError(f"{name}: the reading at index {index} {what}; mask it if it is a gap")
     if not mask.any():
         raise ValueError(
             f"{name}: wanted at least one reading, but every reading is masked; a mask is true "

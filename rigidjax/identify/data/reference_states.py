@@ -109,6 +109,17 @@ def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     return rates_between_attitudes(*attitudes(recording))
 
 
+def require_turning(rates: np.ndarray, name: str) -> None:
+    """Raise `ValueError` if the body rates (n, 3), rad/s, are all zero, or so small that they are
+    round-off; the text `name` names them in the message.
+    """
+    if rates.size and np.abs(rates).max() < 1e-14:
+        raise ValueError(
+            f"{name} are all zero: a body at rest shows nothing of its inertia, or the sensor was "
+            "off; take other columns, or another part of the recording"
+        )
+
+
 def rates_between_attitudes(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
     """Return two things: times (m,), s; and for each of these times the mean body rate (m, 3),
     rad/s, between two attitudes.

@@ -5,6 +5,7 @@ records: such intervals hold the spectral density of a torque fixed at its most 
 which is below its mean.
 """
 
+import sys
 from collections.abc import Callable
 from statistics import NormalDist
 from typing import Any
@@ -51,7 +52,7 @@ class Nuts(eqx.Module):
     """Draw from a posterior density by the no-U-turn sampler of blackjax.
 
     A warm-up adapts the step and the mass matrix of the sampler. The class needs blackjax:
-    `pip install rigidjax[posterior]`. Source: Hoffman and Gelman 2014, JMLR 15:1593.
+    `pip install '.[posterior]'` in the clone. Source: Hoffman and Gelman 2014, JMLR 15:1593.
 
     **Arguments:**
 
@@ -191,10 +192,16 @@ class Posterior(eqx.Module):
         returns.
 
         Its variables are the inertia tensors, the values of the `Free`s, the initial body rates and
-        the spectral densities of the process. **Raises** `ImportError` without arviz, which needs
-        Python 3.12.
+        the spectral densities of the process. **Raises** `ImportError` without arviz, and on
+        Python 3.11, for which there is no arviz that reads this form.
         """
-        arviz = _checks.import_library("arviz", "posterior", "to_arviz (Python 3.12)")
+        if sys.version_info < (3, 12):
+            raise ModuleNotFoundError(
+                "to_arviz: arviz needs Python 3.12 or later, and this is Python 3.11; take the "
+                "numbers themselves (`points`, `x`), or run your program on a later Python",
+                name="arviz",
+            )
+        arviz = _checks.import_library("arviz", "posterior", "to_arviz")
         points = self.points
         out = dict(points.values)
         out["omega0"] = points.state0.omega

@@ -22,22 +22,26 @@ def unsigned(value):
     return bytes([*out, value])
 
 
-def blackbox_log(rows, scale="0x3f800000", end=True):
+FIELDS = "gyroADC[0],gyroADC[1],gyroADC[2],accSmooth[0]"
+SCALES = ("gyro_scale:0x3f800000", "acc_1G:2048")
+
+
+def blackbox_log(rows, *lines, fields=FIELDS, end=True):
     """A log as the format's own description says: all fields in full, variable bytes."""
+    count = fields.count(",") + 1
     header = [
         "Product:Blackbox flight data recorder by Nicholas Sherlock",
         "Data version:2",
         "I interval:1",
         "P interval:1/1",
-        "Field I name:loopIteration,time,gyroADC[0],gyroADC[1],gyroADC[2],accSmooth[0]",
-        "Field I signed:0,0,1,1,1,1",
-        "Field I predictor:0,0,0,0,0,0",
-        "Field I encoding:1,1,0,0,0,0",
-        "Field P predictor:0,0,0,0,0,0",
-        "Field P encoding:1,1,0,0,0,0",
+        f"Field I name:loopIteration,time,{fields}",
+        "Field I signed:0,0" + ",1" * count,
+        "Field I predictor:0,0" + ",0" * count,
+        "Field I encoding:1,1" + ",0" * count,
+        "Field P predictor:0,0" + ",0" * count,
+        "Field P encoding:1,1" + ",0" * count,
         "Firmware type:Cleanflight",
-        f"gyro_scale:{scale}",
-        "acc_1G:2048",
+        *(lines or SCALES),
     ]
     frames = b""
     for index, (time, *values) in enumerate(rows):
@@ -69,8 +73,61 @@ def test_blackbox_rates_come_in_degrees_a_second(tmp_path, end):
 def test_the_scale_in_the_header_counts(tmp_path):
     path = tmp_path / "flight.bfl"
     bits = struct.unpack("I", struct.pack("f", 0.0609756))[0]
-    path.write_bytes(blackbox_log(ROWS, f"0x{bits:08x}"))
-    np.testing.assert_allclose(read_table(path, ["gyroADC[2]"])["gyroADC[2]"], 182.9268, rtol=1e-6)
+    for name in ("gyro_scale", "gyro.scale"):
+        path.write_bytes(blackbox_log(ROWS, f"{name}:0x{bits:08x}"))
+        np.testing.assert_allclose(read_table(path, ["gyroADC[2]"])["gyroADC[2]"], 182.9268, 1e-6)
+
+
+def test_a_scale_to_radians_a_microsecond(tmp_path):
+    """As Baseflight writes it, whatever the firmware says that it is."""
+    path = tmp_path / "flight.bfl"
+    (bits,) = struct.unpack("I", struct.pack("f", np.radians(1 / 16.4) * 1e-6))
+    path.write_bytes(blackbox_log(ROWS, f"gyro_scale:0x{bits:08x}"))
+    np.testing.assert_allclose(read_table(path, ["gyroADC[2]"])["gyroADC[2]"], 182.9268, 1e-6)
+
+
+def test_of_a_high_resolution_rates_and_commands_are_ten_times_finer(tmp_path):
+    path = tmp_path / "flight.bbl"
+    scale = {"gyroADC[1]": 0.1, "gyroUnfilt[0]": 0.1, "rcCommand[3]": 0.1, "setpoint[2]": 0.1,
+             "setpoint[3]": 1.0, "accSmooth[2]": 1 / 512, "motor[0]": 1.0}  # fmt: skip
+    rows = [(1000 * i, *(i * k for k in range(3, 10))) for i in range(40)]
+    lines = ("gyro_scale:0x3f800000", "acc_1G:512", "blackbox_high_resolution:1", "vbat_scale:110")
+    path.write_bytes(blackbox_log(rows, *lines, fields=",".join(scale)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        table = read_table(path, list(scale))
+    for k, (name, factor) in enumerate(scale.items(), 3):
+        np.testing.assert_allclose(table[name], factor * k * np.arange(40), 1e-12, err_msg=name)
+        assert known_unit_of_column(path, name) == {"g": "deg/s", "a": "g"}.get(name[0])
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["acc_1G:2048"], r"no scale of the fields gyroADC\[0\], gyroADC\[1\]; they are read as logged"),
+        ([*SCALES, "gyro_resolution:3"], "change a unit in a way that is not known: gyro_resolution:3"),
+        ([*SCALES, "blackbox_high_resolution:2"], "is not known: blackbox_high_resolution:2"),
+    ],
+)  # fmt: skip
+def test_a_scale_that_is_not_known_is_said(lines, words, tmp_path):
+    path = tmp_path / "flight.bbl"
+    path.write_bytes(blackbox_log(ROWS, *lines))
+    with pytest.warns(LogWarning, match=words):
+        read_table(path, ["gyroADC[0]", "gyroADC[1]"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_table(path, ["time"])["time"].size == len(ROWS)
+
+
+@pytest.mark.parametrize("many", [90, 145, 400])
+def test_frames_may_be_longer_than_256_bytes(many, tmp_path):
+    path = tmp_path / "flight.bbl"
+    rows = [(900 * i, 3 * i, *(70_000 + k for k in range(many))) for i in range(30)]
+    fields = "gyroADC[0]," + ",".join(f"debug[{k}]" for k in range(many))
+    path.write_bytes(blackbox_log(rows, *SCALES, fields=fields))
+    table = read_table(path, ["time", "gyroADC[0]", f"debug[{many - 1}]"])
+    wanted = np.array(rows)[:, [0, 1, -1]]
+    np.testing.assert_array_equal(np.stack(list(table.values()), 1), wanted)
 
 
 @pytest.mark.parametrize("content", [b"", b"t,wx\n1,2\n", blackbox_log(ROWS)[:200]])
@@ -93,7 +150,7 @@ def test_without_the_parser_the_extra_is_named(tmp_path, monkeypatch):
     path = tmp_path / "flight.bbl"
     path.write_bytes(blackbox_log(ROWS))
     monkeypatch.setitem(sys.modules, "orangebox.reader", None)
-    with pytest.raises(LogError, match=r"pip install 'rigidjax\[blackbox\]'"):
+    with pytest.raises(LogError, match=r"pip install '.\[blackbox\]'"):
         read_table(path, ["time"])
 
 
@@ -306,6 +363,25 @@ def test_of_several_flights_one_is_chosen(tmp_path, capsys):
     for flight in (0, 3, -1):
         with pytest.raises(LogError, match=f"wanted a flight from 1 to 2, got {flight}"):
             read(tmp_path, two_flights(), flight=flight)
+
+
+def test_of_flights_of_a_header_only_those_with_frames_are_named(tmp_path):
+    """As a flash memory keeps them that was armed and disarmed, or whose header was cut."""
+    whole, cut = HEADER + b"".join(frames(0, 24)) + END, HEADER[:200]
+    data = HEADER + whole + cut + HEADER + END + two_flights() + HEADER + 90 * b"\xff"
+    words = (
+        r"3 flights are in this log, of .* kB \(4 more have a header only\); .* --flight 2, 5, 6 "
+    )
+    with pytest.raises(LogError, match=words):
+        read(tmp_path, data)
+    for flight in (1, 3, 4, 7):
+        words = f"flight {flight} has a header only; flights with frames: 2, 5, 6$"
+        with pytest.raises(LogError, match=words):
+            read(tmp_path, data, flight=flight)
+    np.testing.assert_array_equal(read(tmp_path, data, flight=6), content(range(12, 48)))
+    np.testing.assert_array_equal(read(tmp_path, cut + whole + HEADER), content(range(24)))
+    with pytest.raises(LogError, match=r"flight.bbl: no frames in this log; is it whole"):
+        read(tmp_path, HEADER + cut)
 
 
 def test_only_blackbox_has_flights(tmp_path):

@@ -172,5 +172,5 @@ def test_without_the_library_the_extra_is_named(tmp_path, monkeypatch, ending, l
     (ulog if ending == "ulg" else of_json)(path)
     monkeypatch.setitem(sys.modules, library, None)
     extra = "ulog" if ending == "ulg" else "mcap"
-    with pytest.raises(LogError, match=rf"pip install 'rigidjax\[{extra}\]'"):
+    with pytest.raises(LogError, match=rf"pip install '.\[{extra}\]'"):
         read_table(path, ["x"])

@@ -14,6 +14,7 @@ import rigidjax as rj
 from rigidjax.cli.command import main
 from rigidjax.cli.logs.errors import LogError
 from rigidjax.cli.logs.layouts import imu_columns_of
+from rigidjax.identify import read_table
 
 GOOD = "t,wx,wy,wz\n" + "\n".join(
     f"{0.1 * k:.1f},{np.cos(k):.6f},{np.sin(k):.6f},1.0" for k in range(12)
@@ -50,6 +51,9 @@ WRONG = {
     "a wanted name twice": (GOOD.replace("wy,wz", "wy,wz,wx", 1), "line 1: wanted one column 'wx', got 2"),
     "blanks": (GOOD.replace(",", " "), "line 1: no column 't'; the columns are t wx wy wz (names and numbers are separated by commas, semicolons or tabs)"),
     "a quote without end": (_swap(5, '0.3,"1,1,1' + 200_000 * "1"), "cannot be read as text (Error: field larger than field limit"),
+    "zero bytes": (GOOD.replace("wy", "w\0y"), "line 1: holds zero bytes, so that it is no text"),
+    "zeros alone": (200_000 * "\0", "line 1: holds zero bytes, so that it is no text"),
+    "a zero byte below": (_swap(5, "0.3,1,1\0,1"), r"line 5: column 'wy': '1\x00' is not a number"),
     "too short": ("t,wx,wy,wz\n0,1,1,1\n1,1,1,1\n", "wanted at least 4 samples, got 2"),
 }  # fmt: skip
 
@@ -64,6 +68,28 @@ def test_a_bad_log_gets_one_clear_line(case, tmp_path, capsys):
     assert out.out == ""
     assert out.err.startswith(f"error: {path}: {words}"), out.err
     assert out.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", [150_000 * "w", 900 * "w,"])
+def test_of_long_names_and_many_a_part_is_shown(text, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(text + "\n1\n")
+    with pytest.raises(LogError, match="no column 't'; the columns are w") as raised:
+        read_table(path, ["t"])
+    assert len(str(raised.value)) < 400 + len(str(path))
+    path.write_text("t\n" + 100_000 * "w")
+    with pytest.raises(LogError, match=r"line 2: column 't': 'ww.*' is not a number") as raised:
+        read_table(path, ["t"])
+    assert len(str(raised.value)) < 400 + len(str(path))
+
+
+@pytest.mark.parametrize("line", ["0,0\n", "\n", "#\n", "\0"])
+def test_a_packed_file_of_equal_lines_is_refused_at_once(line, tmp_path):
+    path = tmp_path / "log.csv.gz"
+    with gzip.open(path, "wt") as file:
+        file.write("t,wx\n" + line * (12_000_000 // len(line)))
+    with pytest.raises(LogError, match="unpacks to more than 100 times its size"):
+        read_table(path, ["t", "wx"])
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t"])

@@ -130,11 +130,23 @@ def test_times_that_are_plainly_in_another_unit_are_remarked_upon(step, unit, ra
         warn_of_gap_or_wrong_unit("log", step * np.arange(50), unit, rate)
 
 
-@pytest.mark.parametrize(("step", "rate"), [(2e-4, 300.0), (0.02, 20.0), (60.0, 1e-3), (1.0, 2.0)])
+@pytest.mark.parametrize(("step", "rate"), [(2e-4, 300.0), (0.02, 20.0), (60.0, 1e-3), (1.0, 0.02)])
 def test_usual_times_are_not_remarked_upon(step, rate):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_of_gap_or_wrong_unit("log", step * np.arange(50), "s", rate)
+
+
+@pytest.mark.parametrize("rate", [0.0, 2.0, 300.0])
+@pytest.mark.parametrize("left_out", [[], [7], [20, 21, 40]])
+def test_numbers_of_frames_are_no_times(rate, left_out):
+    t = np.delete(np.arange(50.0), left_out)
+    with pytest.warns(LogWarning, match="is exactly 1 s: are they the numbers of rows or frames"):
+        warn_of_gap_or_wrong_unit("log", t, "s", rate)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_gap_or_wrong_unit("log", 1.001 * t, "s", min(rate, 5.0))
+        warn_of_gap_or_wrong_unit("log", 1e-3 * t, "ms", rate)
 
 
 def test_a_clock_that_was_set_forward_is_told():

@@ -327,6 +327,18 @@ def test_nuts_draws_from_a_normal_distribution(acceptance):
     np.testing.assert_allclose(np.cov(drawn.T), root @ root.T, atol=0.35)
 
 
+def test_without_arviz_the_way_to_it_is_named(fitted, monkeypatch):
+    """On Python 3.11 there is none: the extra leaves it out."""
+    monkeypatch.setitem(sys.modules, "arviz", None)
+    density = identify.LogDensity(fitted, rj.torques.RandomTorque(1e-4), deviation=2.0)
+    drawn = identify.Posterior(density, density.x0[None, None])
+    words = r"to_arviz: arviz is missing; in the clone: pip install '.\[posterior\]'$"
+    if sys.version_info < (3, 12):
+        words = "to_arviz: arviz needs Python 3.12 or later"
+    with pytest.raises(ModuleNotFoundError, match=words):
+        drawn.to_arviz()
+
+
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # entries that are constant
 def test_draws_go_to_arviz(fitted):
     arviz = pytest.importorskip("arviz")
