@@ -46,6 +46,7 @@ from rigidjax.rotation import (
     rodrigues as rodrigues,
     so3 as so3,
 )
+from rigidjax.rotation.barrier import set_xla_flags as set_xla_flags
 from rigidjax.solve import (
     Event as Event,
     crossings as crossings,
@@ -78,8 +79,8 @@ __all__ = [
     "batch", "body", "conserved", "crossings", "datasets", "drift", "elliptic", "energy",
     "equations_of_motion", "error_of", "euler", "exact", "frames", "identify", "kinetic_energy",
     "lagrangian", "lyapunov_exponents", "motion", "mrp", "orbits", "parameters", "plot",
-    "quaternion", "rodrigues", "scenes", "shapes", "simulate", "so3", "solve", "solvers",
-    "spatial_angular_momentum", "torques", "tumblers", "volumes", "workprecision",
+    "quaternion", "rodrigues", "scenes", "set_xla_flags", "shapes", "simulate", "so3", "solve",
+    "solvers", "spatial_angular_momentum", "torques", "tumblers", "volumes", "workprecision",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

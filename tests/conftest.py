@@ -1,7 +1,7 @@
 """Strict JAX, and every public signature checked at run time (jaxtyping + beartype)."""
 
 import gc
-import importlib.metadata
+import importlib
 import itertools
 import os
 from pathlib import Path
@@ -20,13 +20,6 @@ def pytest_configure(config):
     if hasattr(config, "cache") and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(config.cache.mkdir("jax"))
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
-    default_run = config.option.markexpr == "not slow and not long"
-    # The older emitters of XLA compile the same programs in half of the time. jaxlib 0.10 has both;
-    # later ones have one, and end at the flag. Long tests are compiled as users compile them.
-    if default_run and importlib.metadata.version("jaxlib").startswith("0.10."):
-        flags = os.environ.get("XLA_FLAGS", "")
-        if "xla_cpu_use_fusion_emitters" not in flags:
-            os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {flags}"
     # Threads of OpenBLAS wait busily for one another: where all cores are taken, the QR of some
     # thousand small matrices took 0.55 s of the processor by one thread and 115 s by two.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -58,6 +51,12 @@ def _load(default_run):
         for name in ("rigidjax", *(f"rigidjax.{late}" for late in LATER)):
             importlib.import_module(name)
     equinox.filter_jit = usual
+
+    # As the command line does; but long tests are compiled by the emitters that users have.
+    if not default_run and jax.__version_info__ < (0, 11):
+        flags = os.environ.get("XLA_FLAGS", "")
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=true"
+    importlib.import_module("rigidjax").set_xla_flags()
 
     # Traced programs are millions of objects that all stay: to look through them again and again
     # for garbage is a tenth of the time.

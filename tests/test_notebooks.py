@@ -86,6 +86,8 @@ def test_runs_in_its_short_form(path, monkeypatch):
     import nbformat
 
     monkeypatch.setenv("RIGIDJAX_SHORT", "1")
+    # As a reader starts it, without the options of XLA that the tests set.
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
     # A warning of ours would go to standard error, where `complaints` sees it.
     monkeypatch.setenv("PYTHONWARNINGS", "default")
     roots = [str(FOLDER.parent), *filter(None, [os.environ.get("PYTHONPATH")])]

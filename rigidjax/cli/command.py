@@ -91,6 +91,8 @@ def _dispatch_command(
     - `owns_process`: whether the process belongs to this command, so that settings of JAX may be
       changed.
     """
+    if owns_process:
+        rj.set_xla_flags()
     if options.command == "workprecision":
         return workprecision.run_subcommand(options)
     if options.demo:
@@ -100,8 +102,6 @@ def _dispatch_command(
         if unused:
             names = ", ".join("--" + name.replace("_", "-") for name in unused)
             parser.error(f"identify --demo: {names} is for log FILES only")
-    if owns_process:
-        _compile_by_older_emitters()
     if owns_process and options.no_cache:
         jax.config.update("jax_enable_compilation_cache", False)
     elif owns_process:
@@ -139,19 +139,6 @@ def _check_output_files(options: argparse.Namespace, parser: argparse.ArgumentPa
         if name != "checkpoint" and (path.is_dir() or not path.parent.is_dir()):
             why = "is a folder" if path.is_dir() else f"there is no folder {path.parent}"
             parser.error(f"--{name}: {path}: {why}")
-
-
-def _compile_by_older_emitters() -> None:
-    """Set XLA to compile by its older emitters, if this version of XLA has two kinds of emitters.
-
-    An emitter is the part of XLA that writes the code of a kernel. In jax 0.10 the older emitters
-    compile a program in half of the time, and the program is as fast. Later versions have one kind
-    of emitter only, and end the process at this flag, which they do not know. XLA reads the flag
-    when it compiles its first program.
-    """
-    flags, name = os.environ.get("XLA_FLAGS", ""), "xla_cpu_use_fusion_emitters"
-    if jax.__version_info__ < (0, 11) and name not in flags:
-        os.environ["XLA_FLAGS"] = f"--{name}=false {flags}"
 
 
 def _keep_compiled_programs() -> None:

@@ -19,12 +19,61 @@ from rigidjax.exact.derivatives import (
     body_rate_and_rotation,
     free_motion_constants,
 )
-from rigidjax.motion import Attitude, Rigid
+from rigidjax.motion import Rigid
 from rigidjax.rotation.kernels import quaternion_product
 from rigidjax.rotation.linalg3 import components
 from rigidjax.rotation.validation import require_near_unit, rotation_tolerance
 
 State = TypeVar("State", bound=HasSpin)
+
+
+class FreeMotion(eqx.Module):
+    """Hold the motion of a free body from any initial state, a `Spin`, an `Attitude` or a `Rigid`.
+
+    The body and the state are not checked. Call the object with one time or with times (n,), s; the
+    time is 0 at the initial state. The result is NaN at a time until which the body turns by more
+    than 1/eps rad, where eps is the machine epsilon of the dtype.
+    """
+
+    state0: Any
+    tensor: Mat3
+    omega: Vec3
+    exponent: Array
+    setting: FreeMotionConstants
+
+    def __init__(self, body: Inertia | MassProperties, state0: PyTree):
+        tensor = (body if isinstance(body, Inertia) else body.inertia).tensor
+        # Divide the tensor and the body rate by powers of two, so that their largest entries are
+        # near 1: this loses no digit, and no product below overflows or underflows for a huge or a
+        # tiny body.
+        self.exponent = largest_binary_exponent(state0.omega)
+        self.tensor = times_power_of_two(tensor, -largest_binary_exponent(tensor))
+        self.omega = times_power_of_two(state0.omega, -self.exponent)
+        self.setting = free_motion_constants(*jax.lax.stop_gradient((self.tensor, self.omega)))
+        self.state0 = state0
+
+    def __call__(self, since: Float[Array, "*n"]) -> Any:
+        """Return the state of the free body at the time `since`, or the states at the times `since`
+        (n,), s; the time is 0 at the initial state `state0`.
+        """
+        t = since.astype(self.tensor.dtype)
+        # If the body turns by more than 1/eps rad until the time t, the dtype holds no digit of the
+        # angle within one turn, and the state is unknown: replace t by NaN, so that the state is
+        # NaN, too.
+        turned = jnp.abs(t) * jnp.max(jnp.abs(self.state0.omega))
+        t = jnp.where(turned <= 1 / jnp.finfo(t.dtype).eps, t, jnp.nan)
+        scaled = times_power_of_two(t, self.exponent)
+        omega, turn = body_rate_and_rotation(self.tensor, self.omega, self.setting, scaled)
+        omega = times_power_of_two(omega, self.exponent)
+        state = eqx.tree_at(lambda s: s.omega, self.state0, omega)
+        if isinstance(state, HasAttitude):
+            first = jnp.broadcast_to(state.q, turn.shape)
+            state = eqx.tree_at(lambda s: s.q, state, _unit_product(first, turn))
+        if not isinstance(state, Rigid):
+            return state
+        v = jnp.broadcast_to(state.v, omega.shape)
+        x = jnp.broadcast_to(state.x, v.shape) + since[..., None] * v
+        return Rigid(x, v, state.q, omega)
 
 
 class FreeBody(eqx.Module):
@@ -40,28 +89,16 @@ class FreeBody(eqx.Module):
     Array([0., 0., 1.], dtype=float64)
     """
 
-    state0: HasSpin
-    tensor: Mat3
-    omega: Vec3
-    exponent: Array
-    setting: FreeMotionConstants
+    motion: FreeMotion
 
     def __init__(self, inertia: Inertia, state0: HasSpin):
-        inertia = _checked_inertia(inertia, state0)
-        # Divide the tensor and the body rate by powers of two, so that their largest entries are
-        # near 1: this loses no digit, and no product below overflows or underflows for a huge or a
-        # tiny body.
-        self.exponent = largest_binary_exponent(state0.omega)
-        self.tensor = times_power_of_two(inertia.tensor, -largest_binary_exponent(inertia.tensor))
-        self.omega = times_power_of_two(state0.omega, -self.exponent)
-        self.setting = free_motion_constants(*jax.lax.stop_gradient((self.tensor, self.omega)))
-        self.state0 = state0
+        self.motion = FreeMotion(_checked_inertia(inertia, state0), state0)
 
     def __call__(self, t: ScalarLike) -> HasSpin:
         """Return the state of the free body at the time `t`, one number, s; the time is 0 at the
         initial state `state0`.
         """
-        return self.at(_checked_time(t, self.state0.omega))
+        return self.at(_checked_time(t, self.motion.state0.omega))
 
     def at(self, ts: Float[Array, "*n"]) -> HasSpin:
         """Return the states of the free body at the times `ts` (n,), s; the time is 0 at the
@@ -75,51 +112,7 @@ class FreeBody(eqx.Module):
         Array([[0., 0., 1.],
                [0., 0., 1.]], dtype=float64)
         """
-        t = ts.astype(self.tensor.dtype)
-        # If the body turns by more than 1/eps rad until the time t, the dtype holds no digit of the
-        # angle within one turn, and the state is unknown: replace t by NaN, so that the state is
-        # NaN, too.
-        turned = jnp.abs(t) * jnp.max(jnp.abs(self.state0.omega))
-        t = jnp.where(turned <= 1 / jnp.finfo(t.dtype).eps, t, jnp.nan)
-        since = times_power_of_two(t, self.exponent)
-        omega, turn = body_rate_and_rotation(self.tensor, self.omega, self.setting, since)
-        omega = times_power_of_two(omega, self.exponent)
-        state = eqx.tree_at(lambda s: s.omega, self.state0, omega)
-        if not isinstance(state, HasAttitude):
-            return state
-        first = jnp.broadcast_to(state.q, turn.shape)
-        return eqx.tree_at(lambda s: s.q, state, _unit_product(first, turn))
-
-
-class FreeMotion(eqx.Module):
-    """Hold the motion of a free body from any initial state: the rotation as a `FreeBody`, and, if
-    the state is a `Rigid` (position, velocity, quaternion and body rate), also the straight path of
-    the centre of mass.
-
-    Call the object with one time or with times (n,), s; the time is 0 at the initial state. The
-    result is NaN at a time until which the body turns by more than 1/eps rad, where eps is the
-    machine epsilon of the dtype.
-    """
-
-    state0: Any
-    turning: FreeBody
-
-    def __init__(self, body: Inertia | MassProperties, state0: PyTree):
-        self.state0 = state0
-        rigid = isinstance(state0, Rigid)
-        turning = Attitude(state0.q, state0.omega) if rigid else state0
-        self.turning = FreeBody(body if isinstance(body, Inertia) else body.inertia, turning)
-
-    def __call__(self, since: Float[Array, "*n"]) -> Any:
-        """Return the state of the free body at the time `since`, or the states at the times `since`
-        (n,), s; the time is 0 at the initial state `state0`.
-        """
-        turned: Any = self.turning.at(since)
-        if not isinstance(self.state0, Rigid):
-            return turned
-        v = jnp.broadcast_to(self.state0.v, turned.omega.shape)
-        x = jnp.broadcast_to(self.state0.x, v.shape) + since[..., None] * v
-        return Rigid(x, v, turned.q, turned.omega)
+        return self.motion(ts)
 
 
 def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
@@ -163,11 +156,11 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     >>> free_body(rj.Inertia.from_principal(1.0, 2.0, 3.0), state0, 20.0).omega
     Array([-0.42522037, -0.90508985,  0.24550111], dtype=float64)
     """
-    _checked_inertia(inertia, state0)
+    inertia = _checked_inertia(inertia, state0)
     return _jitted(inertia, state0, _checked_time(t, state0.omega))
 
 
-_jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0).at(t))
+_jitted = jax.jit(lambda inertia, state0, t: FreeMotion(inertia, state0)(t))
 
 
 def _checked_time(t: ScalarLike, omega: Array) -> Scalar:

@@ -31,6 +31,7 @@ from rigidjax.motion.equations import (
 )  # fmt: skip
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.composite import Sum
+from rigidjax.rotation.barrier import warn_of_slow_loops
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import integrate_with_diffrax
 from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_or_nonfinite_input
@@ -161,6 +162,8 @@ def equations_of_motion(
     if isinstance(state0, Coupled):
         return CoupledEquations(equations_of_motion(body, state0.motion, torque), body)
     validation.require_compatible_types(body, state0, torque)
+    if torque is not None:
+        warn_of_slow_loops()
     if isinstance(state0, Point):
         return scene_of_force(torque).field
     kind: Any = EulerEquations

@@ -76,22 +76,6 @@ def test_the_demo_says_nothing_but_its_progress(tmp_path):
     assert held.stat().st_mode & 0o777 == 0o700 and len(list(held.iterdir())) > 5
 
 
-@pytest.mark.parametrize(
-    ("release", "flags", "wanted"),
-    [
-        ((0, 10, 1), "", "--xla_cpu_use_fusion_emitters=false "),
-        ((0, 10, 1), "--a=1", "--xla_cpu_use_fusion_emitters=false --a=1"),
-        ((0, 10, 1), *2 * ("--xla_cpu_use_fusion_emitters=true",)),
-        ((0, 11, 2), *2 * ("--a=1",)),
-    ],
-)
-def test_older_emitters_are_used_where_there_are_any(release, flags, wanted, monkeypatch):
-    monkeypatch.setattr(command, "jax", SimpleNamespace(__version_info__=release))
-    monkeypatch.setenv("XLA_FLAGS", flags)
-    command._compile_by_older_emitters()
-    assert os.environ["XLA_FLAGS"] == wanted
-
-
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="users and modes are those of POSIX")
 @pytest.mark.parametrize(
     ("mode", "owner", "used"),

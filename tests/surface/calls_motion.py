@@ -380,6 +380,7 @@ row(
     transforms=(),
 )
 row("batch.compiler_options", transforms=())
+row("set_xla_flags", transforms=())
 for name in ("share", "gather", "total"):
     row(
         f"batch.distributed.{name}",

@@ -486,6 +486,7 @@ way(
 leave_out(
     "options of a compiler: no numbers",
     "batch.compiler_options",
+    "set_xla_flags",
 )
 leave_out("shares of a run's own statistics: `drift` and `lyapunov_exponents` are rows",
           "solve.Solution.drift", "solve.Solution.growth")  # fmt: skip
