@@ -170,7 +170,9 @@ def tumble(
     )
     unit = ", m" if surface is not None or isinstance(body, MassProperties) else ""
     set_equal_scales(ax, solid.reach, (f"x{unit}", f"y{unit}", f"z{unit}"))
-    edges = dict(edgecolor="0.2", linewidths=0.8) if surface is None else dict(linewidths=0.3)
+    edges: dict[str, Any] = {"linewidths": 0.3}
+    if surface is None:
+        edges = {"edgecolor": "0.2", "linewidths": 0.8}
     up, around = np.radians([ax.elev, ax.azim])
     towards = [np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)]
     drawn = Poly3DCollection([], alpha=0.85 if surface is None else 1.0, **edges)
@@ -235,9 +237,10 @@ def player(
     """Return a page that plays the motion in 3-D; you can turn and zoom the view while it plays.
 
     The picture is as in `tumble`: the body, and the path of the end of its longest axis. The page
-    contains everything, also the program of the 3-D viewer viser (0.8 MB): a notebook shows it without a network or a running kernel, and `.save("tumble.html")` writes it to
-    a file. **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises**
-    as `tumble`.
+    contains everything, also the program of the 3-D viewer viser (0.8 MB): a notebook shows it
+    without a network or a running kernel, and `.save("tumble.html")` writes it to a file.
+    **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises** as
+    `tumble`.
     """
     seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
     moments, q = evenly_spaced_times_and_attitudes(ts, states, pictures)
