@@ -527,9 +527,9 @@ def _accepts_arguments(value: Callable[..., Any], count: int) -> bool:
 
 
 @contextlib.contextmanager
-def explained_tracing(kind: str, function: object) -> Iterator[None]:
-    """Replace JAX's errors about a traced number that Python or NumPy reads by one line that says
-    where the user's `function` does so, and what to write; `kind` is its role, such as "torque".
+def explain_tracing(kind: str, function: object) -> Iterator[None]:
+    """Raise one line for JAX's errors about a traced number that Python or NumPy reads: where the
+    user's `function` does so, and what to write; `kind` is its role, such as "torque".
     """
     try:
         yield

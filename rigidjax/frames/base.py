@@ -100,7 +100,7 @@ class Force(AbstractScene):
     def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
         if self.force is None:
             return jnp.zeros_like(state.x)
-        with _checks.explained_tracing("force", self.force):
+        with _checks.explain_tracing("force", self.force):
             value = self.force(t, state, None)
         return checked_force_per_mass(value, self.force)
 

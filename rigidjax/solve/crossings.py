@@ -282,7 +282,7 @@ def condition_value(event: Event, body: Any, t: Any, y: PyTree) -> Array:
 
     **Raises:** `TypeError` or `ValueError` if the condition gives a truth value or an array.
     """
-    with _checks.explained_tracing("condition", event.condition):
+    with _checks.explain_tracing("condition", event.condition):
         found = event.condition(t, y, body)
     if jnp.issubdtype(getattr(found, "dtype", type(found)), jnp.bool_):
         raise TypeError(

@@ -274,7 +274,7 @@ def force_and_torque(
     # float64 table in a torque must not turn a float32 solve into a float64 solve, nor raise an
     # error under JAX's strict promotion of dtypes.
     try:
-        with _checks.explained_tracing("torque", model):
+        with _checks.explain_tracing("torque", model):
             result = in_precision(model, dtype)(t, state, in_precision(body, dtype))
     except AttributeError as error:
         message = missing_state_part_message(name, error)
