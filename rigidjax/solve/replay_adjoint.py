@@ -57,6 +57,10 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
       conditions (`ReplayAdjoint` can end a run only by one boolean condition);
     - a run whose state has complex numbers or several dtypes.
 
+    `between` is for `simulate`: times, s, at which the run is saved besides those of the `SaveAt`,
+    known to be in order. diffrax checks the times of a `SaveAt` by a call of Python, which
+    `jax.export` refuses.
+
     **Raises:** `TypeError` for `jax.grad` of a `jax.grad`: second derivatives are forward over
     reverse.
 
@@ -73,8 +77,6 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
     """
 
     otherwise: dfx.AbstractAdjoint = dfx.RecursiveCheckpointAdjoint()
-    # Times saved by the first function of `SaveAt`, for `simulate`. diffrax checks the times of
-    # `SaveAt` itself, by a call of Python that `jax.export` refuses; these are known to be right.
     between: Array | None = None
 
     def __check_init__(self) -> None:
