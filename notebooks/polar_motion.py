@@ -1,8 +1,8 @@
 """The Earth's free precession, kicked by air and sea: period, amplitude, forecasts.
 
-    python notebooks/polar_motion.py FOLDER/1973-1995.csv
+    python notebooks/polar_motion.py
 
-The table has columns mjd, x_arcsec, x_error_arcsec, y_arcsec, y_error_arcsec. With p = x − i y and
+The table `data/polar_motion.csv` has columns mjd, x_arcsec, x_error_arcsec, y_arcsec, y_error_arcsec. With p = x − i y and
 the excitation χ the pole obeys dp/dt = iσ (p − χ), σ = 2π/T (1 + i/2Q) (Munk and MacDonald, The
 Rotation of the Earth (1960), ch. 6). χ is white noise, or noise with a memory, or both; besides, the
 seasons force turns of a year and half a year, either way, whose amplitudes may wander, and the mean
@@ -14,7 +14,7 @@ first years, and what a filter sees of it day by day is that smoothing, not the 
 are believed.
 """
 
-import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -40,9 +40,10 @@ START = {
 }  # fmt: skip
 
 
-def read(path):
+def read():
     """Times (T,) MJD, readings (T, 2) of (x, −y) and their errors, mas, every fifth day."""
-    table = np.loadtxt(path, delimiter=",", skiprows=1)[::STEP]
+    path = Path(__file__).parent / "data" / "polar_motion.csv"
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
     t, x, dx, y, dy = table.T
     return t, 1e3 * np.column_stack([x, -y]), 1e3 * np.column_stack([dx, dy])
 
@@ -172,8 +173,8 @@ def rms(off):
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-def main(path):
-    t, readings, errors = read(path)
+def main():
+    t, readings, errors = read()
     fits = {}
     for name, names in MODELS.items():
         v, covariance, best, value, x = fits[name] = fit(names, readings, errors)
@@ -214,4 +215,4 @@ def main(path):
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    main(sys.argv[1])
+    main()

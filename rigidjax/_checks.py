@@ -1,12 +1,14 @@
 """Check arguments at public boundaries; say what was wanted, what came, and the likely cause."""
 
+import contextlib
 import functools
 import importlib
 import inspect
 import os
 import re
+import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
@@ -522,6 +524,29 @@ def _accepts_arguments(value: Callable[..., Any], count: int) -> bool:
         # is accepted. A `TypeError` says that the number of arguments is wrong.
         return isinstance(error, ValueError)
     return True
+
+
+@contextlib.contextmanager
+def explain_tracing(kind: str, function: object) -> Iterator[None]:
+    """Raise one line for JAX's errors about a traced number that Python or NumPy reads: where the
+    user's `function` does so, and what to write; `kind` is its role, such as "torque".
+    """
+    try:
+        yield
+    except (
+        jax.errors.ConcretizationTypeError,
+        jax.errors.TracerArrayConversionError,
+        jax.errors.TracerIntegerConversionError,
+    ) as error:
+        name = getattr(function, "__name__", type(function).__name__)
+        inside = os.sep + "jax" + os.sep
+        where = [f for f in traceback.extract_tb(error.__traceback__) if inside not in f.filename]
+        raise TypeError(
+            f"{kind} {name}, line {where[-1].lineno} of {Path(where[-1].filename).name} "
+            f"({where[-1].line}): Python or NumPy needs the value of a number that JAX traces (the "
+            "time, the state); write jnp.where(condition, a, b) for if, jnp.sin for np.sin and "
+            "math.sin, and leave out float()"
+        ) from None
 
 
 def integer(value: object, name: str, least: int, most: int | None = None) -> int:

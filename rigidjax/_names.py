@@ -1,14 +1,24 @@
-"""Make `dir` list the public names of a module, and answer a wrong name with the nearest public
-names.
+"""Make `dir` list the public names of a module, and answer a wrong name, of a module or of an
+argument, with the nearest right ones.
 """
 
 import difflib
 import functools
+import inspect
 import sys
+from collections.abc import Callable
 from importlib.util import find_spec
 from types import ModuleType
-from typing import NoReturn
+from typing import Any, NoReturn, TypeVar
 
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+# Names of arguments in other libraries, and ours for them.
+_OTHERS = {
+    "t0": "ts", "t1": "ts", "t_span": "ts", "t_eval": "ts", "saveat": "ts", "times": "ts",
+    "y0": "state0", "state": "state0", "method": "solver", "events": "event", "force": "torque",
+    "tol": "rtol", "dt": "dt0", "args": "torque",
+}  # fmt: skip
 _NOT_MODELLED = ("joint", "contact", "hinge", "constraint", "collide", "render", "flexib", "urdf")
 
 
@@ -48,6 +58,22 @@ def raise_attribute_error(module_name: str, name: str) -> NoReturn:
         nearest = list(dict.fromkeys(paths[one] for one in near))[:2]
         hint = f"; did you mean {' or '.join(nearest)}?" if nearest else ""
     raise AttributeError(f"module {module_name!r} has no attribute {name!r}{hint}", name=name)
+
+
+def suggest_arguments(function: Function) -> Function:
+    """Return `function`, which answers an argument that it lacks with the nearest of its own."""
+    names = inspect.signature(function).parameters
+
+    @functools.wraps(function)
+    def checked(*args: Any, **given: Any) -> Any:
+        for name in given.keys() - names.keys():
+            near = difflib.get_close_matches(name, names, n=1)
+            near = [_OTHERS[name]] if _OTHERS.get(name) in names else near
+            hint = f"; did you mean {near[0]}?" if near else f"; it has {', '.join(names)}"
+            raise TypeError(f"{function.__name__}: there is no argument {name}{hint}")
+        return function(*args, **given)
+
+    return checked  # pyright: ignore[reportReturnType]
 
 
 @functools.cache

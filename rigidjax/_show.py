@@ -1,4 +1,4 @@
-"""Print states and bodies with their numbers."""
+"""Print states, bodies, torques and other objects with their numbers."""
 
 import dataclasses
 from typing import Any
@@ -17,20 +17,27 @@ _RATE_UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.p
 
 
 def fields_as_text(self: Any) -> str:
-    """Return the text that `print` shows for an object with fields, such as a state or a body: the
-    name of its class, and each field with its numbers, `Name(field=numbers, …)`. A field that is
-    `None` is left out; a traced or large array is shown by its dtype and shape.
+    """Return the text that `print` shows for an object with fields, such as a state or a torque:
+    the name of its class, and each field with its numbers, `Name(field=numbers, …)`. A field that
+    is `None` or a class is left out; a traced or large array is shown by its dtype and shape.
     """
     fields = [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.repr]
-    fields = [(name, value) for name, value in fields if value is not None]
+    fields = [(name, value) for name, value in fields if not isinstance(value, type | None)]
     parts = ", ".join(f"{name}={as_text(value)}" for name, value in fields)
     return f"{type(self).__name__}({parts})"
 
 
 def as_text(value: object) -> str:
-    """Return the numbers of an array as text. For an array that JAX traces, or that has more than
-    `MOST` numbers, the text is its dtype and shape; any other `value` is written as Equinox does.
+    """Return the numbers of an array as text, and those in a Module or a tuple. For an array that
+    JAX traces, or that has more than `MOST` numbers, the text is its dtype and shape; any other
+    `value` is written as Equinox does.
     """
+    if type(value) is tuple:
+        parts = [as_text(part) for part in value]
+        return f"({', '.join(parts)}{',' if len(parts) == 1 else ''})"
+    if isinstance(value, eqx.Module):
+        plain = type(value).__repr__ is eqx.Module.__repr__
+        return fields_as_text(value) if plain else repr(value)
     is_array = isinstance(value, (jax.Array, np.ndarray))
     if not is_array or isinstance(value, Tracer) or value.size > MOST:
         return eqx.tree_pformat(value)

@@ -147,3 +147,19 @@ def test_the_tests_that_a_default_run_is_spared_are_there(name):
         path, _, name = line.partition("::")
         source = (ROOT / path).read_text(encoding="utf-8")
         assert f"def {name.partition('[')[0]}(" in source, line
+
+
+@pytest.mark.parametrize(
+    ("call", "meant"),
+    [
+        (lambda: rj.simulate(None, None, [0.0, 1.0], atoll=1e-3), "simulate: .* atoll; .* atol?"),
+        (lambda: rj.simulate(None, None, t0=0.0, t1=1.0), "simulate: .* did you mean ts?"),
+        (lambda: rj.identify.fit(None, start=3), "fit: .* did you mean starts?"),
+        (lambda: rj.batch.simulate(None, None, chunks=2), "did you mean chunk?"),
+        (lambda: rj.batch.rollout(None, adjoin=2), "rollout: there is no argument adjoin"),
+        (lambda: rj.crossings(None, qqq=2), "qqq; it has body, state0, t0"),
+    ],
+)
+def test_a_wrong_argument_is_answered_with_what_is_meant(call, meant):
+    with pytest.raises(TypeError, match=meant):
+        call()

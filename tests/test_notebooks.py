@@ -27,6 +27,12 @@ def complaints(notebook):
     ]
 
 
+def pictures(notebook):
+    """How many pictures each cell shows."""
+    cells = notebook["cells"]
+    return [sum("image/png" in o.get("data", {}) for o in c.get("outputs", [])) for c in cells]
+
+
 def test_each_has_a_number_of_its_own():
     numbers = [path.name[:2] for path in NOTEBOOKS]
     assert len(set(numbers)) == len(numbers) >= 12
@@ -77,6 +83,13 @@ def test_names_of_the_library_exist(path):
     assert count > 5 or path.stem == "13_polar_motion"  # its code is in `polar_motion.py`
 
 
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_no_cell_is_skipped_for_want_of_data(path):
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    code = "".join("".join(c["source"]) for c in notebook["cells"] if c["cell_type"] == "code")
+    assert "skipped" not in code
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_runs_in_its_short_form(path, monkeypatch):
@@ -102,3 +115,5 @@ def test_runs_in_its_short_form(path, monkeypatch):
     )
     client.execute()
     assert complaints(notebook) == []
+    # A clone, without data beside it, shows every picture of what is committed.
+    assert pictures(notebook) == pictures(json.loads(path.read_text(encoding="utf-8")))

@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, PyTree
 
 from rigidjax import _checks
+from rigidjax._names import suggest_arguments
 from rigidjax._types import ScalarLike
 from rigidjax.batch.sharding import CompiledFunction, Devices, Division, divide_batch, map_bodies
 from rigidjax.batch.validation import (
@@ -87,6 +88,7 @@ def rollout(
 ) -> tuple[State, Reduced]: ...
 
 
+@suggest_arguments
 def rollout(
     bodies: Inertia | MassProperties,
     states0: PyTree,

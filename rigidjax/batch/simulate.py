@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from rigidjax import _checks
+from rigidjax._names import suggest_arguments
 from rigidjax._types import ScalarLike
 from rigidjax.batch.rollout import Inputs, rollout
 from rigidjax.batch.sharding import (
@@ -91,6 +92,7 @@ class Batch(eqx.Module, Generic[State]):
     own: tuple[Any, ...] | None = None
 
 
+@suggest_arguments
 def simulate(
     bodies: Inertia | MassProperties,
     states0: State,

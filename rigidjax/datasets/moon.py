@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia
@@ -70,6 +70,8 @@ class Moon(eqx.Module):
     angles: Chebyshev
     constants: dict[str, float] = eqx.field(static=True)
     first: float = eqx.field(static=True)
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, first: float, last: float):
         spec = find_spec("de421")

@@ -87,12 +87,12 @@ class FreeSolver(dfx.AbstractSolver):
         t1: RealLike,
         y0: PyTree,
         args: PyTree,
-    ) -> None:
-        """Return no solver state; raise a `ValueError` unless `terms` are the equations of a free
-        body.
+    ) -> tuple[()]:
+        """Return an empty solver state; raise a `ValueError` unless `terms` are the equations of a
+        free body.
         """
         _free_euler_equations(terms)
-        return None
+        return ()
 
     def step(
         self,
@@ -101,12 +101,12 @@ class FreeSolver(dfx.AbstractSolver):
         t1: RealLike,
         y0: PyTree,
         args: PyTree,
-        solver_state: None,
+        solver_state: PyTree,
         made_jump: Bool[ArrayLike, ""],
-    ) -> tuple[Any, Any, dict[str, Any], None, dfx.RESULTS]:
+    ) -> tuple[Any, Any, dict[str, Any], tuple[()], dfx.RESULTS]:
         """Return the five results of a step from `t0` to `t1`, as diffrax asks for them: the exact
-        state at `t1`, an error of zero, the numbers for the dense output, no solver state, and
-        success.
+        state at `t1`, an error of zero, the numbers for the dense output, an empty solver state,
+        and success.
         """
         # The direction is −1 if diffrax integrates backwards, in which case its times are −t.
         inertia, direction = (
@@ -116,7 +116,7 @@ class FreeSolver(dfx.AbstractSolver):
         y1 = FreeBody(inertia, y0)(direction * (t1 - t0))
         error = jax.tree.map(jnp.zeros_like, y0)
         dense = dict(y0=y0, inertia=inertia, direction=direction)
-        return y1, error, dense, None, dfx.RESULTS.successful
+        return y1, error, dense, (), dfx.RESULTS.successful
 
     def func(
         self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import NumbersLike, Scalar, ScalarLike, Vec3
 from rigidjax.frames.point import Point
 
@@ -35,6 +35,8 @@ class AbstractScene(eqx.Module):
     >>> float(Spring().conserved(0.0, Point([1.0, 0, 0], [0.0, 2, 0]))["energy"])
     2.5
     """
+
+    __repr__ = _show.fields_as_text
 
     @abc.abstractmethod
     def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
@@ -98,7 +100,9 @@ class Force(AbstractScene):
     def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
         if self.force is None:
             return jnp.zeros_like(state.x)
-        return checked_force_per_mass(self.force(t, state, None), self.force)
+        with _checks.explain_tracing("force", self.force):
+            value = self.force(t, state, None)
+        return checked_force_per_mass(value, self.force)
 
     def conserved(self, t: ScalarLike, state: PyTree) -> dict[str, Scalar]:
         return {}

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia
 from rigidjax.frames.base import AbstractScene, Force, checked_force_per_mass, jump_times_within
@@ -148,6 +148,8 @@ class BodyInFrame(eqx.Module):
     feels: ClassVar[type] = HasAttitude
     frame: MovingFrame
     torque: Callable[..., Any] | None = None
+
+    __repr__ = _show.fields_as_text
 
     def __check_init__(self) -> None:
         require_frame(self.frame, "BodyInFrame")

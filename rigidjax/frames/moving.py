@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.frames import rotation_models
 from rigidjax.frames.frame_kinematics import Instant, acceleration_due_to_rotation
@@ -46,6 +46,8 @@ class MovingFrame(eqx.Module):
     rotation: Any
     origin: Callable[[Any], Any] | None
     rate: Callable[[Any], Any] | None
+
+    __repr__ = _show.fields_as_text
 
     def __init__(
         self,

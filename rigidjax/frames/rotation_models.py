@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import Mat3, ScalarLike, Vec3
 from rigidjax.rotation import linalg3, quaternion, so3
 from rigidjax.rotation.validation import require_near_unit, require_rotation_matrix
@@ -27,6 +27,8 @@ class Uniform(eqx.Module):
     """
 
     omega: Float[Array, "3"]
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, omega: Float[Array, "3"] | object):
         self.omega = _checks.require_finite(_checks.array_of_shape(omega, (3,), "omega"), "omega")
@@ -54,6 +56,8 @@ class AboutAxis(eqx.Module):
 
     axis: Float[Array, "3"]
     angle: Callable[[Any], Any]
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, axis: Float[Array, "3"] | object, angle: Callable[[Any], Any]):
         axis = _checks.require_finite(_checks.array_of_shape(axis, (3,), "axis"), "axis")

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import HasAttitude, Scalar, ScalarLike
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
@@ -32,6 +32,8 @@ class Coordinates(eqx.Module):
 
     q: Float[Array, "*batch n"]
     rate: Float[Array, "*batch n"]
+
+    __repr__ = _show.fields_as_text
 
     def __init__(
         self, q: Float[ArrayLike, "*batch n"] | object, rate: Float[ArrayLike, "*batch n"] | object

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import HasAttitude, Mat3, Scalar, ScalarLike, Vec3, Vectors
 from rigidjax.body import inertia as _inertia, validation
 from rigidjax.motion.torques import HeavyTop
@@ -27,6 +27,8 @@ class Momentum(eqx.Module):
     """
 
     pi: Float[Array, "*batch 3"]
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, pi: Vectors):
         self.pi = _checks.array_of_shape(pi, (3,), "pi", batched=True)

@@ -12,7 +12,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.frames.base import AbstractScene
 from rigidjax.frames.point import Point
@@ -35,6 +35,8 @@ class PeriodicOrbit(eqx.Module):
 
     state: Point
     period: Float[Array, "*batch"]
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, state: Point, period: ScalarLike):
         self.state = _checks.require_instance(state, Point, "state", requirement="a Point(x, v)")

@@ -5,8 +5,9 @@ import html
 import io
 import shutil
 import subprocess
+import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -16,6 +17,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, NumbersLike
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.meshes import checked_faces
 from rigidjax.body.principal_axes import principal
 from rigidjax.plot.style import (
     COLOURS,
@@ -110,23 +112,33 @@ def tumble(
     ts: Float[ArrayLike, " times"],
     states: HasAttitude,
     *,
+    surface: Any = None,
     seconds: float | int | None = None,
     fps: float | int = 15,
     size: int = 400,
     title: str = "",
 ) -> Film:
-    """Return a GIF of a box that tumbles as the body does; a line shows the path of the end of its
-    longest axis.
+    """Return a GIF of the body as it tumbles; a line shows the path of the end of its longest axis.
 
-    The box is solid and uniform, and has the second moment 𝔖 of the body (the integral of r rᵀ over
-    the mass), hence the same motion. The faces across the shortest, middle and longest axis are
-    blue, orange and green; the faces on the negative side of an axis are pale, so that a flip is
-    seen. The centre of the box is fixed.
+    Without a `surface`, a body is numbers only, and a box is drawn: it is solid and uniform, and
+    has the second moment 𝔖 of the body (the integral of r rᵀ over the mass), hence the same motion.
+    Faces across x, y and z (of a box: its shortest, middle and longest axis) are blue, orange and
+    green; those on the negative side of an axis are pale, so that a flip is seen. The origin of the
+    body axes is fixed.
 
-    **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, with less
-    than a quarter turn between consecutive states; `seconds` the duration of the film, by default
-    the duration of the motion, but at most 20 s; `fps` pictures a second; `size` the width and the
-    height, px; `title`. **Returns** a `Film`, which a notebook shows and `.save(path)` writes.
+    **Arguments:**
+
+    - `body`; `ts` (T,) s; `states` of one body with a leading time axis, with less than a quarter
+      turn between consecutive states.
+    - `surface`: what is drawn: a mesh, `(vertices, faces)` as `shapes.mesh` takes, or an object
+      with these two, such as a mesh of trimesh; a list of meshes for a body of several parts. It is
+      in metres and body axes, about the point that the body turns about: the tip of a top is at the
+      origin.
+    - `seconds`: the duration of the film, by default the duration of the motion, but at most 20 s;
+      `fps` pictures a second; `size` the width and the height, px; `title`.
+
+    **Returns** a `Film`, which a notebook shows and `.save(path)` writes. A `UserWarning` says if
+    the body makes half a turn or more between two pictures, which then show another motion.
     **Raises** `ValueError` if `seconds`, `fps` or `size` is not positive.
 
     >>> body = rj.shapes.box(1.0, [0.1, 0.2, 0.3])
@@ -137,8 +149,9 @@ def tumble(
     seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
     body = validation.require_single_body(body, (Inertia, MassProperties), "body")
     moments, q = evenly_spaced_times_and_attitudes(ts, states, pictures)
+    _warn_of_aliases(ts, states, moments, seconds)
     size = _checks.integer(size, "size", 64)
-    corners, tip, reach = _box_corners_axis_end_and_half_diagonal(body)
+    solid = _solid(body, surface)
     pyplot()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -151,17 +164,33 @@ def tumble(
     ax: Any = figure.add_axes((0.0, 0.08, 0.86, 0.84), projection="3d")
     # The path goes through every given state: through the states of the few pictures alone it would
     # be a zigzag.
-    when, tips = np.asarray(ts, dtype=float), rotation_matrices(attitudes_on_host(states)) @ tip
-    unit = ", m" if isinstance(body, MassProperties) else ""
-    set_equal_scales(ax, reach, (f"x{unit}", f"y{unit}", f"z{unit}"))
-    solid = Poly3DCollection([], edgecolor="0.2", linewidths=0.8, alpha=0.85)
-    ax.add_collection3d(solid)
+    when, tips = (
+        np.asarray(ts, dtype=float),
+        rotation_matrices(attitudes_on_host(states)) @ solid.tip,
+    )
+    unit = ", m" if surface is not None or isinstance(body, MassProperties) else ""
+    set_equal_scales(ax, solid.reach, (f"x{unit}", f"y{unit}", f"z{unit}"))
+    edges: dict[str, Any] = {"linewidths": 0.3}
+    if surface is None:
+        edges = {"edgecolor": "0.2", "linewidths": 0.8}
+    up, around = np.radians([ax.elev, ax.azim])
+    towards = [np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)]
+    drawn = Poly3DCollection([], alpha=0.85 if surface is None else 1.0, **edges)
+    ax.add_collection3d(drawn)
     (trail,) = ax.plot([], [], [], color="0.3", lw=0.9)
     shots = []
     for moment, rotation in zip(moments, rotation_matrices(q), strict=True):
-        placed = corners @ rotation.T
-        solid.set_verts([placed[list(face)] for face in FACES])
-        solid.set_facecolor(SHADES)
+        placed, colours = solid.polygons @ rotation.T, solid.colours
+        if surface is not None:
+            # Of an opaque surface only what faces the viewer is drawn: matplotlib sorts whole
+            # triangles by their depth, so that others would shine through.
+            a, b, c = (placed[:, k] for k in range(3))
+            front = np.cross(b - a, c - a) @ towards > 0
+            placed, colours = placed[front], colours[front]
+        drawn.set_verts(placed)
+        drawn.set_facecolor(colours)
+        if surface is not None:
+            drawn.set_edgecolor(colours)
         trail.set_data_3d(*tips[when <= moment].T)
         ax.set_title(escape_formulas(f"{title}  t = {moment:.3g} s".strip()), fontsize=10)
         canvas.draw()
@@ -200,21 +229,23 @@ def player(
     ts: Float[ArrayLike, " times"],
     states: HasAttitude,
     *,
+    surface: Any = None,
     seconds: float | int | None = None,
     fps: float | int = 20,
     height: int = 420,
 ) -> Film:
     """Return a page that plays the motion in 3-D; you can turn and zoom the view while it plays.
 
-    The picture is as in `tumble`: a box that moves as the body does, and the path of the end of its
-    longest axis. The page contains everything, also the program of the 3-D viewer viser (0.8 MB): a
-    notebook shows it without a network or a running kernel, and `.save("tumble.html")` writes it to
-    a file. **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises**
-    as `tumble`.
+    The picture is as in `tumble`: the body, and the path of the end of its longest axis. The page
+    contains everything, also the program of the 3-D viewer viser (0.8 MB): a notebook shows it
+    without a network or a running kernel, and `.save("tumble.html")` writes it to a file.
+    **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises** as
+    `tumble`.
     """
     seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
-    _, q = evenly_spaced_times_and_attitudes(ts, states, pictures)
-    box = _box_corners_axis_end_and_half_diagonal(body)
+    moments, q = evenly_spaced_times_and_attitudes(ts, states, pictures)
+    _warn_of_aliases(ts, states, moments, seconds)
+    solid = _solid(validation.require_single_body(body, (Inertia, MassProperties), "body"), surface)
     viser = _checks.import_library("viser", "view", "plot.player")
     import rich
 
@@ -226,7 +257,7 @@ def player(
     try:
         server = viser.ViserServer(host="127.0.0.1", verbose=False)
         try:
-            page = _html_of_tumbling_box(server, *box, q, seconds)
+            page = _html_of_tumbling_solid(server, solid, q, seconds)
         finally:
             server.stop()
     finally:
@@ -234,39 +265,31 @@ def player(
     return Film(page.encode("utf-8"), "html", height)
 
 
-def _html_of_tumbling_box(
-    server: Any,
-    corners: np.ndarray,
-    longest_axis_end: np.ndarray,
-    half_diagonal: float,
-    q: np.ndarray,
-    seconds: float,
-) -> str:
-    """Draw a tumbling box in a server of viser, and return the HTML page that plays the recorded
-    motion.
-
-    - `server`: the server, without connected browsers.
-    - `corners`: (8, 3) the corners of the box, body axes.
-    - `longest_axis_end`: (3,) the end of its longest half-axis, body axes, whose path is drawn.
-    - `half_diagonal`: the half diagonal of the box.
-    - `q`: (N, 4) the attitudes, body → world, evenly spaced in time.
-    - `seconds`: the duration of the film, s.
+def _html_of_tumbling_solid(server: Any, solid: "_Solid", q: np.ndarray, seconds: float) -> str:
+    """Draw a tumbling body in a server of viser without browsers, and return the page that plays
+    its attitudes `q` (N, 4), body → world, evenly spaced over `seconds`.
     """
     scene = server.scene
     scene.set_up_direction("+z")
-    server.initial_camera.position = tuple(1.8 * half_diagonal * np.array([1.0, -1.2, 0.7]))
+    server.initial_camera.position = tuple(1.8 * solid.reach * np.array([1.0, -1.2, 0.7]))
     server.initial_camera.look_at = (0.0, 0.0, 0.0)
-    scene.add_frame("/world", axes_length=1.1 * half_diagonal, axes_radius=0.008 * half_diagonal)
+    scene.add_frame("/world", axes_length=1.1 * solid.reach, axes_radius=0.008 * solid.reach)
     attitude = scene.add_frame("/body", show_axes=False, wxyz=tuple(q[0]))
-    for side, ((a, b, c, d), shade) in enumerate(zip(FACES, SHADES, strict=True)):
-        faces = np.array([(a, b, c), (a, c, d)], dtype=np.uint32)
+    for side, shade in enumerate(SHADES):
+        polygons = solid.polygons[solid.sides == side]
+        corners = polygons.shape[1]
+        # Each polygon is cut into triangles from its first corner.
+        fan = np.array([(0, k, k + 1) for k in range(1, corners - 1)])
+        faces = (corners * np.arange(len(polygons))[:, None, None] + fan).reshape(-1, 3)
         how = dict(color=tuple(round(255 * part) for part in shade), flat_shading=True)
-        place = f"/body/side{side}"
-        scene.add_mesh_simple(place, corners.astype(np.float32), faces, side="double", **how)
-    tips = (rotation_matrices(q) @ longest_axis_end).astype(np.float32)
+        vertices = polygons.reshape(-1, 3).astype(np.float32)
+        if len(faces):
+            name = f"/body/side{side}"
+            scene.add_mesh_simple(name, vertices, faces.astype(np.uint32), side="double", **how)
+    tips = (rotation_matrices(q) @ solid.tip).astype(np.float32)
     lines = np.stack([tips[:-1], tips[1:]], axis=1)
     scene.add_line_segments(
-        "/trail", points=lines, colors=(90, 90, 90), thickness=0.01 * half_diagonal
+        "/trail", points=lines, colors=(90, 90, 90), thickness=0.01 * solid.reach
     )
     recording = server.get_scene_serializer()
     for one in q:
@@ -296,19 +319,67 @@ def evenly_spaced_times_and_attitudes(
     return when, between / np.linalg.norm(between, axis=1, keepdims=True)
 
 
-def _box_corners_axis_end_and_half_diagonal(
-    body: Inertia | MassProperties,
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return three things, for the uniform box that moves as the body does: its corners (8, 3); the
-    end (3,) of its longest half-axis; and half of its diagonal.
+class _Solid(NamedTuple):
+    """Hold what a film draws, in body axes."""
 
-    The corners and the end are given in body axes. Lengths are in metres for `MassProperties`; for
-    an `Inertia` the longest half-axis has the length 1.
+    polygons: np.ndarray  # (m, k, 3)
+    sides: np.ndarray  # (m,) which of the colours `SHADES` is nearest
+    colours: np.ndarray  # (m, 3)
+    tip: np.ndarray  # (3,) the end of the longest axis
+    reach: float  # the largest distance of a corner from the origin
+
+
+def _solid(body: Inertia | MassProperties, surface: Any) -> _Solid:
+    """Return what is drawn for a body: its `surface`, or the uniform box that moves as it does."""
+    half, axes = box_half_lengths_and_axes(body)
+    if surface is None:
+        polygons = ((CORNERS * half) @ axes.T)[np.array(FACES)]
+    else:
+        parts = surface if isinstance(surface, list) else [surface]
+        polygons = np.concatenate([_triangles(part) for part in parts])
+    a, b, c = (polygons[:, k] for k in range(3))
+    normal = np.cross(b - a, c - a) @ (axes if surface is None else np.eye(3))
+    weights = normal**2 / np.maximum((normal**2).sum(1, keepdims=True), 1e-300)
+    sides = 2 * np.arange(3) + (normal > 0)
+    colours = (weights[..., None] * SHADES[sides]).sum(1)
+    main = sides[np.arange(len(sides)), weights.argmax(1)]
+    corners, long = polygons.reshape(-1, 3), axes[:, np.argmax(half)]
+    along = corners @ long
+    tip = along[np.argmax(np.abs(along))] * long
+    reach = float(np.linalg.norm(corners, axis=1).max())
+    return _Solid(polygons, main, colours, tip, reach)
+
+
+def _triangles(mesh: Any) -> np.ndarray:
+    """Return the corners (m, 3, 3) of the triangles of a mesh."""
+    if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
+        mesh = (mesh.vertices, mesh.faces)
+    if not isinstance(mesh, tuple) or len(mesh) != 2:
+        words = "surface: wanted (vertices, faces), or a list of such meshes, got "
+        raise TypeError(words + _checks.type_name(mesh))
+    vertices = _checks.host_array(_checks.array_of_rows(mesh[0], (3,), "vertices"), "vertices")
+    return vertices[np.asarray(checked_faces(mesh[1], len(vertices)))]
+
+
+def _warn_of_aliases(ts: NumbersLike, states: PyTree, moments: np.ndarray, seconds: float) -> None:
+    """Warn if the body makes half a turn between two pictures, at `moments`, s, of a film of some
+    `seconds`, or a quarter between two of its `states`.
     """
-    half, turn = box_half_lengths_and_axes(body)
-    longest = np.argmax(half)
-    corners = (CORNERS * half) @ turn.T
-    return corners, turn[:, longest] * half[longest], float(np.linalg.norm(half))
+    t, rates = times_on_host(ts, len(states.omega)), np.linalg.norm(states.omega, axis=-1)
+    turns = np.abs(np.diff(t)) * 0.5 * (rates[1:] + rates[:-1]) / (2 * np.pi)
+    sign = np.sign(t[-1] - t[0])
+    total = np.interp(sign * moments, sign * t, np.concatenate([[0.0], np.cumsum(turns)]))
+    most = np.diff(total).max()
+    if turns.max() >= 0.25:
+        words = f"the body makes {turns.max():.2g} turns between two of ts: give more times"
+    elif most >= 0.5:
+        words = (
+            f"the body makes {most:.2g} turns between two pictures, which show another motion: "
+            f"give a larger fps, or seconds={seconds * most / 0.1:.2g} and more"
+        )
+    else:
+        return
+    warnings.warn(f"film: {words}", stacklevel=3)
 
 
 def box_half_lengths_and_axes(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:

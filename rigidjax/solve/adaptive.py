@@ -1,5 +1,6 @@
 """Solve a vector field in one call of `diffrax.diffeqsolve`; steps end where the field jumps."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from jaxtyping import Array, PyTree
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive_loop import NONFINITE, finite
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.replay_adjoint import ReplayAdjoint
+from rigidjax.solve.replay_adjoint import ReplayAdjoint, can_run
 from rigidjax.solve.step_control import StandardController, Stopping, Watched
 from rigidjax.solve.stops import program_with_stops
 
@@ -117,7 +118,10 @@ def integrate_with_diffrax(
             controller = Stopping(controller, program.stops)
     # The last of `ts` is the end of the last step, so that the state there needs no dense output.
     subs = [dfx.SubSaveAt(t1=True, fn=_state_as_vector)]
-    subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=_state_as_vector)] if ts.shape[0] > 2 else []
+    if ts.shape[0] > 2 and isinstance(adjoint, ReplayAdjoint) and can_run(solver, max_steps, y0):
+        adjoint = dataclasses.replace(adjoint, between=ts[1:-1])
+    elif ts.shape[0] > 2:
+        subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=_state_as_vector)]
     out = dfx.diffeqsolve(
         dfx.ODETerm(field), solver, ts[0], ts[-1], dt0, y0,
         saveat=dfx.SaveAt(subs=subs), stepsize_controller=controller, adjoint=adjoint,

@@ -37,6 +37,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
 from rigidjax import _checks
+from rigidjax._names import suggest_arguments
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
@@ -160,6 +161,7 @@ class Crossings(eqx.Module, Generic[State]):
         return self.result == dfx.RESULTS.event_occurred
 
 
+@suggest_arguments
 def crossings(
     body: Inertia | MassProperties | None,
     state0: State,
@@ -284,7 +286,8 @@ def condition_value(event: Event, body: Any, t: Any, y: PyTree) -> Array:
 
     **Raises:** `TypeError` or `ValueError` if the condition gives a truth value or an array.
     """
-    found = event.condition(t, y, body)
+    with _checks.explain_tracing("condition", event.condition):
+        found = event.condition(t, y, body)
     if jnp.issubdtype(getattr(found, "dtype", type(found)), jnp.bool_):
         raise TypeError(
             "condition: wanted one real number, zero at the event, got a truth value; give the "

@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, PyTree
 from rigidjax import _checks
 from rigidjax._types import RealLike
 from rigidjax.motion.equations import project_to_group
+from rigidjax.rotation.barrier import barrier
 from rigidjax.solve import validation
 from rigidjax.solve.runge_kutta import Step, change_within_step, dense_rows, error_estimate, stages
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
@@ -43,7 +44,8 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
         theta = jnp.where(length == 0, jnp.zeros_like(length), (t0 - self.t0) / safe)
 
         value = lambda y, rows: y + change_within_step(theta.astype(y.dtype), rows)  # noqa: E731
-        return project_to_group(jax.tree.map(value, self.y0, self.coefficients))
+        # A maximum has no derivative if XLA rounds its argument differently in two places.
+        return barrier(project_to_group(jax.tree.map(value, self.y0, self.coefficients)))
 
 
 def direction_and_length_of_step(
@@ -95,8 +97,8 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
         t1: RealLike,
         y0: PyTree,
         args: PyTree,
-    ) -> None:
-        return None
+    ) -> tuple[()]:
+        return ()
 
     def step(
         self,
@@ -127,7 +129,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
         error = lax.stop_gradient(error_estimate(self.tableau, sizes, h, there.slopes))
         rows = dense_rows(self.tableau, field, step, there.slopes)
         dense = dict(y0=y0, coefficients=jax.vmap(tree)(rows))
-        return y1, tree(error), dense, None, dfx.RESULTS.successful
+        return y1, tree(error), dense, (), dfx.RESULTS.successful
 
     def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, args)

@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
+from rigidjax._names import suggest_arguments
 from rigidjax._types import ScalarLike
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.equations import project_to_group
@@ -53,6 +54,7 @@ class Exponents(eqx.Module):
     result: dfx.RESULTS
 
 
+@suggest_arguments
 def lyapunov_exponents(
     field: Callable[..., Any],
     state0: Any,

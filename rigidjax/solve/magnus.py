@@ -106,11 +106,12 @@ class Magnus4(dfx.AbstractSolver):
         t1: RealLike,
         y0: PyTree,
         args: PyTree,
-    ) -> None:
+    ) -> tuple[()]:
         field, _ = field_and_direction(terms)
         require_independent_of_attitude(
             require_attitude_equations("Magnus4", field, y0, "RungeKutta4").euler.torque
         )
+        return ()
 
     def step(
         self,
@@ -149,7 +150,7 @@ class Magnus4(dfx.AbstractSolver):
             return jnp.stack(cubic_coefficients(b - a, way * h, k, m))
 
         dense = dict(y0=y0, coefficients=jax.tree.map(rows, y0, y1, left, right))
-        return y1, None, dense, None, dfx.RESULTS.successful
+        return y1, None, dense, (), dfx.RESULTS.successful
 
     def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, args)

@@ -57,6 +57,10 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
       conditions (`ReplayAdjoint` can end a run only by one boolean condition);
     - a run whose state has complex numbers or several dtypes.
 
+    `between` is for `simulate`: times, s, at which the run is saved besides those of the `SaveAt`,
+    known to be in order. diffrax checks the times of a `SaveAt` by a call of Python, which
+    `jax.export` refuses.
+
     **Raises:** `TypeError` for `jax.grad` of a `jax.grad`: second derivatives are forward over
     reverse.
 
@@ -73,6 +77,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
     """
 
     otherwise: dfx.AbstractAdjoint = dfx.RecursiveCheckpointAdjoint()
+    between: Array | None = None
 
     def __check_init__(self) -> None:
         _checks.require_instance(self.otherwise, dfx.AbstractAdjoint, "otherwise")
@@ -91,6 +96,10 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         # In a run backwards in time diffrax uses −t as the time, so that the field changes its
         # sign.
         way = jnp.where(jnp.asarray(terms.contr(t0, t1)) < 0, -1, 1).astype(y0.dtype)
+        if self.between is not None:
+            (sub,), (saved,) = saveat.subs, init_state.save_state
+            saveat = dfx.SaveAt(subs=[sub, dfx.SubSaveAt(ts=way * self.between, fn=sub.fn)])
+            init_state = dataclasses.replace(init_state, save_state=[saved, saved])
         program = trace_program(
             lambda t, y: way * ravel_pytree(terms.vf(t, tree(y), args))[0].astype(y.dtype), t0, y0
         )
@@ -193,6 +202,15 @@ class _Control(NamedTuple):
         return jax.tree.map(jnp.asarray, (keep, t, following, (control, progress), result))
 
 
+def can_run(solver: dfx.AbstractSolver, max_steps: int | None, state: Any) -> bool:
+    """Return whether `ReplayAdjoint` can do a run of this solver from this state: an explicit
+    method of this package, a largest number of steps, and numbers of one floating-point dtype.
+    """
+    kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(state)}
+    plain = isinstance(solver, AbstractExplicit) and max_steps is not None and len(kinds) == 1
+    return plain and jnp.issubdtype(min(kinds, key=str), jnp.floating)
+
+
 def _can_be_replayed(
     solver: dfx.AbstractSolver,
     saveat: dfx.SaveAt,
@@ -202,17 +220,11 @@ def _can_be_replayed(
 ) -> bool:
     """Return whether `ReplayAdjoint` can do a run without its other adjoint, `otherwise`.
 
-    It can do a run of an explicit method of this package with a largest number of steps, on a state
-    of one floating-point dtype. It cannot save dense output or every step. An event must have one
-    condition that returns a truth value, and no root finder.
-
-    The arguments are those of `diffrax.diffeqsolve`: the `solver`, what is saved (`saveat`), the
-    `event` or `None`, and the largest number of steps (`max_steps`) or `None`. `state` is the state
-    of `diffeqsolve` at the start.
+    Besides `can_run`: it cannot save dense output or every step. An event must have one condition
+    that returns a truth value, and no root finder. `state` is the state of `diffeqsolve` at the
+    start.
     """
-    kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(state.y)}
-    plain = isinstance(solver, AbstractExplicit) and max_steps is not None and not saveat.dense
-    plain = plain and len(kinds) == 1 and jnp.issubdtype(min(kinds, key=str), jnp.floating)
+    plain = can_run(solver, max_steps, state.y) and not saveat.dense
     if event is not None:
         values = jax.tree.leaves(state.event_values)
         plain = plain and event.root_finder is None and callable(event.cond_fn)

@@ -408,7 +408,7 @@ def warn_of_missed_switches(
         "end at the first of these times, and the derivative with respect to the other times is "
         "lost. Give the law `jump_times`, all its jumps in s, or take torques.Held or Pulses for a "
         "table",
-        stacklevel=4,
+        stacklevel=5,
     )
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
+from rigidjax._names import suggest_arguments
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame
@@ -20,6 +21,7 @@ from rigidjax.solve.crossings import Event, check_condition_and_add_torque_state
 from rigidjax.solve.error import estimate_error_of_run, solve_to_accuracy
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected
+from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.run import (
     ClosedFormRun,
     DiffraxRun,
@@ -52,6 +54,7 @@ _EITHER_MODE = (type(None), dfx.ForwardMode, dfx.RecursiveCheckpointAdjoint)
 _TIGHT, _EVERY_STEP = 1e-10, dfx.RecursiveCheckpointAdjoint(checkpoints=4096)
 
 
+@suggest_arguments
 def simulate(
     body: Inertia | MassProperties | None,
     state0: State,
@@ -182,22 +185,41 @@ def simulate(
     )  # fmt: skip
     setup = dataclasses.replace(setup, adjoint=_adjoint_of_run(setup))
     sought = setup.records_steps_for_derivatives and progress_meter is None
-    if accuracy is not None and not sought:
-        raise ValueError(
-            "simulate: an accuracy is for the closed form and the explicit methods of "
-            "rigidjax.solvers under ReplayAdjoint: leave solver, adjoint, progress_meter and "
-            "max_steps to their defaults, or take a solver of rigidjax.solvers"
-        )
-    if event is not None and not sought:
-        raise ValueError(
-            "simulate: an event is for the closed form and the explicit methods of "
-            "rigidjax.solvers under ReplayAdjoint: leave solver, stepsize_controller, adjoint and "
-            "progress_meter to their defaults (or take a solver of rigidjax.solvers), or give "
-            "diffrax.Event to diffrax.diffeqsolve"
-        )
+    for name, asked in (("accuracy", accuracy), ("event", event)):
+        if asked is not None and not sought:
+            raise ValueError(_message_of_conflict(name, setup, solver, progress_meter))
     if accuracy is not None:
         return _solve_to_accuracy(setup, event, state0, times, accuracy)
     return _solve_run(setup, event, state0, times)
+
+
+def _message_of_conflict(
+    name: str,
+    setup: DiffraxRun,
+    solver: dfx.AbstractSolver | None,
+    meter: dfx.AbstractProgressMeter | None,
+) -> str:
+    """Return why the argument `name` (an accuracy or an event) cannot be had: which of the other
+    arguments needs diffrax' own loop.
+    """
+    ours = solver is None or isinstance(solver, AbstractExplicit)
+    needs_diffrax = {
+        f"solver={type(solver).__name__}": not ours,
+        "max_steps=None": setup.max_steps is None,
+        f"stepsize_controller={type(setup.controller).__name__}": setup.controller is not None,
+        f"adjoint={type(setup.adjoint).__name__}": ours
+        and setup.max_steps is not None
+        and not isinstance(setup.adjoint, ReplayAdjoint),
+        f"progress_meter={type(meter).__name__}": meter is not None,
+    }
+    given = [argument for argument, needs in needs_diffrax.items() if needs]
+    advice = ["leave it out" if len(given) == 1 else "leave them out"]
+    advice += [] if ours else ["take an explicit solver of rigidjax.solvers"]
+    advice += ["give diffrax.Event to diffrax.diffeqsolve"] if name == "event" else []
+    return (
+        f"simulate: {name} does not go with {' and '.join(given)}, a run in the loop of diffrax: "
+        f"{', or '.join(advice)}"
+    )
 
 
 def _solver_of_run(

@@ -231,7 +231,7 @@ def _warn_if_error_exceeds(error: Error, limit: Any, message_start: str) -> None
     warnings.warn(
         f"{message_start} from t = {float(error.ts[i]):g} s on: the steps leave {steps:.1e}, "
         f"round-off {off:.1e} (rad, or relative); end the run earlier{single}",
-        stacklevel=5,
+        stacklevel=6,
     )
 
 

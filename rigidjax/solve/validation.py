@@ -199,7 +199,7 @@ def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
         warnings.warn(
             f"simulate: {np.dtype(dtype).name} cannot reach rtol={rtol:g}; "
             f"using {floor:.2g}{advice}",
-            stacklevel=3,
+            stacklevel=4,
         )
         rtol = floor
     return rtol, atol

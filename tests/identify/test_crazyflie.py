@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[2]
-LOGS = ROOT.parent / "shared" / "data" / "crazyflie"
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not LOGS.exists(), reason="the logs are not beside this checkout"),
-]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

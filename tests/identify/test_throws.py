@@ -174,6 +174,7 @@ def test_the_notebook_gives_the_figures(monkeypatch):
 
     matplotlib.use("Agg")
     monkeypatch.chdir(NOTEBOOK.parent)
+    monkeypatch.syspath_prepend(NOTEBOOK.parent)
     monkeypatch.delenv("RIGIDJAX_SHORT", raising=False)
     cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
     space = {}

@@ -284,8 +284,9 @@ def test_a_free_particle_goes_straight_on_the_right(turntable):
 def test_a_film_has_its_pictures(flip, tmp_path):
     from PIL import Image
 
+    states = jax.tree.map(lambda a: a[:26], flip.ys)
     film = rj.plot.tumble(
-        rj.shapes.box(1.0, [0.1, 0.2, 0.3]), flip.ts, flip.ys, seconds=0.4, fps=10
+        rj.shapes.box(1.0, [0.1, 0.2, 0.3]), flip.ts[:26], states, seconds=0.4, fps=10
     )
     path = film.save(tmp_path / "tumble.gif")
     with Image.open(path) as picture:
@@ -382,3 +383,40 @@ def test_nothing_of_this_is_imported_before_it_is_called():
     code = "import sys, rigidjax; print([m for m in ('matplotlib', 'viser', 'PIL') if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+def test_a_film_shows_the_surface_that_it_gets():
+    from rigidjax.plot.animation import SHADES, _solid
+
+    body = rj.shapes.box(2.0, [0.2, 0.6, 0.4])
+    # A box of triangles, whose corner is at the origin: a body on a pivot.
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    faces = [f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))]
+    size = np.array([0.2, 0.6, 0.4])
+    shown = _solid(body, [(corners * size, faces), (corners * size + 1.0, faces)])
+    assert shown.polygons.shape == (24, 3, 3)
+    np.testing.assert_allclose(shown.polygons.min((0, 1)), 0, atol=1e-12)
+    np.testing.assert_allclose(shown.polygons.max((0, 1)), 1 + size)
+    np.testing.assert_allclose(shown.colours[:12], np.repeat(SHADES, 2, axis=0), atol=1e-12)
+    # The end of the longest axis, y.
+    np.testing.assert_allclose(shown.tip, [0, 1.6, 0], atol=1e-12)
+    # The box of a box is drawn as itself.
+    box = _solid(body, None)
+    np.testing.assert_allclose(np.sort(np.abs(box.polygons).max((0, 1))), [0.1, 0.2, 0.3])
+    with pytest.raises(TypeError, match=r"surface: wanted \(vertices, faces\)"):
+        _solid(body, 3.0)
+
+
+def test_a_film_says_when_its_pictures_show_another_motion():
+    ts = jnp.linspace(0.0, 2.0, 81)
+    spin = jnp.stack([jax.vmap(lambda t: 9.0 + 0 * t)(ts), 0 * ts, 0 * ts], axis=1)
+    q = jax.vmap(rj.quaternion.exp)(spin * ts[:, None])
+    states, body = rj.Attitude(q, spin), rj.shapes.box(1.0, [1.0, 2.0, 3.0])
+    # 18 rad in 2 s: 0.41 turns between 8 pictures, 0.57 between 6.
+    rj.plot.tumble(body, ts, states, seconds=2, fps=4, size=64)
+    with pytest.warns(UserWarning, match=r"0\.57 turns between two pictures"):
+        rj.plot.tumble(body, ts, states, seconds=2, fps=3, size=64)
+    few = jax.tree.map(lambda a: a[::10], states)
+    with pytest.warns(UserWarning, match="turns between two of ts"):
+        rj.plot.tumble(body, ts[::10], few, seconds=2, fps=8, size=64)

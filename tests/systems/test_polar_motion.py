@@ -12,7 +12,6 @@ from once import once
 from rigidjax import identify
 
 ROOT = Path(__file__).parents[2]
-DATA = ROOT.parent / "shared" / "data" / "polar_motion" / "1973-1995.csv"
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +73,8 @@ def test_the_likelihood_knows_the_period_of_a_made_pole(polar):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not DATA.exists(), reason="the table of polar motion is not on this machine")
 def test_the_measured_pole(polar):
-    t, readings, errors = polar.read(DATA)
+    t, readings, errors = polar.read()
     v, covariance, best, value, x = polar.fit(polar.MODELS["red"], readings, errors)
     period = float(v["period"])
     assert abs(period - 432.1) < 3 * period * np.sqrt(covariance[0, 0])

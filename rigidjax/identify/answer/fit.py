@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
+from rigidjax._names import suggest_arguments
 from rigidjax.identify.answer.assess import assess
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
@@ -64,6 +65,7 @@ _ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
 _MOST_STARTS = 10_000
 
 
+@suggest_arguments
 def fit(
     model: Model,
     *,

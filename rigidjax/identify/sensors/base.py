@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import NumbersLike, Scalar, Vec3
 from rigidjax.body.inertia import MassProperties
 
@@ -98,6 +98,8 @@ class AbstractSensor(eqx.Module):
     feels: eqx.AbstractVar[type]
     unit: eqx.AbstractClassVar[str]
     noise: eqx.AbstractVar[Array | None]
+
+    __repr__ = _show.fields_as_text
 
     @abc.abstractmethod
     def error(self, motion: SensorInput, reading: Array) -> Float[Array, " k"]:

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import Scalar, ScalarLike
 
 # An interval between two samples is a hole in the log if it is longer than _HOLE times the median
@@ -48,6 +48,8 @@ class LowPass(eqx.Module):
 
     cutoff: Scalar
     order: int = eqx.field(static=True)
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, cutoff: ScalarLike, order: int = 1):
         cutoff = _checks.array_of_shape(cutoff, (), "cutoff")

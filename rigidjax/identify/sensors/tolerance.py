@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import NumbersLike, Scalar
 
 
@@ -54,6 +54,8 @@ class Tolerance(eqx.Module):
     cross_axis: Scalar | None = _deviation_field("cross_axis")
     bias: Scalar | None = _deviation_field("bias")
     clock: Scalar | None = _deviation_field("clock")
+
+    __repr__ = _show.fields_as_text
 
 
 def tolerance_of(tolerance: object) -> Tolerance | None:

@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PyTree
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import (
     HasAttitude,
     HasPose,
@@ -40,6 +40,8 @@ class Wrench(eqx.Module):
 
     force: Vec3
     torque: Vec3
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, force: Vector, torque: Vector | None = None):
         self.force = _checks.array_of_shape(force, (3,), "force", hint="world-frame N")
@@ -92,6 +94,8 @@ class AbstractTorque(eqx.Module):
 
     feels: eqx.AbstractVar[type]
 
+    __repr__ = _show.fields_as_text
+
     @abc.abstractmethod
     def __call__(self, t: ScalarLike, state: PyTree, body: Body) -> Vec3:
         """Return the torque (3,), N m, body frame, at the time `t`, s, on a `body` (an `Inertia` or
@@ -106,6 +110,8 @@ class AbstractForce(eqx.Module):
     """
 
     feels: eqx.AbstractVar[type]
+
+    __repr__ = _show.fields_as_text
 
     @abc.abstractmethod
     def __call__(self, t: ScalarLike, state: PyTree, body: MassProperties) -> Wrench:
@@ -268,7 +274,8 @@ def force_and_torque(
     # float64 table in a torque must not turn a float32 solve into a float64 solve, nor raise an
     # error under JAX's strict promotion of dtypes.
     try:
-        result = in_precision(model, dtype)(t, state, in_precision(body, dtype))
+        with _checks.explain_tracing("torque", model):
+            result = in_precision(model, dtype)(t, state, in_precision(body, dtype))
     except AttributeError as error:
         message = missing_state_part_message(name, error)
         if message is None:

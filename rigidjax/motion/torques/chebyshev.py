@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.rotation.barrier import barrier
 
@@ -34,6 +34,8 @@ class Chebyshev(eqx.Module):
     start: Scalar
     step: Scalar
     coefficients: Float[Array, "intervals k terms"]
+
+    __repr__ = _show.fields_as_text
 
     def __init__(
         self,

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import HasAttitude, HasSpin, Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import Body, Inertia, tensor_of, with_tensor
 from rigidjax.body.symmetric3 import from_components
@@ -33,6 +33,8 @@ class Sum(eqx.Module):
     """
 
     parts: tuple[Any, ...]
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, *parts: base.Torque):
         if not parts:
@@ -126,6 +128,8 @@ class ChangingInertia(eqx.Module):
 
     inertia: Callable[..., Any]
     torque: Any
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, inertia: Callable[..., Any], torque: base.Torque | None = None):
         if hasattr(inertia, "feels"):
@@ -235,6 +239,8 @@ class Tide(eqx.Module):
     mu: Scalar = eqx.field(converter=base.number_converter("mu"))
     position: Any = eqx.field(converter=base.vector_or_function_converter("position"))
     mean_rate: Scalar = eqx.field(converter=base.number_converter("mean_rate"), default=0.0)
+
+    __repr__ = _show.fields_as_text
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: Body) -> Mat3:
         before = quaternion.multiply(state.q, quaternion.exp(-self.delay * state.omega))

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import NumbersLike, ScalarLike
 from rigidjax.body.inertia import Body
 from rigidjax.motion.torques.base import jump_times_of
@@ -34,6 +34,8 @@ class Input(eqx.Module):
 
     name: str = eqx.field(static=True)
 
+    __repr__ = _show.fields_as_text
+
     def __call__(self, t: ScalarLike) -> Any:
         """Raise `ValueError`: an input has no value until `bind` puts a value or a function of time
         in its place.
@@ -54,6 +56,8 @@ class _ConstantFunction(eqx.Module):
     """
 
     value: Array
+
+    __repr__ = _show.fields_as_text
 
     def __call__(self, t: ScalarLike) -> Array:
         return self.value
@@ -85,6 +89,8 @@ class Delayed(eqx.Module):
 
     source: Any
     delay: Float[Array, ""]
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, source: object, delay: ScalarLike):
         source = _checks.require_function(source, "source", "of time")
@@ -146,6 +152,8 @@ class Lagged(eqx.Module):
     source: Any
     time: Float[Array, "*k"]
     start: Array | None
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, source: object, time: NumbersLike, start: NumbersLike | None = None):
         self.source = _checks.require_function(source, "source", "of time")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import HasSpin, NumbersLike, Scalar, ScalarLike, Vec3
 from rigidjax.motion.torques.base import AbstractTorque
 
@@ -23,6 +23,8 @@ class _Table(eqx.Module):
 
     times: Float[Array, " n"]
     values: Float[Array, "n *k"]
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, times: Times, values: Float[ArrayLike, "rows *k"] | Sequence[Any]):
         self.times, self.values = _checked_times_and_rows("times", times, "values", values)

@@ -11,7 +11,7 @@ import numpy as np
 from jax.lax import linalg
 from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import NumbersLike, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.linalg3 import cross, dot
@@ -43,6 +43,8 @@ class Series(eqx.Module):
     step: Scalar
     values: Float[Array, "n *channels"]
     slopes: Float[Array, "n *channels"]
+
+    __repr__ = _show.fields_as_text
 
     def __init__(self, times: Float[ArrayLike, " n"] | Sequence[Any], values: Samples):
         t, rows = (
@@ -160,6 +162,8 @@ class Wheel(eqx.Module):
     speed: Any
     delay: Scalar | None
     tilt: Float[Array, "2"] | None
+
+    __repr__ = _show.fields_as_text
 
     def __init__(
         self,
