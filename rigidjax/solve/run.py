@@ -230,7 +230,7 @@ def convert_to_forward_time(
 
     def directed(s: Array, y: Any, sides: Any = None) -> Any:
         sided = evaluate_on_correct_sides(
-            field, sign, None if sides is None else [time(side) for side in sides]
+            field, sign, None if sides is None else [time(side) for side in sides], ts[-1]
         )
         return jax.tree.map(time, sided(time(s), y, None))
 

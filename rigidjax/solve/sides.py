@@ -39,17 +39,19 @@ class Sided(eqx.Module):
     - `stops`: (n,) s, the times at which steps end because of these jumps. They differ from the
       jumps by at most some units of round-off; `None` says that they are equal to the jumps.
     - `sign`: the direction of time: 1, −1 in a run backwards, or `None` for 1.
+    - `end`: s, the time at which the run ends.
     """
 
     law: Any
     jumps: Any
     stops: Any
     sign: Any
+    end: Any
 
     def __getattr__(self, name: str) -> Any:
         # Attributes that a `Sided` does not have, such as `feels` or `rate_free`, are those of the
         # law that it wraps.
-        if name.startswith("__") or name in ("law", "jumps", "stops", "sign"):
+        if name.startswith("__") or name in ("law", "jumps", "stops", "sign", "end"):
             raise AttributeError(name)
         return getattr(self.law, name)
 
@@ -76,11 +78,15 @@ class Sided(eqx.Module):
         jumps = lax.stop_gradient(self.jumps.astype(still.dtype))
         # A law may have the value before a jump at the time of the jump, as tables do at their last
         # row. A step that begins there needs the value after it: in a run backwards that of the
-        # number before, else that of the next number.
+        # number before, else that of the next number. The step that ends the run needs the value
+        # before a jump.
         closed = jumps[-1:] if isinstance(self.law, _OWN) else jumps
-        now = jnp.where(jnp.any(still == closed), jnp.nextafter(still, high), still)
+        ahead = jnp.where(jnp.any(still == closed), jnp.nextafter(still, high), still)
+        before = jnp.nextafter(still, low)
+        now = jnp.where(still == self.end, before, ahead)
         if self.sign is not None:
-            now = jnp.where(self.sign < 0, jnp.nextafter(still, low), now)
+            back = jnp.where(still == self.end, still, before)
+            now = jnp.where(self.sign < 0, back, now)
         if self.stops is not None:
             stops = self.stops.astype(still.dtype)
             new, after = now >= stops, jnp.nextafter(jumps, jnp.full_like(jumps, jnp.inf))
@@ -146,7 +152,7 @@ def declared_jumps(field: Any) -> list[Array]:
 
 
 def evaluate_on_correct_sides(
-    field: Any, sign: Array | None, stop_times: list[Array] | None
+    field: Any, sign: Array | None, stop_times: list[Array] | None, end: Array
 ) -> Any:
     """Return a vector field in which each part is evaluated on the correct side of its jumps.
 
@@ -158,6 +164,7 @@ def evaluate_on_correct_sides(
     - `stop_times`: a list with one array for each part that has jumps, in the order of
       `declared_jumps`: the times, s, at which steps end because this part jumps. `None` says that
       steps end exactly at the jump times.
+    - `end`: s, the time at which the run ends.
     """
     stops = iter(stop_times or ())
 
@@ -171,7 +178,7 @@ def evaluate_on_correct_sides(
         return (
             part
             if has_own_states(part)
-            else Sided(part, jumps, own, sign if jumps.shape[0] else None)
+            else Sided(part, jumps, own, sign if jumps.shape[0] else None, end)
         )
 
     return jax.tree.map(on_side, field, is_leaf=_declares_jumps)

@@ -237,8 +237,8 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
     cut short at the stop, so that each stop costs several short steps.) A step that would end just
     before a stop ends at the stop.
 
-    **Arguments:** `controller` is any adaptive controller of diffrax, or `ConstantStepSize`; `stops` (J,) are times in
-    increasing order.
+    **Arguments:** `controller` is any adaptive controller of diffrax, or `ConstantStepSize`;
+    `stops` (J,) are times in increasing order.
 
     >>> Stopping(dfx.PIDController(rtol=1e-6, atol=1e-9), jnp.array([0.5])).rtol
     1e-06
