@@ -33,7 +33,7 @@ class Changes(NamedTuple):
 
     times: Array  # (k,) s, with derivatives; the end of the run where nothing changes
     sizes: Array  # (k,) by how much the value of the element changes; 0 where nothing changes
-    bent: Array  # the elements of the last of these changes, those of bent heights
+    bent: Array  # the elements, as floats, of the last of these changes: those of bent heights
     first: Array  # (m,) the values of the elements at the start of the run
     over: Array  # whether there are more changes than can be stored
 
@@ -78,7 +78,7 @@ def find_changes(found: Switches, consts: Arrays, t0: Array, t1: Array) -> Chang
     t = known_with_derivatives_of(
         lax.stop_gradient(t), jnp.where(over, jnp.nan, 1.0).astype(t.dtype) * t
     )
-    return Changes(t, sizes, which, first, over)
+    return Changes(t, sizes, which.astype(t.dtype), first, over)
 
 
 def _at(values: Array, i: Array) -> Array:
@@ -221,7 +221,7 @@ def _times_with_derivatives(
         t, known = barrier((t, jnp.where(moves, lax.stop_gradient(t), jnp.inf)))
         apart = jnp.abs(known[None] - lax.stop_gradient(t)[:, None])
         same = apart <= 8 * eps * jnp.abs(lax.stop_gradient(t))[:, None]
-        count = jnp.sum(same, 1)
+        count = jnp.sum(same, 1, dtype=t.dtype)
         mean = jnp.sum(jnp.where(same, t[None], 0), 1) / jnp.maximum(count, 1)
         t = jnp.where(~moves & (count > 0), mean, t)
     return t
