@@ -70,6 +70,14 @@ def square(w, end):
     return min(rest, 2 * np.pi / w - rest)
 
 
+@jax.custom_jvp
+def gate(t, a):
+    return jnp.where(t < a, 1.0 + t, -1.0)
+
+
+gate.defjvp(lambda at, d: (gate(*at), jnp.where(at[0] < at[1], d[0], jnp.zeros_like(d[0]))))
+
+
 # Value of the torque (t, rate, *numbers), numbers, its impulse in closed form, options.
 CASES = {
     "lt": (lambda t, w, a: push(t < a), [1.31], lambda a: a, {}),
@@ -108,8 +116,26 @@ CASES = {
     "beside a comparison of the state": (lambda t, w, a: push((t > a) & (w > 0)), [0.6], lambda a: 2 - a, dict(rate=0.1)),
     "two at the same time": (lambda t, w, a, b: push(t < a) + 3.0 * push(t < b), [1.31, 1.31], lambda a, b: a + 3 * b, {}),
     "elements of one comparison at the same time": (lambda t, w, a, b: jnp.sum(push(t < jnp.stack([a, b])) * np.array([1.0, 3.0])), [1.31, 1.31], lambda a, b: a + 3 * b, {}),
+    "the end of a square root": (lambda t, w, a: push(~jnp.isnan(jnp.sqrt(a - t)), 1.0 + t), [1.13], lambda a: a + a * a / 2, {}),
+    "the end of a logarithm": (lambda t, w, a: push(jnp.isfinite(jnp.log(a - t))), [1.13], lambda a: a, {}),
+    "a pole": (lambda t, w, a: push(1 / (t - a) > 0, 2.0), [0.71], lambda a: 4 - 2 * a, {}),
+    "beside a pole": (lambda t, w, a: push(1 / (t - a) > 2.5, t), [0.71], lambda a: 0.4 * a + 0.08, {}),
+    "a tangent": (lambda t, w, a: push(jnp.tan(t) > a), [0.6], lambda a: np.pi / 2 - np.arctan(a), {}),
+    "the leap of an angle": (lambda t, w, a: jnp.arctan2(jnp.sin(a * t), jnp.cos(a * t)), [2.3], lambda a: 2 * a - 4 * np.pi + 2 * np.pi**2 / a, {}),
+    "a complex wave": (lambda t, w, a: jnp.real(jnp.exp(1j * a * t)), [1.7], lambda a: np.sin(2 * a) / a, {}),
+    "a complex wave compared": (lambda t, w, a: push(jnp.imag(jnp.exp(1j * a * t)) < 0.0), [2.3], lambda a: 2 - np.pi / a, {}),
+    "clipped or not": (lambda t, w, a, b: push(jnp.clip(t, a, b) != t), [0.5, 1.2], lambda a, b: 2 - (b - a), {}),
+    "a cond in a cond": (lambda t, w, a, b: lax.cond(t < a, lambda: 1.0 + t, lambda: lax.cond(t < b, lambda: -2.0 * t, lambda: 3.0 + 0 * t)), [0.6, 1.4], lambda a, b: a + a * a / 2 - (b * b - a * a) + 3 * (2 - b), {}),
+    "a branch with a derivative rule": (lambda t, w, a: gate(t, a), [0.7], lambda a: a + a * a / 2 - (2 - a), {}),
+    "50 edges": (lambda t, w, a: jnp.sum(push(t > a * np.linspace(0.1, 1.8, 50))), [1.02], lambda a: np.sum(2 - a * np.linspace(0.1, 1.8, 50)), {}),
+    "searchsorted among 50": (lambda t, w, a: jnp.searchsorted(a * np.linspace(0.1, 1.8, 50), t).astype(float), [1.02], lambda a: np.sum(2 - a * np.linspace(0.1, 1.8, 50)), {}),
+    "110 steps": (lambda t, w, h: jnp.floor(t / h), [0.018], lambda h: steps(h, 2.0), {}),
+    "firings of a wave": (lambda t, w, a: push(jnp.cos(a * t) > np.cos(2e-3), 100.0), [3.1 * np.pi], lambda a: 100 * 61 * 2e-3 / a, dict(ts=LONG)),
+    "an operand that jumps": (lambda t, w, a, b: push(push(t < a, t) + push(t >= a, 3 * t) > b), [0.9, 1.5], lambda a, b: 2 - a, {}),
+    "pulses inside a function": (lambda t, w, a, b: torques.Pulses(jnp.stack([a, b]), 1e3 * AXIS[None])(t, None, None)[2], [7.3, 7.301], lambda a, b: 1e3 * (b - a), dict(ts=LONG)),
+    "a table inside a function": (lambda t, w, a: torques.Held(jnp.stack([0.0 * a, a]), np.array([1.0, 3.0]))(t), [0.9], lambda a: a + 3 * (2 - a), {}),
 }  # fmt: skip
-QUICK = ("a firing of 1 ms", "two at the same time")
+QUICK = ("pulses inside a function", "a firing of 1 ms", "two at the same time")
 
 
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=long) for n in CASES])
@@ -242,6 +268,82 @@ def test_more_switches_than_places_are_said():
         UserWarning, match=r"(?s)more than 256 times.*test_switching\.py.*jump_times"
     ):
         impulse(lambda t, w: jnp.floor(t / 0.003), atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        lambda t, a: jnp.sum(push(t > a * np.linspace(0.2, 1.7, 300))),
+        lambda t, a: lax.fori_loop(0, 3, lambda i, x: x + push(t > a * i), 0.0),
+    ],
+    ids=["a table of 300", "a loop"],
+)
+def test_what_cannot_be_looked_for_is_said_when_a_derivative_is_traced(value):
+    slope = jax.jit(jax.grad(lambda a: impulse(lambda t, w: value(t, a))))
+    with pytest.warns(UserWarning, match=r"(?s)test_switching\.py.*jump_times"):
+        slope.lower(jnp.asarray(1.1))
+
+
+@long
+def test_derivatives_of_switches_that_are_not_stored_are_unknown():
+    program = lambda h: impulse(lambda t, w: jnp.floor(t / h), atol=1e-3, rtol=1e-3)
+    assert np.isnan(jax.jit(jax.grad(program))(0.003))
+
+
+class Burn(eqx.Module):
+    end: jax.Array
+
+    def __call__(self, t, state, body):
+        return AXIS * jnp.where(t < self.end, 2.0, -2.0)
+
+
+@pytest.mark.parametrize("make", [Burn, lambda end: Burn(end).__call__, lambda end: lambda *a: Burn(end)(*a)],
+                         ids=["module", "method", "function"])  # fmt: skip
+def test_crossing_after_a_switch(make):
+    """The rate rises from 0.2 until `end`, and falls to `level` from there."""
+
+    def crossing(p):
+        condition = lambda t, state, body: state.omega[2] - p[1]
+        found = rj.crossings(
+            BODY,
+            rj.Spin(0.2 * AXIS),
+            0.0,
+            9.0,
+            condition,
+            make(p[0]),
+            max_crossings=1,
+            direction=-1,
+        )
+        return found.times[0]
+
+    value, slope = once(jax.value_and_grad(crossing))(jnp.array([2.3, 0.7]))
+    np.testing.assert_allclose(value, 2 * 2.3 + 0.2 - 0.7, atol=1e-10)
+    np.testing.assert_allclose(slope, [2.0, -1.0], atol=1e-10)
+
+
+@pytest.mark.parametrize("ts", [(0.0, 1.5), (1.5, 0.0)])
+@pytest.mark.parametrize("solver", [rj.solvers.RungeKutta4(), dfx.Tsit5()])
+def test_equal_steps_end_at_jumps(solver, ts):
+    edges, rows = np.linspace(0.0, 1.5, 7), np.array([1.0, -2.0, 0.5, 4.0, -1.0, 2.0])
+    laws = {
+        "pulses": torques.Pulses(edges, rows[:, None] * AXIS),
+        "held": torques.InSpace(torques.Held(edges, np.append(rows, 9.0)[:, None] * AXIS)),
+        "found": lambda t, s, b: AXIS * jnp.asarray(rows)[jnp.sum(t >= edges[1:-1])],
+        "table": torques.Tabulated([0.0, 1.5], np.stack([AXIS, AXIS])),
+    }
+    right = dict.fromkeys(laws, 0.25 * np.sum(rows)) | {"table": 1.5}
+    start, equal = rj.Attitude([1.0, 0, 0, 0], np.zeros(3)), dfx.ConstantStepSize()
+    for name, law in laws.items():
+        sol = rj.simulate(BODY, start, ts, law, solver=solver, dt0=0.25, stepsize_controller=equal)
+        sign = np.sign(ts[1] - ts[0])
+        np.testing.assert_allclose(2 * sol.ys.omega[-1, 2], sign * right[name], atol=1e-12)
+
+
+def test_tables_are_closed_at_both_ends():
+    table = torques.Tabulated([0.0, 2.0], np.stack([AXIS, 3 * AXIS]))
+    pulses = torques.Pulses([0.0, 2.0], 5 * AXIS[None])
+    assert [float(table(t, None, None)[2]) for t in (-1e-9, 0.0, 2.0, 2.1)] == [0.0, 1.0, 3.0, 0.0]
+    assert [float(pulses(t, None, None)[2]) for t in (-1e-9, 0.0, 2.0, 2.1)] == [0.0, 5.0, 5.0, 0.0]
 
 
 def pair(p, kinds, ts=SHORT):
