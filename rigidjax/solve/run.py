@@ -402,7 +402,7 @@ def warn_of_missed_switches(
     form = equations_by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
     program = trace_program(lambda t, y: ravel_pytree(field(t, y, None))[0], ts[0], state0)
-    lines = dict.fromkeys(s.name_and_line for s in find_switches(program.closed).switches)
+    lines = dict.fromkeys(s.line for s in find_switches(program.closed).switches)
     warnings.warn(
         f"simulate: a law switches by the time more than {MOST} times ({'; '.join(lines)}): steps "
         "end at the first of these times, and the derivative with respect to the other times is "

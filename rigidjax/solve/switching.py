@@ -74,6 +74,7 @@ _RISING = {
 
 _HOME = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 _SCHEDULES = os.path.join(_HOME, "motion", "torques", "piecewise.py")
+_DIFFRAX = f"{os.sep}diffrax{os.sep}"
 _EQUINOX = os.path.dirname(os.path.abspath(eqx.__file__)) + os.sep
 
 
@@ -173,20 +174,9 @@ class Switch(NamedTuple):
     path: tuple[Any, ...]  # the equations of the calls around it, the outermost first, and its own
     kind: int  # how its height depends on the time
     size: int
-    line: str
-
-    @property
-    def name_and_line(self) -> str:
-        return f"{_name(self.path[-1])}, {self.line}"
-
-    @property
-    def leaps(self) -> bool:
-        """Return whether an element may change many times while its height only rises."""
-        return _name(self.path[-1]) in _LEVELS and self.path[-1].outvars[0].aval.dtype != bool
-
-    @property
-    def asks_for_nan(self) -> bool:
-        return _asks_for_nan(self.path[-1])
+    line: str  # its primitive and its line of code
+    leaps: bool  # whether an element may change many times while its height only rises
+    asks_for_nan: bool
 
     def result(self, values: Array, inputs: Any, result: Array) -> Array:
         """Return the result of the equation, from the values (m,) of its elements."""
@@ -375,18 +365,23 @@ def find_switches(traced: ClosedJaxpr) -> Switches:
     jaxpr, switches, unfound = traced.jaxpr, [], []
 
     def hidden(path: tuple[Any, ...], more: str = "") -> None:
+        line = _searched_line(path)
         # An interpolation in a long table has kinks, no jumps.
-        smooth = any(eqn.params.get("name") == "_interp" for eqn in path)
-        if not (more and smooth) and (line := _searched_line(path)):
+        kinks = _DIFFRAX in line or any(eqn.params.get("name") == "_interp" for eqn in path)
+        if line and not (more and kinks):
             unfound.append(f"{_name(path[-1])}{more}, {line}")
 
     def meet(path: tuple[Any, ...], inputs: Any, result: Array, kind: int) -> Array:
-        kink, size = _name(path[-1]) in _KINKS, _height_and_value(path[-1], inputs, result)[0].size
-        if size > (FEW_KINKS if kink else MOST):
-            if not kink:
-                hidden(path, f" of {size} elements")
+        eqn, name = path[-1], _name(path[-1])
+        size = _height_and_value(eqn, inputs, result)[0].size
+        if name in _KINKS and size > FEW_KINKS:
+            return result
+        if size > MOST:
+            hidden(path, f" of {size} elements")
         elif line := _searched_line(path):
-            switches.append(Switch(path, kind, size, line))
+            leaps = name in _LEVELS and result.dtype != bool
+            switch = Switch(path, kind, size, f"{name}, {line}", leaps, _asks_for_nan(eqn))
+            switches.append(switch)
         return result
 
     def look(t: Array) -> None:
