@@ -1,4 +1,4 @@
-"""Interpret a traced vector field, and find its equations that switch at times of their own.
+"""Find the equations of a traced vector field that switch at times of their own, and replace them.
 
 A law that a user writes, such as `jnp.where(t < self.te, push, 0.0)`, declares no `jump_times`, but
 the traced field contains its comparison. One interpreter of the traced field is run twice. The
@@ -257,7 +257,7 @@ class Interpreter(NamedTuple):
         return list(zip(out, kinds, strict=True))
 
     def cond(self, eqn: Any, args: list[Any]) -> list[tuple[Any, int]]:
-        """Enter the branches: in the whole field by `lax.switch`, else all, to choose from them."""
+        """Evaluate the branches: one by `lax.switch` if `whole`, else all, to choose from them."""
         (index, by), *args = args
         kinds: list[list[int]] = []
 
