@@ -222,7 +222,7 @@ def _rms_errors_of_components(fit: Fit) -> list[tuple[str, list[float], str]]:
     """
     out = []
     for error, reading in zip(fit.residuals, fit.model.records.readings, strict=True):
-        mask = reading.usable_channel_mask
+        mask = reading.usable
         squares = np.where(mask, np.asarray(error).reshape(mask.shape) ** 2, 0.0)
         mean = squares.sum(axis=(0, 1)) / np.maximum(mask.sum(axis=(0, 1)), 1)
         sensor = reading.sensor

@@ -49,33 +49,31 @@ class AttitudeSensor(ClockedSensor):
     mounting: Vec3 | None = eqx.field(converter=base.optional_array_field("mounting"), default=None)
 
     def error(self, motion: SensorInput, reading: Array) -> Vec3:
-        q = _mounted_attitude(motion.state.q, self.mounting)
+        q = _mounted(motion.state.q, self.mounting)
         return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
 
     def reading_of(self, motion: SensorInput, error: Vec3) -> Float[Array, "4"]:
         """Return the quaternion (4,) that this attitude sensor reads for a given `motion` if its
         error is the rotation vector `error` (3,), rad.
         """
-        q = _mounted_attitude(motion.state.q, self.mounting)
+        q = _mounted(motion.state.q, self.mounting)
         return quaternion.multiply(q, quaternion.exp(error))
 
     def readings(self, values: np.ndarray) -> np.ndarray:
         """Return the attitudes `values`, which are quaternions (T, 4) or rotation matrices (T, 3,
         3), as quaternions (T, 4), the form of the readings of this sensor.
         """
-        return _quaternions_of_matrices(values) if values.shape[1:] == (3, 3) else values
+        return _quaternions(values) if values.shape[1:] == (3, 3) else values
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         """Return two things: a mask (T,), true for each row of `values` that is not a unit
         quaternion; and the reason in words.
         """
         wanted = "wanted (w, x, y, z) with the scalar first"
-        return _differs_from_unit_length(
-            values
-        ), f"the quaternion at index {{index}} is not unit; {wanted}"
+        return _not_unit(values), f"the quaternion at index {{index}} is not unit; {wanted}"
 
 
-def _quaternions_of_matrices(matrices: np.ndarray) -> np.ndarray:
+def _quaternions(matrices: np.ndarray) -> np.ndarray:
     """Return the unit quaternions (T, 4), scalar first, of rotation `matrices` (T, 3, 3).
 
     The quaternion of a matrix with NaN is NaN. **Raises** `ValueError` for a matrix that is no
@@ -95,7 +93,7 @@ def _quaternions_of_matrices(matrices: np.ndarray) -> np.ndarray:
     return np.where(finite[:, None], out, np.nan)
 
 
-def _mounted_attitude(q: Array, mounting: Vec3 | None) -> Array:
+def _mounted(q: Array, mounting: Vec3 | None) -> Array:
     """Return the attitude (4,) of the axes of a sensor that is mounted on a body of attitude q
     (4,).
 
@@ -148,7 +146,7 @@ class Direction(ClockedSensor):
     mounting: Vec3 | None = eqx.field(converter=base.optional_array_field("mounting"), default=None)
 
     def error(self, motion: SensorInput, reading: Array) -> Float[Array, "2"]:
-        predicted = self._predicted_direction(motion)
+        predicted = self._predicted(motion)
         # The axes orthogonal to the reading are data, so that no derivative passes through these
         # axes. Axes orthogonal to the prediction would jump as the motion changes.
         first, second = _orthogonal_pair(reading)
@@ -164,7 +162,7 @@ class Direction(ClockedSensor):
         The reason is the choice of axes: here `error` is taken along axes orthogonal to the
         prediction, but the method `error` uses axes orthogonal to the reading.
         """
-        predicted = self._predicted_direction(motion)
+        predicted = self._predicted(motion)
         first, second = _orthogonal_pair(predicted)
         # The length of `error` is the chord of the angle θ between prediction and reading: cos θ =
         # 1 − ½ |error|², sin θ = |error| cos ½θ.
@@ -172,7 +170,7 @@ class Direction(ClockedSensor):
         half = jnp.sqrt(1.0 - 0.25 * square)
         return (1.0 - 0.5 * square) * predicted + half * (error[0] * first + error[1] * second)
 
-    def _predicted_direction(self, motion: SensorInput) -> Vec3:
+    def _predicted(self, motion: SensorInput) -> Vec3:
         """Return the predicted reading of the sensor for a `motion`: the direction (3,) in the
         sensor's axes.
 
@@ -180,20 +178,16 @@ class Direction(ClockedSensor):
         The reading is this vector in the sensor's axes, which follow from the attitude of the body
         and the mounting of the sensor.
         """
-        return quaternion.rotate_inverse(
-            _mounted_attitude(motion.state.q, self.mounting), self.world
-        )
+        return quaternion.rotate_inverse(_mounted(motion.state.q, self.mounting), self.world)
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         """Return two things: a mask (T,), true for each row of `values` that is not a unit vector;
         and the reason in words.
         """
-        return _differs_from_unit_length(
-            values
-        ), "the direction at index {index} is not of length 1"
+        return _not_unit(values), "the direction at index {index} is not of length 1"
 
 
-def _differs_from_unit_length(rows: np.ndarray) -> np.ndarray:
+def _not_unit(rows: np.ndarray) -> np.ndarray:
     """Return a mask (T,), true where the length of a row of `rows` (T, k) differs from 1 by more
     than 1e-6.
 
@@ -321,9 +315,7 @@ class Velocity(ClockedSensor):
             arm = motion.lever(self.place)
             velocity = velocity + quaternion.rotate(state.q, cross(state.omega, arm))
         if self.mounting is not None:
-            velocity = quaternion.rotate_inverse(
-                _mounted_attitude(state.q, self.mounting), velocity
-            )
+            velocity = quaternion.rotate_inverse(_mounted(state.q, self.mounting), velocity)
         return reading - (velocity if self.bias is None else velocity + self.bias)
 
 

@@ -89,20 +89,18 @@ class LowPass(eqx.Module):
         usual = jnp.nanmedian(jnp.where(is_padding, jnp.nan, intervals))
         intervals = jnp.where(is_padding, usual, intervals)
         is_hole = intervals > _HOLE * usual
-        before, after = _input_slopes_at_interval_ends(
-            intervals, jnp.diff(values, axis=0), is_hole, is_padding
-        )
+        before, after = _end_slopes(intervals, jnp.diff(values, axis=0), is_hole, is_padding)
         # On each interval u = u₀ + b s + c s² + d s³, where s is the time since the begin of the
         # interval.
         h = intervals[:, None]
         chord = jnp.diff(values, axis=0) / h
         c, d = (3 * chord - 2 * before - after) / h, (before + after - 2 * chord) / h**2
         ends = (before, 2 * c, 6 * d), (after, 2 * c + 6 * d * h, 6 * d)
-        particular = partial(_particular_solution, self.order, w)
+        particular = partial(_particular, self.order, w)
         y0, y1 = particular(values[:-1], ends[0]), particular(values[1:], ends[1])
         begin = y0[0]
         if intervals.size > 2:
-            first = particular(values[:1], _derivatives_at_first_sample(intervals, chord))[0]
+            first = particular(values[:1], _first_derivatives(intervals, chord))[0]
             begin = jnp.where(jnp.any(is_hole[:3]), begin, first)
         return _filter_samples(
             begin, y0, y1, partial(_propagator, self.order, w), intervals, is_hole
@@ -132,7 +130,7 @@ def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
         raise ValueError(f"t: wanted increasing times; t[{index}] is not above t[{index - 1}]")
 
 
-def _input_slopes_at_interval_ends(
+def _end_slopes(
     intervals: Array, changes: Array, is_hole: Array, is_padding: Array
 ) -> tuple[Array, Array]:
     """Return two arrays (n, k): the time derivatives of a sampled input at the begin, and at the
@@ -160,9 +158,7 @@ def _input_slopes_at_interval_ends(
     return chord - begin, chord + end
 
 
-def _derivatives_at_first_sample(
-    intervals: Array, mean_slopes: Array
-) -> tuple[Array, Array, Array]:
+def _first_derivatives(intervals: Array, mean_slopes: Array) -> tuple[Array, Array, Array]:
     """Return the first, second and third time derivative of a sampled input at its first sample.
 
     The three arrays (1, k), for k channels, are the derivatives of the cubic through the first four
@@ -180,7 +176,7 @@ def _derivatives_at_first_sample(
     return rate[None], 2 * (one - two * (a + b))[None], 6 * two[None]
 
 
-def _particular_solution(
+def _particular(
     order: int, w: Array, u: Array, du: tuple[ArrayLike, ArrayLike, ArrayLike]
 ) -> Array:
     """Return the state of a low-pass filter on the particular solution for an input that is a cubic

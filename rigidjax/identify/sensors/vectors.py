@@ -37,7 +37,7 @@ class VectorSensor(ClockedSensor):
     lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
     tolerance: Tolerance | None = eqx.field(converter=tolerance_of, default=None)
 
-    def _reading_of_vector(self, vector: Vec3) -> Vec3:
+    def _read(self, vector: Vec3) -> Vec3:
         """Return the predicted reading (3,) of a `vector` v (3,) in the body frame, in the unit of
         v.
 
@@ -116,7 +116,7 @@ class Gyro(VectorSensor):
             self.place = jnp.zeros(3)
 
     def error(self, motion: SensorInput, reading: Array) -> Vec3:
-        prediction = self._reading_of_vector(motion.state.omega)
+        prediction = self._read(motion.state.omega)
         if self.g_sensitivity is not None:
             assert self.place is not None
             force = specific_force(motion, self.place, self.gravity)
@@ -175,7 +175,7 @@ class Accelerometer(VectorSensor):
     gravity: Vec3 | None = eqx.field(converter=base.optional_array_field("gravity"), default=None)
 
     def error(self, motion: SensorInput, reading: Array) -> Vec3:
-        return reading - self._reading_of_vector(specific_force(motion, self.place, self.gravity))
+        return reading - self._read(specific_force(motion, self.place, self.gravity))
 
 
 class Magnetometer(VectorSensor):
@@ -208,4 +208,4 @@ class Magnetometer(VectorSensor):
 
     def error(self, motion: SensorInput, reading: Array) -> Vec3:
         field = quaternion.rotate(quaternion.conjugate(motion.state.q), self.field)
-        return reading - self._reading_of_vector(field)
+        return reading - self._read(field)
