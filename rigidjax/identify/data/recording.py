@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from rigidjax import _checks, _show
 from rigidjax._types import NumbersLike
 from rigidjax.identify.sensors import AbstractSensor
+from rigidjax.identify.sensors.base import extras
 from rigidjax.motion.torques import Held
 
 
@@ -29,7 +30,7 @@ class Reading(eqx.Module):
     jitter_error: Float[Array, "*records times k"] | None = None
 
     def __post_init__(self) -> None:
-        if self.jitter_error is None and getattr(self.sensor, "jitter", None) is not None:
+        if self.jitter_error is None and extras(self.sensor).jitter is not None:
             shape = (*np.shape(self.mask), self.sensor.components)
             self.jitter_error = jnp.asarray(np.zeros(shape, self.values.dtype))
 
@@ -44,7 +45,7 @@ class Reading(eqx.Module):
         mask = np.broadcast_to(
             self.host_mask[..., None], (*self.mask.shape, self.sensor.components)
         )
-        limit = getattr(self.sensor, "limit", None)
+        limit = extras(self.sensor).limit
         if limit is None:
             return mask
         return mask & (np.abs(self.values) < np.asarray(limit)[..., None, :] * (1 - 1e-6))
@@ -282,7 +283,8 @@ def _reading(
     if rows_hidden is not None:
         values[rows_hidden] = np.nan
     # A sensor may convert its readings: attitude matrices, for example, become quaternions.
-    values = getattr(sensor, "readings", lambda values: values)(values)
+    convert = extras(sensor).readings
+    values = values if convert is None else convert(values)
     wanted = (t.size, *sensor.reading_shape)
     if values.shape != wanted:
         turned = "; transposed?" if values.shape == wanted[::-1] else ""
@@ -318,7 +320,7 @@ def _reading(
     if not mask.all():
         shaped = mask.reshape(-1, *(1 for _ in across))
         values = np.where(shaped, values, values[int(np.argmax(mask))])
-    refusal = getattr(sensor, "refusal", None)
+    refusal = extras(sensor).refusal
     if refusal is not None:
         wrong, why = refusal(values)
         if wrong.any():

@@ -24,6 +24,7 @@ from rigidjax.identify.sensors import (
     Range,
     Velocity,
 )
+from rigidjax.identify.sensors.base import extras
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import leaf_names, plus
 from rigidjax.rotation import quaternion, so3
@@ -184,10 +185,10 @@ def _typical_rate(recording: Recording) -> float:
     rate = float(np.linalg.norm(w[0])) if len(w) else 0.0
     # If there is no rate, take the estimate of the first sensor that can estimate a typical rate.
     for reading in recording.readings if rate == 0 else ():
-        sensor: Any = reading.sensor
-        if hasattr(sensor, "typical_rate"):
+        estimate = extras(reading.sensor).typical_rate
+        if estimate is not None:
             t, values = np.asarray(recording.t), np.asarray(reading.values)
-            rate = sensor.typical_rate(t[reading.host_mask], values[reading.host_mask])
+            rate = estimate(t[reading.host_mask], values[reading.host_mask])
             break
     return rate if rate > 0 else 1.0
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from rigidjax import _checks
 from rigidjax.identify.model.scene import Scene
+from rigidjax.identify.sensors.base import extras
 
 
 class Free(eqx.Module):
@@ -213,7 +214,7 @@ def find_slots(free: Sequence[Free], scene: Scene, body_names: Sequence[str]) ->
         way, prior = split_path(path).leaf, item.prior
         if prior is None and len(way) == 3 and getattr(way[0], "name", "") == "sensors":
             # What the sensor's data sheet states for the number is its prior.
-            tolerance = getattr(scene.sensors[way[1].idx], "tolerance", None)
+            tolerance = extras(scene.sensors[way[1].idx]).tolerance
             prior = getattr(tolerance, TOLERANCES.get(way[2].name, ""), None)
         prior, spread = (
             None if x is None else jnp.asarray(x / item.scale) for x in (prior, spread)

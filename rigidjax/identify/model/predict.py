@@ -20,6 +20,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.identify.sensors import AbstractSensor, SensorInput
+from rigidjax.identify.sensors.base import extras
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, CoupledEquations, with_own_states
 from rigidjax.motion.torques.base import Torque
@@ -278,7 +279,7 @@ def sensor_inputs(
     """
     turned = needed_body(body, type(state0))
     field = equations_of_motion(turned, state0, torque)
-    offset, times = getattr(sensor, "offset", None), ts
+    offset, times = extras(sensor).offset, ts
     if delay is not None:
         offset = delay if offset is None else offset + delay
     if offset is not None:
@@ -324,7 +325,7 @@ def errors_along(
         return error
 
     times, states, _ = along
-    lowpass = getattr(sensor, "lowpass", None)
+    lowpass = extras(sensor).lowpass
     if lowpass is None:
         return jax.vmap(error)(times, states, values)
     # The error of a reading of zero is minus the prediction. The low-pass filter smooths this
@@ -392,13 +393,13 @@ def simulate_readings(
             raise ValueError(
                 f"{name}: noise=None gives no size of the noise to draw; give noise, or key=None"
             )
-        jitter, lowpass = getattr(one, "jitter", None), getattr(one, "lowpass", None)
+        jitter, lowpass = extras(one).jitter, extras(one).lowpass
         if key is not None and jitter is not None and (jitter.estimated or lowpass is not None):
             raise ValueError(
                 f"{name}: wanted a jitter in s, and no lowpass beside it, to draw times; or "
                 "key=None"
             )
-        if not hasattr(one, "reading_of") and math.prod(one.reading_shape) != one.components:
+        if extras(one).reading_of is None and math.prod(one.reading_shape) != one.components:
             raise ValueError(
                 f"{name}: its readings of shape {one.reading_shape} are not its error of "
                 f"{one.components} numbers plus a prediction; write a method reading_of(motion, "
@@ -426,21 +427,21 @@ def _readings(
     key: PRNGKeyArray | None,
 ) -> Float[Array, "times ..."]:
     """Return the readings of one sensor at the time stamps `ts` along a motion, in one program."""
-    jitter, late = getattr(sensor, "jitter", None), None
-    if key is not None and jitter is not None:
+    members, late = extras(sensor), None
+    if key is not None and members.jitter is not None:
         key, own = jax.random.split(key)
-        late = jitter.deviation * jax.random.normal(own, ts.shape, ts.dtype)
+        late = members.jitter.deviation * jax.random.normal(own, ts.shape, ts.dtype)
     along = sensor_inputs(sensor, body, torque, ts, state0, states, late)
     error = jnp.zeros((ts.shape[0], sensor.components), ts.dtype)
     if key is not None:
         assert sensor.noise is not None
         error = sensor.noise[None] * jax.random.normal(key, error.shape, ts.dtype)
-    reading = getattr(sensor, "reading_of", None)
+    reading = members.reading_of
     if reading is not None:
         values = jax.vmap(lambda t, y, e: reading(along.input_at(t, y), e))(*along[:2], error)
     else:
         nothing = jnp.zeros((ts.shape[0], *sensor.reading_shape), ts.dtype)
         missed = errors_along(sensor, nothing, along)
         values = (error - missed).reshape(ts.shape[0], *sensor.reading_shape)
-    limit = getattr(sensor, "limit", None)
+    limit = members.limit
     return values if limit is None else jnp.clip(values, -limit[None], limit[None])

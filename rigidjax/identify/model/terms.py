@@ -23,6 +23,7 @@ from rigidjax.identify.model.predict import (
     states_at,
 )
 from rigidjax.identify.model.scene import Scene
+from rigidjax.identify.sensors.base import extras
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import Input, bind
 from rigidjax.rotation.barrier import match_batch_axes, platform
@@ -266,7 +267,7 @@ def whiten(model: "Model", errors: SensorErrors, noise: Noise) -> tuple[Float[Ar
     """Return the errors of each sensor in standard deviations, as `standardise` computes them."""
     out = []
     for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
-        limit = getattr(reading.sensor, "limit", None)
+        limit = extras(reading.sensor).limit
         parts: Any = reading.values, reading.mask, error, sigma, limit, reading.jitter_error
         out.append(jax.vmap(standardise)(*parts).errors)
     return tuple(out)

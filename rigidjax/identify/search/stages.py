@@ -22,6 +22,7 @@ from rigidjax.identify.model.normal import NormalMatrix, normal_matrix
 from rigidjax.identify.model.predict import FixedSteps, HeldSteps
 from rigidjax.identify.model.terms import Blocks, Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
+from rigidjax.identify.sensors.base import extras
 from rigidjax.rotation.barrier import barrier
 
 # Fits to longer and longer beginnings of a record follow each other: to a quarter of its length, to
@@ -371,7 +372,7 @@ def fit_in_stages(
 
 def has_unit_noise(reading: Reading) -> bool:
     """Return whether a sensor's noise is only a unit for its errors, whose size is not known."""
-    return getattr(reading.sensor, "nominal", False)
+    return extras(reading.sensor).nominal is True
 
 
 def unit_noise_count(model: Model) -> int:

@@ -3,10 +3,11 @@
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, _show
@@ -167,6 +168,33 @@ def jitter_of(jitter: object) -> Jitter | None:
             raise ValueError(f"jitter: wanted {wanted}, got {jitter!r}")
         return Jitter(jnp.zeros(()), True)
     return Jitter(jnp.asarray(_checks.positive_float(jitter, "jitter", wanted)), False)
+
+
+class Extras(NamedTuple):
+    """Hold the optional members of a sensor, as `AbstractSensor` describes them, or `None`."""
+
+    offset: Scalar | None
+    jitter: Jitter | None
+    limit: Float[Array, "*records k"] | None
+    lowpass: Any
+    tolerance: Any
+    refusal: Callable[[np.ndarray], tuple[np.ndarray, str]] | None
+    typical_rate: Callable[[np.ndarray, np.ndarray], float] | None
+    reading_of: Callable[[SensorInput, Array], Array] | None
+    suspect: tuple[str, str, str] | None
+    # Convert the readings of the user to the form of this sensor.
+    readings: Callable[[np.ndarray], np.ndarray] | None
+    # Whether the noise holds only units of errors whose size is unknown.
+    nominal: bool | None
+
+
+def extras(sensor: AbstractSensor) -> Extras:
+    """Return the optional members of a sensor.
+
+    They are no members of `AbstractSensor`, whose value a field of a subclass without a default
+    would take for its default.
+    """
+    return Extras(*(getattr(sensor, name, None) for name in Extras._fields))
 
 
 class ClockedSensor(AbstractSensor):
