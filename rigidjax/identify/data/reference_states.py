@@ -106,7 +106,7 @@ def rates(recording: Recording) -> Samples:
     return mean_rates(*attitudes(recording))
 
 
-def require_turning(rates: Float[np.ndarray, "n 3"], name: str) -> None:
+def require_turning(rates: np.ndarray, name: str) -> None:
     """Raise `ValueError` if the body `rates`, rad/s, are all zero or round-off."""
     if rates.size and np.abs(rates).max() < 1e-14:
         raise ValueError(
