@@ -29,16 +29,26 @@ class Horizons(NamedTuple):
     """Hold the errors of open-loop predictions, as functions of the horizon.
 
     The horizon is the number of steps from the measured start of a window to the predicted state.
-    The kinds are the parts of the state: `x` (m), `v` (m/s), `q` (rad) and `omega` (rad/s).
+    Each field but `steps` is a dict of kind → array, where the kinds are the parts of the state:
+    `x` (m), `v` (m/s), `q` (rad) and `omega` (rad/s).
+
+    **Fields:**
+
+    - `steps`: (L,) the horizons 1 to L.
+    - `mean_absolute`: for each kind the mean absolute value (L,) of a component of the error.
+    - `mean_norm`: for each kind the mean length (L,) of the error vector.
+    - `rms`: for each kind the square root (L,) of the mean squared length of the error vector.
+
+    >>> t = np.arange(6.0)
+    >>> spin = rj.Spin(np.stack([t, 0 * t, 0 * t], 1))
+    >>> held = rj.identify.windows(t, spin, length=2).held_horizons()
+    >>> held.rms["omega"].tolist()   # the rate grows by 1 a step
+    [1.0, 2.0]
     """
 
-    # The horizons 1 to L.
     steps: np.ndarray
-    # For each kind the mean absolute value (L,) of a component of the error.
     mean_absolute: dict[str, np.ndarray]
-    # For each kind the mean length (L,) of the error vector.
     mean_norm: dict[str, np.ndarray]
-    # For each kind the square root (L,) of the mean squared length of the error vector.
     rms: dict[str, np.ndarray]
 
 
