@@ -57,7 +57,7 @@ from rigidjax.identify.model.scene import (
     require_unknown_torque,
 )
 from rigidjax.identify.model.terms import (
-    Linear,
+    FirstOrder,
     all_errors,
     map_recordings,
     motion_in,
@@ -556,7 +556,7 @@ def unpack_at(model: Model, x: Float[Array, " n"]) -> Unpacked:
 
 
 @eqx.filter_jit
-def unpack_jacobian(model: Model, x: Float[Array, " n"]) -> Linear:
+def unpack_jacobian(model: Model, x: Float[Array, " n"]) -> FirstOrder:
     """Return the quantities that x represents, and their Jacobian."""
     return value_and_jacfwd(lambda x: unpack_at(model, x), x)
 

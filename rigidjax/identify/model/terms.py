@@ -42,7 +42,7 @@ SensorErrors = tuple[Array | np.ndarray, ...]
 Noise = tuple[Float[Array, "records _"], ...]
 
 
-class Linear(NamedTuple):
+class FirstOrder(NamedTuple):
     """Hold the value of a function and its Jacobian, both arrays or pytrees of arrays."""
 
     value: Any
@@ -52,7 +52,7 @@ class Linear(NamedTuple):
 
 # `Blocks` holds for each sensor the errors (R, T, k), and their Jacobian (R, T, k, m) with respect
 # to the m columns of a row.
-Blocks = Linear
+Blocks = FirstOrder
 
 
 class Motion(NamedTuple):
@@ -214,7 +214,7 @@ def _map_rows_jvp(
 
 def error_jacobians(
     model: "Model", x: Float[Array, " n"], function: Callable[..., PyTree] = sensor_errors
-) -> Linear:
+) -> FirstOrder:
     """Return the value of `function` for each recording, and its Jacobian with respect to the row.
 
     The last axis (m) of the Jacobian is that of `model.index.places`.
@@ -223,15 +223,15 @@ def error_jacobians(
     columns = jnp.asarray(model.index.columns, jnp.int32)
     if columns.size > model.index.width:
         slopes = jax.tree.map(lambda block: block[..., columns], slopes)
-    return Linear(out, slopes)
+    return FirstOrder(out, slopes)
 
 
 def _row_jacobians(
     model: "Model", rows: Float[Array, "records columns"], function: Callable[..., PyTree[Array]]
-) -> Linear:
+) -> FirstOrder:
     """Return the value of a `function` for `map_rows`, and its Jacobian in the rows."""
 
-    def linear(row: Row, *rest: PyTree) -> Linear:
+    def linear(row: Row, *rest: PyTree) -> FirstOrder:
         # Forward mode is cheaper than reverse mode, to compile and to run, for a dozen numbers and
         # one long loop over time.
         return value_and_jacfwd(lambda row: function(model, row, *rest), row)
@@ -252,7 +252,7 @@ def delay_slopes(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, ".
     return map_recordings(derivative_of_recording, model, model.index.rows(x))
 
 
-def value_and_jacfwd(function: Callable[[Array], Any], x: Float[Array, " n"]) -> Linear:
+def value_and_jacfwd(function: Callable[[Array], Any], x: Float[Array, " n"]) -> FirstOrder:
     """Return the value of a `function` at x and its Jacobian, by forward mode."""
 
     def value_and_aux(x: Array) -> tuple[PyTree, PyTree]:
@@ -260,7 +260,7 @@ def value_and_jacfwd(function: Callable[[Array], Any], x: Float[Array, " n"]) ->
         return value, value
 
     jacobian, value = jax.jacfwd(value_and_aux, has_aux=True)(x)
-    return Linear(value, jacobian)
+    return FirstOrder(value, jacobian)
 
 
 def whiten(model: "Model", errors: SensorErrors, noise: Noise) -> tuple[Float[Array, "..."], ...]:
@@ -359,7 +359,7 @@ def residual_jacobians(
     function: Callable[[tuple[Array, ...]], tuple[Array, ...]],
     errors: SensorErrors,
     slopes: SensorErrors,
-) -> Linear:
+) -> FirstOrder:
     """Return the residuals `function(errors)` and their Jacobians.
 
     Each residual may depend only on the errors of its own reading.
@@ -368,7 +368,7 @@ def residual_jacobians(
     # depends only on the errors of the same reading: no matrix of all residuals by all errors is
     # made.
     value, push = jax.linearize(function, errors)
-    return Linear(value, jax.vmap(push, in_axes=-1, out_axes=-1)(slopes))
+    return FirstOrder(value, jax.vmap(push, in_axes=-1, out_axes=-1)(slopes))
 
 
 def prior_weights(model: "Model") -> Float[Array, " n"]:
