@@ -7,7 +7,7 @@ import io
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -68,7 +68,7 @@ def table(lines: list[Row]) -> str:
     out = [f"{'':{wide}}  {'value':>14}  95 % interval"]
     for name, value, low, high, unit in lines:
         shown = numbers(value, low, high)
-        out.append(f"{name:{wide}}  {shown[0]:>14}  {_interval_as_text(shown)} {unit}".rstrip())
+        out.append(f"{name:{wide}}  {shown[0]:>14}  {_interval(shown)} {unit}".rstrip())
     return "\n".join(out)
 
 
@@ -107,11 +107,8 @@ def _power_of_ten(number: float) -> int:
     return int(np.floor(np.log10(abs(number)))) if number else 0
 
 
-def _interval_as_text(texts: list[str]) -> str:
-    """Return an interval as text, such as "1.2 … 1.3", or "not determined" if an end is NaN.
-
-    The list `texts` holds three texts: the value, the low end and the high end of the interval.
-    """
+def _interval(texts: list[str]) -> str:
+    """Return "low … high" of the texts (value, low, high), or "not determined" for NaN."""
     return "not determined" if "nan" in texts[1:] else f"{texts[1]} … {texts[2]}"
 
 
@@ -183,7 +180,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
         "rms": {
             f"{index} {name}": {"value": plain(rms), "axes": list(map(plain, axes)), "unit": unit}
             for index, ((name, axes, unit), rms) in enumerate(
-                zip(_rms_errors_of_components(fit), fit.rms, strict=True)
+                zip(_component_rms(fit), fit.rms, strict=True)
             )
         },
         "noise": [
@@ -214,19 +211,22 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
     }
 
 
-def _rms_errors_of_components(fit: Fit) -> list[tuple[str, list[float], str]]:
-    """Return three things for each sensor of a `fit`: the name of its class; the root mean square
-    error of each of its components; and its unit.
+class _Rms(NamedTuple):
+    """Hold the root mean square errors of the components of a sensor."""
 
-    Masked readings and readings at full scale are left out.
-    """
+    name: str
+    axes: list[float]
+    unit: str
+
+
+def _component_rms(fit: Fit) -> list[_Rms]:
+    """Return the errors of each sensor, without readings that are masked or at full scale."""
     out = []
     for error, reading in zip(fit.residuals, fit.model.records.readings, strict=True):
-        mask = reading.usable_channel_mask
+        mask = reading.usable
         squares = np.where(mask, np.asarray(error).reshape(mask.shape) ** 2, 0.0)
         mean = squares.sum(axis=(0, 1)) / np.maximum(mask.sum(axis=(0, 1)), 1)
-        sensor = reading.sensor
-        out.append((type(sensor).__name__, [float(x) for x in np.sqrt(mean)], sensor.unit))
+        out.append(_Rms(type(reading.sensor).__name__, np.sqrt(mean).tolist(), reading.sensor.unit))
     return out
 
 
@@ -285,16 +285,11 @@ def write_html(
     '<!doctype html>'
     """
     require_one_fit(fit)
-    units = [
-        _show.scale_and_unit_to_show(unit, rate_unit) for *_, unit in _rms_errors_of_components(fit)
-    ]
-    sizes = _table_rows_as_html(
-        (name, " ".join(f"{scale * x:.3g}" for x in axes), unit)
-        for (name, axes, _), (scale, unit) in zip(
-            _rms_errors_of_components(fit), units, strict=True
-        )
-    )
-    starts = _table_rows_as_html(
+    sizes = []
+    for name, axes, unit in _component_rms(fit):
+        scale, shown = _show.scale_and_unit_to_show(unit, rate_unit)
+        sizes.append((name, " ".join(f"{scale * x:.3g}" for x in axes), shown))
+    starts = _html_rows(
         (
             str(number),
             f"{start.cost:.6g}",
@@ -321,7 +316,7 @@ img {{ max-width: 100%; margin: 1rem 0 }}
 <h1>{html.escape(title)}</h1>
 <p>{read}</p>
 {as_html(fit, rate_unit, more)}
-<table><tr><th>sensor</th><th>rms error an axis</th><th>unit</th></tr>{sizes}</table>
+<table><tr><th>sensor</th><th>rms error an axis</th><th>unit</th></tr>{_html_rows(sizes)}</table>
 <table><tr><th>start</th><th>misfit</th><th></th><th></th></tr>{starts}</table>
 {pictures}
 </html>
@@ -343,8 +338,8 @@ def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str
     >>> as_html(result).startswith("<p") and "Ix/Iz" in as_html(result)
     True
     """
-    lines = _table_rows_as_html(
-        (name, (shown := numbers(*three))[0], _interval_as_text(shown), unit)
+    lines = _html_rows(
+        (name, (shown := numbers(*three))[0], _interval(shown), unit)
         for name, *three, unit in (*rows(fit, rate_unit), *more)
     )
     head, *words = verdict(fit).splitlines()
@@ -356,10 +351,8 @@ def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str
 <ul>{said}</ul>"""
 
 
-def _table_rows_as_html(lines: Iterable[tuple[str, ...]]) -> str:
-    """Return the `lines` of a table, each a tuple of the texts of its cells, as rows (`tr`) of
-    HTML.
-    """
+def _html_rows(lines: Iterable[tuple[str, ...]]) -> str:
+    """Return lines of cells as rows (`tr`) of a table of HTML."""
     cells = ("".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in lines)
     return "".join(f"<tr>{line}</tr>" for line in cells)
 

@@ -22,7 +22,7 @@ from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.charts import Bodies
-from rigidjax.identify.model.model import Model, require_single_model
+from rigidjax.identify.model.model import Model, require_single
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.identify.uncertainty import covariance as uncertainty
 from rigidjax.identify.uncertainty.quantities import (
@@ -199,7 +199,7 @@ def fit_light_curve(
     )
     say(f"{used} pairs of frequencies, χ² {pairs.misfits[0]:.6g} of {pairs.dof}")
     say(f"{len(starts)} starts")
-    whole = stacking.pad_to_few_lengths(model)
+    whole = stacking.pad_to_few(model)
     ends = search_all_then_best_starts(
         whole, starts, noise_of(reading, flux, pairs.scatter), tolerance
     )
@@ -220,7 +220,7 @@ def _require_one_brightness(model: Model) -> Reading:
     Raise `TypeError` for traced numbers, as within `jax.jit`, and `ValueError` for a model with
     another sensor, several sensors, recordings or bodies, or a torque.
     """
-    require_single_model(model)
+    require_single(model)
     if not _checks.is_known(model):
         words = "got traced ones; call it outside of jax.jit, jax.grad and jax.vmap"
         raise TypeError(f"model: wanted known numbers, {words}")
@@ -237,7 +237,7 @@ def _require_one_brightness(model: Model) -> Reading:
         raise ValueError("fit_light_curve: wanted one body, got several by name")
     if model.torque is not None:
         raise ValueError("fit_light_curve: wanted a free body, got a model with a torque")
-    return stacking.pick_records(readings[0], 0)
+    return stacking.pick(readings[0], 0)
 
 
 @eqx.filter_jit
@@ -349,7 +349,7 @@ def _bisectors_in_body_frame(x: Float[Array, " n"], model: Model) -> Float[Array
     point = model.unpack(x)
     body, state0 = point.body, point.state0
     motion, t = exact.FreeBody(Inertia(tensor_of(body)), state0), model.records.t[0]
-    sensor = stacking.pick_records(model.records.readings[0], 0).sensor
+    sensor = stacking.pick(model.records.readings[0], 0).sensor
 
     def bisector_at(now: Array) -> Array:
         state: Any = motion(now - t[0])
@@ -368,7 +368,7 @@ def _widen_covariance_for_shape_errors(best: Fit) -> Fit:
     standard deviation `SHAPE`. All quantities of the fit get new, wider intervals.
     """
     linear: Any = best.linear
-    reading, weight = stacking.pick_records(best.model.records.readings[0], 0), linear.weights[0][0]
+    reading, weight = stacking.pick(best.model.records.readings[0], 0), linear.weights[0][0]
     flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
     size = np.full(weight.shape, 1.0 / MAGNITUDE) if reading.sensor.unit == "mag" else flux
     n = np.asarray(_bisectors_in_body_frame(best.x, best.model))

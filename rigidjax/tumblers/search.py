@@ -16,7 +16,7 @@ from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.free import leaf_at
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.normal import NormalMatrix
-from rigidjax.identify.model.terms import Noise, scene_at_starting_values
+from rigidjax.identify.model.terms import Noise, starting_scene
 from rigidjax.identify.search.least_squares import CAREFUL, Settings, minimise
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.rotation import quaternion
@@ -251,7 +251,7 @@ def _fit_brightness_level_of_starts(
     sphere of the same volume, if sun and observer are in the same direction. If the level is not a
     free number of the `model`, it must keep its value, and the starts are returned unchanged.
     """
-    scene = scene_at_starting_values(model, model.records)
+    scene = starting_scene(model, model.records)
     path = leaf_at(lambda s: s.sensors[0].level, scene, "level", "the sensor")[0]
     mine = [slot for slot in model.slots if slot.path == path and slot.shared is not None]
     if not mine:
@@ -268,7 +268,7 @@ def _fit_brightness_level_of_starts(
         else:
             shape = jnp.where(mask, reading.values[0] - error, 0.0)
             better = level * jnp.sum(shape * reading.values[0]) / jnp.sum(shape * shape)
-        step = slot.step_between(level, better)
+        step = slot.step(level, better)
         return start.at[slot.shared].set(step.reshape(jnp.asarray(slot.shared).shape))
 
     return jax.vmap(level_of_start)(starts)

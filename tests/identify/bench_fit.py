@@ -40,7 +40,7 @@ jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.model.terms import errors_and_jacobians
+from rigidjax.identify.model.terms import error_jacobians
 
 COUNT, STEP, SIGMA, WHEEL = 700, 1e-3, 0.02, 1.7e-6
 T = np.arange(COUNT) * STEP
@@ -337,7 +337,7 @@ def steps():
     for name, (made, at) in tasks.items():
         for way in (made.integrator, identify.Adaptive()):
             chosen = eqx.tree_at(lambda p: p.integrator, made, way)
-            run = eqx.filter_jit(lambda at, chosen: errors_and_jacobians(chosen, at))
+            run = eqx.filter_jit(lambda at, chosen: error_jacobians(chosen, at))
             found, _ = compared(
                 {"it": lambda at, run=run, chosen=chosen: jax.block_until_ready(run(at, chosen))},
                 [at] * 9,

@@ -262,7 +262,7 @@ def main():
 
     def evaluated():
         # A search of no steps, the inside of the fit.
-        jax.block_until_ready(stages.errors_and_slopes(model, start))
+        jax.block_until_ready(stages.blocks_at(model, start))
 
     errors_alone = eqx.filter_jit(identify.Model.errors)
 

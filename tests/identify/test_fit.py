@@ -338,7 +338,7 @@ def test_a_record_of_another_length_is_the_same_program(caplog):
     # `simulate` is another one, with what it does beside.
     programs = set(re.findall(r"Compiling jit\((\w+)\)", caplog.text))
     named = {
-        "least_squares_from",
+        "marquardt",
         "_errors_without_derivatives",
         "_weighted_errors_and_derivatives",
         "_compiled_quantities_and_derivatives",
@@ -346,7 +346,7 @@ def test_a_record_of_another_length_is_the_same_program(caplog):
     assert not programs & named
     assert short.residuals[0].shape == (92, 3) and short.model.recording.t.shape == (92,)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stacking, "pad_to_few_lengths", lambda problem: problem)
+        patch.setattr(stacking, "pad_to_few", lambda problem: problem)
         plain = fitted(92)
     assert short.status == plain.status and short.independent == plain.independent
     assert jax.tree.structure(short) == jax.tree.structure(plain)

@@ -8,7 +8,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.filtering.steps import require_sensors
-from rigidjax.identify.model.terms import white_errors_and_log_variances
+from rigidjax.identify.model.terms import decorrelate
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
 TRUTH = np.array([1.0 / 2.1, 1.6 / 2.1])
@@ -38,10 +38,8 @@ def test_independent_errors_are_those_of_choleskys_factor(dtype, size):
         v = (size * v).astype(dtype)
         covariance = np.eye(k) + np.outer(v.astype(float), v.astype(float))
         lower = np.linalg.cholesky(covariance)
-        found, logs = white_errors_and_log_variances(jnp.asarray(e), jnp.asarray(v))
-        slope = jax.jacfwd(lambda e, v=v: white_errors_and_log_variances(e, jnp.asarray(v))[0])(
-            jnp.asarray(e)
-        )
+        found, logs = decorrelate(jnp.asarray(e), jnp.asarray(v))
+        slope = jax.jacfwd(lambda e, v=v: decorrelate(e, jnp.asarray(v))[0])(jnp.asarray(e))
         digits = 1e-9 if dtype is np.float64 else 2e-4
         wanted, scale = np.linalg.inv(lower), max(1.0, size)
         np.testing.assert_allclose(found, wanted @ e, rtol=digits, atol=digits)

@@ -8,8 +8,8 @@ from scipy import signal
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.data.stacking import pick_records
-from rigidjax.identify.model.terms import errors_in_sensor_units
+from rigidjax.identify.data.stacking import pick
+from rigidjax.identify.model.terms import sensor_errors
 from rigidjax.identify.sensors import SensorInput
 
 BODY = rj.Inertia.from_principal(1.0, 2.0, 2.7)
@@ -79,10 +79,8 @@ def test_the_model_goes_through_the_filter_and_so_do_its_derivatives():
     flat = problem.start(BODY, [3.0, 0.5, 4.0])
 
     def errors(x):
-        record, reference = pick_records(problem.records, 0), pick_records(problem.reference, 0)
-        return errors_in_sensor_units(
-            problem, problem.index.rows_of_recordings(x)[0], record, reference, None
-        )[0]
+        record, reference = pick(problem.records, 0), pick(problem.reference, 0)
+        return sensor_errors(problem, problem.index.rows(x)[0], record, reference, None)[0]
 
     # SciPy's filter begins at rest; by then it has forgotten that.
     np.testing.assert_allclose(errors(flat)[t > 0.5], 0.0, atol=1e-4)

@@ -17,7 +17,7 @@ from rigidjax.cli import spec
 from rigidjax.cli.command import main
 from rigidjax.cli.logs.errors import LogError
 from rigidjax.identify.search import checkpoint
-from rigidjax.identify.search.stages import Attempt, errors_and_slopes
+from rigidjax.identify.search.stages import Attempt, blocks_at
 from rigidjax.identify.uncertainty import quantities
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -88,7 +88,7 @@ def test_three_throws_of_different_lengths_give_one_body_with_its_scale(joint):
 @pytest.mark.slow
 def test_the_blocks_are_the_derivative(joint):
     model, x = joint.model, joint.x
-    errors, blocks = errors_and_slopes(model, x)
+    errors, blocks = blocks_at(model, x)
     where = np.asarray(model.index.places)
     for index in range(3):
         for column in (0, 1, 6, 10, 13):

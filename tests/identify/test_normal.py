@@ -8,9 +8,9 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.model.model import AbstractPull, with_replaced_fields
-from rigidjax.identify.model.normal import NormalMatrix, OwnBlocks, normal_matrix_of_jacobians
-from rigidjax.identify.search.stages import errors_and_slopes
+from rigidjax.identify.model.model import AbstractPull, replaced
+from rigidjax.identify.model.normal import NormalMatrix, OwnBlocks, normal_matrix
+from rigidjax.identify.search.stages import blocks_at
 from rigidjax.identify.uncertainty import covariance as uncertainty
 
 RNG = np.random.default_rng(0)
@@ -85,19 +85,19 @@ def test_it_is_the_whole_matrix(dtype):
     unit, more = (RNG.uniform(0.5, 2.0, size).astype(dtype) for _ in range(2))
     x, sides = RNG.normal(size=size).astype(dtype), RNG.normal(size=(size, 2)).astype(dtype)
     for own in (None, alone):
-        found = normal_matrix_of_jacobians((jnp.asarray(rows),), jnp.asarray(where), size, own)
+        found = normal_matrix((jnp.asarray(rows),), jnp.asarray(where), size, own)
         assert found.core.shape[0] == (size if own is None else size - own.size * problem.count)
         np.testing.assert_allclose(found.diagonal, np.diag(wanted), rtol=exact)
         np.testing.assert_allclose(found @ jnp.asarray(x), wanted @ x, rtol=exact, atol=100 * exact)
         whole = wanted * np.outer(unit, unit) + np.diag(more)
-        made = found.scale_rows_and_columns(jnp.asarray(unit)).add_diagonal(jnp.asarray(more))
+        made = found.scaled(jnp.asarray(unit)).add_diagonal(jnp.asarray(more))
         for side in (x, sides):
             solved = np.linalg.solve(whole, side)
             near = exact * np.abs(solved).max()
             np.testing.assert_allclose(made.solve(jnp.asarray(side)), solved, atol=near)
     body = np.zeros((2, size), dtype)
     body[:, :4] = RNG.normal(size=(2, 4))
-    wider = found.add_residual_rows(jnp.asarray(body))
+    wider = found.add_rows(jnp.asarray(body))
     np.testing.assert_allclose(
         wider @ jnp.asarray(x), wanted @ x + body.T @ (body @ x), atol=100 * exact
     )
@@ -124,7 +124,7 @@ def jacobian(linear):
 def linear_at(problem, sigma=0.01):
     start = start_of(problem)
     noise = (jnp.full((problem.count, 3), sigma),)
-    return uncertainty.linearise(problem, start, noise, errors_and_slopes(problem, start))
+    return uncertainty.linearise(problem, start, noise, blocks_at(problem, start))
 
 
 def near_a_guess():
@@ -208,9 +208,7 @@ class Joints(AbstractPull):
 
 
 def test_numbers_that_rows_tie_together_stay_in_the_core():
-    linear = linear_at(
-        with_replaced_fields(identify.Model(records(9), identify.Ratios()), pull=Joints())
-    )
+    linear = linear_at(replaced(identify.Model(records(9), identify.Ratios()), pull=Joints()))
     rows = jacobian(linear)
     wanted = np.linalg.pinv(rows) @ np.linalg.pinv(rows).T
     size = np.sqrt(np.diag(wanted))
@@ -239,7 +237,7 @@ def test_many_recordings_are_fitted_as_few_are():
     problem = several(18)
     found = identify.fit(problem, starts=1)
     assert found.search.word == "found"
-    blocks = errors_and_slopes(problem, found.x)
+    blocks = blocks_at(problem, found.x)
     linear = uncertainty.linearise(problem, found.x, found.noises, blocks)
     step = found.determined_covariance @ linear.misfit_gradient
     # At the least misfit the gradient vanishes, in standard deviations.

@@ -6,7 +6,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.data.reference_states import reference_states_of
+from rigidjax.identify.data.reference_states import references
 
 Q = np.array([0.8, 0.4, -0.4, 0.2])
 BODY = rj.MassProperties(2.0, [0.1, -0.2, 0.3], np.diag([0.2, 0.3, 0.4]))
@@ -65,17 +65,17 @@ def ranges(sigma=0.0):
 
 
 def test_a_fit_starts_where_the_readings_are():
-    by_range = reference_states_of([identify.Recording(TS, *ranges())], rj.Rigid)
+    by_range = references([identify.Recording(TS, *ranges())], rj.Rigid)
     np.testing.assert_allclose(by_range.state.x[0], THROWN.x, rtol=0, atol=1e-12)
     np.testing.assert_allclose(by_range.state.v[0], THROWN.v, rtol=0, atol=0.7)
     x = flight()
     v = np.gradient(x, TS, axis=0)
     both = identify.Recording(TS, (identify.Position(), x), (identify.Velocity(), v))
-    reference = reference_states_of([both], rj.Rigid)
+    reference = references([both], rj.Rigid)
     np.testing.assert_allclose(reference.state.x[0], THROWN.x, rtol=0, atol=1e-14)
     np.testing.assert_allclose(reference.state.v[0], v[0], rtol=0, atol=1e-14)
     # Three stations in a plane show where in it, and leave the height to their own.
-    flat = reference_states_of([identify.Recording(TS, *ranges()[:3])], rj.Rigid)
+    flat = references([identify.Recording(TS, *ranges()[:3])], rj.Rigid)
     np.testing.assert_allclose(flat.state.x[0], [1.0, 2.0, 0.0], rtol=0, atol=1e-12)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.search.stages import errors_and_slopes
+from rigidjax.identify.search.stages import blocks_at
 from rigidjax.identify.uncertainty import covariance as uncertainty
 from rigidjax.identify.uncertainty.quantities import standard_deviations
 
@@ -30,7 +30,7 @@ def gyro_problem(values, sensor=None, chart=None, ts=TS, **options):
 
 
 def linear_at(model, x, noise):
-    return uncertainty.linearise(model, x, noise, errors_and_slopes(model, x))
+    return uncertainty.linearise(model, x, noise, blocks_at(model, x))
 
 
 def off(found):

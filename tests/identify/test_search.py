@@ -18,11 +18,11 @@ from rigidjax.identify.search.least_squares import LMState, Settings
 from rigidjax.identify.search.stages import (
     Attempt,
     Task,
+    first_weights,
     fit_in_stages,
-    least_squares_from,
-    search_whole_records,
-    weights_of_beginning,
-    weights_of_whole_record,
+    marquardt,
+    search_whole,
+    whole_weights,
 )
 
 TS = np.linspace(0.0, 1.0, 8)
@@ -55,12 +55,10 @@ def test_a_stride_that_is_lost_leaves_where_it_began_and_its_misfit(problem, mon
     def lost(model, x, *_):
         return an_end(x, np.inf, False)
 
-    monkeypatch.setattr(stages, "least_squares_from", lost)
+    monkeypatch.setattr(stages, "marquardt", lost)
     monkeypatch.setattr(stages, "cost_of", lambda *_: 7.0)
     seen = []
-    out = search_whole_records(
-        Attempt(at(problem, 2.0)), Task(problem, (), 1e-4, 100), watch=seen.append
-    )
+    out = search_whole(Attempt(at(problem, 2.0)), Task(problem, (), 1e-4, 100), watch=seen.append)
     assert place(out.x) == 2.0 and float(out.cost) == 7.0
     # No other stride follows.
     assert not bool(out.converged) and len(seen) == 1 and seen[0] is out
@@ -76,7 +74,7 @@ def test_a_part_is_not_fitted_at_the_cost_of_the_whole(problem, monkeypatch, bey
         # Far above what explains 24 readings.
         return an_end(at(model, 1.0), 1e3, True)
 
-    monkeypatch.setattr(stages, "least_squares_from", step)
+    monkeypatch.setattr(stages, "marquardt", step)
     monkeypatch.setattr(stages, "cost_of", lambda _, x, *rest: 1.0 if place(x) == 0.0 else beyond)
     fit_in_stages(at(problem, 0.0), Task(problem, (), 1e-4, 25))
     assert [shown for _, shown in begun] == [1.0, 0.25, 0.5, 1.0]
@@ -90,7 +88,7 @@ def test_what_explains_the_whole_record_at_once_is_not_fitted_in_parts(problem, 
         begun.append(float(weights.mean()))
         return an_end(at(model, 1.0), 12.0, True)
 
-    monkeypatch.setattr(stages, "least_squares_from", step)
+    monkeypatch.setattr(stages, "marquardt", step)
     out = fit_in_stages(at(problem, 0.0), Task(problem, (), 1e-4, 25))
     assert begun == [1.0] and place(out.x) == 1.0 and bool(out.converged)
 
@@ -125,12 +123,12 @@ def pushed():
 def searched(problem, weights, settings):
     noise = (jnp.full((1, 3), 0.01),)
     start = problem.start(rj.Inertia.from_principal(1.3, 1.9, 2.5))
-    return least_squares_from(problem, start, noise, weights, settings)
+    return marquardt(problem, start, noise, weights, settings)
 
 
 def test_a_part_of_the_record_is_followed_no_further_than_that(pushed):
     of = pushed(9.0)
-    part, all_of_it = weights_of_beginning(of, 0.25), weights_of_whole_record(of)
+    part, all_of_it = first_weights(of, 0.25), whole_weights(of)
     once = Settings(1e-4, 1.0, 0)
     # Beyond the part nothing is computed: what is not finite there does no harm.
     lost = pushed(1.5)
@@ -154,7 +152,7 @@ def test_a_part_of_the_record_is_followed_no_further_than_that(pushed):
 
 def test_a_search_may_end_near(pushed):
     of = pushed(9.0)
-    seen = weights_of_whole_record(of)
+    seen = whole_weights(of)
     end = searched(of, seen, Settings(1e-4, 1.0, 60))
     least = float(end.cost)
     early = searched(of, seen, Settings(1e-4, 1.0, 60, near=1.5 * least))

@@ -8,7 +8,7 @@ from once import once
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.search.noise import estimate_noise
-from rigidjax.identify.search.stages import errors_and_slopes
+from rigidjax.identify.search.stages import blocks_at
 
 BODIES = {
     "box": rj.Inertia.from_principal(1.0, 1.6, 2.1),
@@ -102,14 +102,14 @@ def test_each_recording_depends_on_its_own_body_and_group(found):
     bias = model.scenes(x).sensors[0].bias
     np.testing.assert_array_equal(bias, found.values["bias, own"])
     # A shared value and a deviation have the same derivative.
-    blocks = np.asarray(errors_and_slopes(model, x)[1][0])
+    blocks = np.asarray(blocks_at(model, x)[1][0])
     np.testing.assert_array_equal(blocks[..., 9:12], blocks[..., 18:21])
 
 
 def test_derivatives_of_one_recording_are_those_of_all_numbers_there(found):
     """Against differences of errors by every free number, recording by recording."""
     model, x, h = found.model, np.asarray(found.x), 1e-5
-    blocks, where = np.asarray(errors_and_slopes(model, found.x)[1][0]), model.index.places
+    blocks, where = np.asarray(blocks_at(model, found.x)[1][0]), model.index.places
     errors = once(lambda x: model.errors(x)[0])
     for place in range(x.size):
         step = h * np.eye(x.size)[place]
@@ -138,8 +138,7 @@ def test_noise_is_estimated_by_group(records, each, wanted):
     rng = np.random.default_rng(3)
     errors = (np.array([0.02, 0.05, 0.1, 0.1])[:, None, None] * rng.normal(size=(4, 60, 3)),)
     first = (jnp.ones((4, 3)),)
-    _, slopes = errors_and_slopes(model, model.start())
-    blocks = tuple(map(jnp.asarray, errors)), slopes
+    blocks = blocks_at(model, model.start())._replace(value=tuple(map(jnp.asarray, errors)))
     _, (noise,) = estimate_noise(model, model.start(), blocks, first)
     np.testing.assert_allclose(noise[:, 0], wanted, rtol=0.15)
 

@@ -10,7 +10,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import report
-from rigidjax.identify.search.stages import errors_and_slopes
+from rigidjax.identify.search.stages import blocks_at
 from rigidjax.identify.uncertainty.covariance import (
     correlation_times,
     covariance_root,
@@ -49,7 +49,7 @@ def test_a_real_flat_body_has_intervals_with_a_width(toss):
 def test_the_sandwich_is_that_of_its_definition(toss):
     # H⁻¹ M H⁻¹ from the slopes themselves where nothing is weakly seen, M's errors in time by hand.
     found = identify.fit(identify.Model(toss, identify.PrincipalRatios()))
-    blocks = errors_and_slopes(found.model, found.x)
+    blocks = blocks_at(found.model, found.x)
     linear = linearise(found.model, found.x, found.noises, blocks)
     times = correlation_times(linear)
     got = white_or_sandwich_covariance(linear, times)

@@ -11,7 +11,7 @@ from tumblers import simulated
 
 from rigidjax import identify, tumblers
 from rigidjax.identify import Gyro
-from rigidjax.identify.data.stacking import pad_to_few_lengths
+from rigidjax.identify.data.stacking import pad_to_few
 from rigidjax.tumblers import Brightness, lattice_series, two_frequencies
 from rigidjax.tumblers.two_frequencies import with_aliases
 
@@ -122,7 +122,7 @@ def test_another_length_is_the_same_program(caplog):
     # Of the readings as they were given.
     assert found.fit.residuals[0].shape == (380, 1) and found.fit.independent == 380
     assert found.fit.model.recording.t.shape == (380,)
-    errors = pad_to_few_lengths(of(380)).errors(found.fit.x)[0]
+    errors = pad_to_few(of(380)).errors(found.fit.x)[0]
     np.testing.assert_allclose(errors[:380], found.fit.residuals[0], rtol=0, atol=1e-12)
     assert errors.shape == (432, 1) and not errors[380:].any()
 

@@ -25,14 +25,14 @@ from rigidjax.identify.answer.answers import (
 from rigidjax.identify.answer.causes import time_stamp_cause
 from rigidjax.identify.answer.result import Fit, Start
 from rigidjax.identify.data.recording import Reading
-from rigidjax.identify.model.model import Model, describe_delays_outside_windows
+from rigidjax.identify.model.model import Model, late_delays
 from rigidjax.identify.model.terms import Noise
-from rigidjax.identify.search.noise import median_and_density_of_chi2
+from rigidjax.identify.search.noise import chi2_median
 from rigidjax.identify.search.stages import (
     Attempt,
-    count_of_errors_if_unit_noise,
-    errors_and_slopes,
+    blocks_at,
     has_unit_noise,
+    unit_noise_count,
 )
 from rigidjax.identify.uncertainty import considered, covariance as uncertainty, flat_limit
 from rigidjax.identify.uncertainty.covariance import (
@@ -247,7 +247,7 @@ def _noise_ratio_by_median(squared_lengths: np.ndarray, components: int) -> floa
     if not squared_lengths.size:
         return 1.0
     middle = float(np.median(squared_lengths))
-    half, density = median_and_density_of_chi2(components)
+    half, density = chi2_median(components)
     # The standard deviation of the median of n samples is 1 / (2 f √n), with f the density at the
     # median.
     wide = 0.5 / (density * np.sqrt(squared_lengths.size))
@@ -404,7 +404,7 @@ def assess(
     """
     x = best.x
     near = flat_limit.thicken_flat_bodies(model, x)
-    thickened = None if near is None else (near, errors_and_slopes(model, near))
+    thickened = None if near is None else (near, blocks_at(model, near))
     linear = uncertainty.linearise(model, x, noise, best.blocks, thickened)
     times = uncertainty.correlation_times(linear)
     white = uncertainty.white_covariance(linear)
@@ -425,7 +425,7 @@ def assess(
             *remarks,
             *remarks_on_dependence_on_one_stretch(stretches, model, numbers, white),
         )
-    remarks = (*remarks, *describe_delays_outside_windows(model, x))
+    remarks = (*remarks, *late_delays(model, x))
     considered_errors = considered.compute_considered_errors(model, linear, noise, white.determined)
     covariance = _covariance_with_considered_errors(covariance, considered_errors, model)
     shifts = considered.shift_matrix(considered_errors, linear.free_count)
@@ -439,7 +439,7 @@ def assess(
     # the minimum is measured with the flatness of the body held constant.
     held = [limit.slope for limit in limits if limit.free < 0]
     near_end = AT_THE_END
-    if count := count_of_errors_if_unit_noise(model):
+    if count := unit_noise_count(model):
         near_end *= float(np.sqrt(2.0 * best_cost / count))
     done = bool(best.converged) or uncertainty.distance_to_minimum(linear, white, held) < near_end
     chi2, dof, explanation, left = goodness_of_fit(model, noise, linear, times, white.determined)

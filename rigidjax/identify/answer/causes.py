@@ -16,14 +16,14 @@ from jaxtyping import Array, Float
 from rigidjax.identify.answer.answers import Cause
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, readings_of
-from rigidjax.identify.data.reference_states import attitudes, rates_between_attitudes
-from rigidjax.identify.model.charts import bodies_as_list, tensor_of
+from rigidjax.identify.data.reference_states import attitudes, mean_rates
+from rigidjax.identify.model.charts import body_list, tensor_of
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.terms import Noise, standardised_error_changes
+from rigidjax.identify.model.terms import Noise, scaled_slopes
 from rigidjax.identify.search.starts import (
-    depends_on_rate_only,
-    inertia_components_and_feasibility_margin,
-    integrated_euler_equations,
+    integrated_euler,
+    rate_only,
+    solve_inertia,
 )
 from rigidjax.identify.sensors import AbstractSensor, Gyro
 from rigidjax.identify.uncertainty.considered import slope_in_time
@@ -93,7 +93,7 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None
         for name, change in ATTITUDES.items():
             changed = [(t, change(q)) for t, q in known]
             ratios[name] = _relative_rate_difference(recordings, changed, _SAME)
-    elif depends_on_rate_only(torque):
+    elif rate_only(torque):
         bound, margin = _euler_residual_and_tensor_margin(recordings, torque, _SAME)
         # The body that fits the uncorrected rates best may be unreal. Sensor errors alone can make
         # it slightly unreal, but not as far as a margin of −0.8. With such a margin the file was
@@ -149,11 +149,9 @@ def _euler_residual_and_tensor_margin(
       permutation or a mirror of the axes, or another unit.
     - `sign`: the factor by which the torque is multiplied; −1 tries a torque whose sign was wrong.
     """
-    balances = [
-        integrated_euler_equations(recording, torque, correction) for recording in recordings
-    ]
+    balances = [integrated_euler(recording, torque, correction) for recording in recordings]
     matrix, side, momentum = (np.concatenate(part) for part in zip(*balances, strict=True))
-    components, margin = inertia_components_and_feasibility_margin(matrix, sign * side)
+    components, margin = solve_inertia(matrix, sign * side)
     left = np.linalg.norm(matrix @ components - sign * side)
     return float(left / np.linalg.norm(momentum @ components)), margin
 
@@ -178,7 +176,7 @@ def _relative_rate_difference(
     """
     left, size = 0.0, 1e-300
     for recording, (t, q) in zip(recordings, attitudes, strict=True):
-        when, wanted = rates_between_attitudes(t, jnp.asarray(q))
+        when, wanted = mean_rates(t, jnp.asarray(q))
         reading = readings_of(recording, Gyro)[0]
         gyro_times, w = (
             np.asarray(recording.t)[reading.host_mask],
@@ -228,9 +226,7 @@ def causes(
     - `linear`: the errors and their derivatives at x.
     - `indices`: the indices of the sensors whose errors the model does not explain.
     """
-    given = zip(
-        stacking.recordings_on_host(model.records, model.counts), model.body_names, strict=True
-    )
+    given = zip(stacking.on_host(model.records, model.counts), model.body_names, strict=True)
     mine = [recording for recording, name in given if name == model.body_names[0]]
     wrong = cause_by_misread_file(mine, model.torque)
     if wrong is not None:
@@ -271,7 +267,7 @@ def time_stamp_cause(model: Model, noise: Noise, linear: Linearisation, index: i
         return None
     slope = slope_in_time(model, np.asarray(model.records.readings[index].values) - error)
     late = model.records.readings[index].jitter_error
-    both = np.asarray(standardised_error_changes(np.stack([error, slope], -1), noise[index], late))
+    both = np.asarray(scaled_slopes(np.stack([error, slope], -1), noise[index], late))
     error, slope = both[..., 0], both[..., 1]
     moved = np.sum(slope**2, axis=-1) * kept
     moving = moved > 1e-2 * moved.max()
@@ -429,7 +425,7 @@ def _rate_response_to_torques(
         return np.zeros_like
     width = model.index.width
     flow = linear.raw_slopes[index][..., width - 3 : width]
-    tensors = np.stack([np.asarray(tensor_of(b)) for b in bodies_as_list(model.bodies(x))])
+    tensors = np.stack([np.asarray(tensor_of(b)) for b in body_list(model.bodies(x))])
     of = (
         np.zeros(model.count, int) if model.body_indices is None else np.asarray(model.body_indices)
     )
@@ -473,7 +469,7 @@ def _explained_share(
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]
     jitter_error = model.records.readings[index].jitter_error
-    changes = standardised_error_changes(direction, noise[index], jitter_error)
+    changes = scaled_slopes(direction, noise[index], jitter_error)
     scaled = np.asarray(changes) * roots[index][..., None]
     size = np.sqrt(np.sum(scaled**2, axis=(0, 1, 2)))
     size[size == 0] = 1.0

@@ -20,7 +20,7 @@ from rigidjax.identify.answer.assess import assess
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.reference_states import rates, require_turning
-from rigidjax.identify.model.model import Model, require_numbers
+from rigidjax.identify.model.model import Model, checked_x
 from rigidjax.identify.model.predict import AbstractIntegrator, Adaptive
 from rigidjax.identify.model.terms import all_errors
 from rigidjax.identify.search.checkpoint import (
@@ -34,11 +34,11 @@ from rigidjax.identify.search.noise import estimate_noise, initial_noise
 from rigidjax.identify.search.stages import (
     Attempt,
     Task,
+    accepted_cost,
+    blocks_at,
     cost_of,
-    errors_and_slopes,
     fit_in_stages,
-    search_whole_records,
-    sufficient_misfit,
+    search_whole,
 )
 from rigidjax.identify.search.starts import starting_points
 from rigidjax.identify.search.stochastic_gradient import Descent, descend_from
@@ -137,7 +137,7 @@ def fit(
     tolerance = _checks.positive_float(tolerance, "tolerance")
     key = None if key is None else _checks.random_key(key)
     if initial is not None:
-        initial = require_numbers(model, initial)
+        initial = checked_x(model, initial)
     if progress is not None:
         _checks.require_function(progress, "progress", "of a line of text, such as print")
     if checkpoint is not None:
@@ -160,10 +160,10 @@ def fit(
             )  # fmt: skip
         return dataclasses.replace(result, place=_ON_CPU)
     if model.index.bodies:
-        recordings = stacking.recordings_on_host(model.records, model.counts)
+        recordings = stacking.on_host(model.records, model.counts)
         for number, recording in enumerate(recordings, 1):
             require_turning(rates(recording)[1], f"fit: the rates of recording {number}")
-    padded = stacking.pad_to_few_lengths(model)
+    padded = stacking.pad_to_few(model)
     task = Task(padded, initial_noise(padded), tolerance, max_steps)
     points = [] if initial is None else [initial]
     if starts > len(points):
@@ -173,7 +173,7 @@ def fit(
         # Choose the tolerance of the integrator at the first starting point, before the search,
         # because integration errors would slow the search down. Another tolerance needs no new
         # compilation.
-        first = Attempt(points[0], blocks=errors_and_slopes(padded, points[0]))
+        first = Attempt(points[0], blocks=blocks_at(padded, points[0]))
         finer = _converged_integrator(first, task, rough)
         task = task if rough else task._replace(model=_with_integrator(padded, finer))
     if descent is not None:
@@ -187,7 +187,7 @@ def fit(
     rough.clear()
     while (finer := _converged_integrator(best, task, rough)) is not None:
         task = task._replace(model=_with_integrator(task.model, finer))
-        best, task = _estimate_noise_in_turn(search_whole_records(Attempt(best.x), task), task)
+        best, task = _estimate_noise_in_turn(search_whole(Attempt(best.x), task), task)
         best = _with_errors_and_derivatives(best, task.model)
     shown = model if task.model is padded else _with_original_readings(model, task.model)
     return assess(task.model, best, task.noise, attempts, lowest, shown, interrupts, rough)
@@ -271,7 +271,7 @@ def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
         pairs = zip(before, task.noise, strict=True)
         if turn > 1 and all(np.allclose(b, a, rtol=_SETTLED, atol=0.0) for a, b in pairs):
             break
-        best = search_whole_records(Attempt(best.x), task)
+        best = search_whole(Attempt(best.x), task)
     return best, task
 
 
@@ -350,7 +350,7 @@ def _search_from_each(
             # is not likely to reach the least misfit so far.
             ended = [float(one.cost) for one in attempts if bool(one.converged)]
             aim = min(ended, default=np.inf)
-            aim = aim if aim <= sufficient_misfit(task.model) else 0.0
+            aim = aim if aim <= accepted_cost(task.model) else 0.0
             attempts.append(fit_in_stages(point, task, aim=aim, watch=watch))
             latest = like
             # Only the best search so far keeps its errors and their derivatives, which need memory.
@@ -376,7 +376,7 @@ def _with_errors_and_derivatives(best: Attempt, model: Model) -> Attempt:
     """
     if best.blocks is not None:
         return best
-    return dataclasses.replace(best, blocks=errors_and_slopes(model, best.x))
+    return dataclasses.replace(best, blocks=blocks_at(model, best.x))
 
 
 @eqx.filter_jit
@@ -423,7 +423,7 @@ def _converged_integrator(
     while steps is not None and (finer := steps.refine()) is not None:
         closer = _with_integrator(model, finer)
         if jax.tree.structure(finer) == jax.tree.structure(model.integrator):
-            exact, _ = errors_and_slopes(closer, best.x)
+            exact, _ = blocks_at(closer, best.x)
         else:
             exact = _errors_without_derivatives(closer, best.x)
         apart = max(
@@ -473,7 +473,7 @@ def _estimate_spreads_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]
         widths = [jnp.asarray(width) for width in new]
         model = eqx.tree_at(lambda m: [m.slots[i].spread for i in indices], task.model, widths)
         task = task._replace(model=model)
-        best = search_whole_records(Attempt(best.x), task)
+        best = search_whole(Attempt(best.x), task)
         if (np.abs(new - before) < _SETTLED * before).all() or (new <= least).all():
             break
         before = new

@@ -15,7 +15,7 @@ from rigidjax.identify.answer import answers, undetermined
 from rigidjax.identify.answer.answers import Answer, Cause
 from rigidjax.identify.answer.causes import causes
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
-from rigidjax.identify.model.model import Model, Unpacked, unpack_with_slopes
+from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jacobian
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.uncertainty.considered import Consideration
 from rigidjax.identify.uncertainty.covariance import Linearisation
@@ -287,7 +287,7 @@ class Fit(eqx.Module):
         out = []
         errors = self._unpadded_errors
         for error, reading in zip(errors, self.model.records.readings, strict=True):
-            mask = reading.usable_channel_mask.all(axis=-1)
+            mask = reading.usable.all(axis=-1)
             lengths = np.sum(np.asarray(error) ** 2, axis=-1)[
                 mask if mask.any() else reading.host_mask
             ]
@@ -369,7 +369,7 @@ def value_and_interval_of(
         point = dataclasses.replace(point, noise=fit.noises)
         return _checks.differentiable_array(function(point), "function(point)")
 
-    point, slopes = unpack_with_slopes(fit.model, fit.derivative_point)
+    point, slopes = unpack_jacobian(shortened(fit.model), fit.derivative_point)
 
     def value_and_change(step: Unpacked) -> tuple[Array, Array]:
         return jax.jvp(value, (point,), (step,))

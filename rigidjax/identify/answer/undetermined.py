@@ -14,10 +14,10 @@ from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.answer.answers import FAILS, NOT_ENDED
 from rigidjax.identify.data.full_scale import describe_full_scale
 from rigidjax.identify.data.reference_states import ReferenceStates
-from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, bodies_as_list
-from rigidjax.identify.model.model import Model, with_first_times_only
-from rigidjax.identify.model.terms import jacobian_and_value
-from rigidjax.identify.search.stages import errors_and_slopes
+from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, body_list
+from rigidjax.identify.model.model import Model, shortened
+from rigidjax.identify.model.terms import value_and_jacfwd
+from rigidjax.identify.search.stages import blocks_at
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
 from rigidjax.identify.uncertainty.flat_limit import bodies_at
@@ -132,7 +132,7 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
     best = basis = None
     slopes, values = map(
         np.asarray,
-        _slopes_and_values_for_report(with_first_times_only(fit.model), fit.derivative_point),
+        _slopes_and_values_for_report(shortened(fit.model), fit.derivative_point),
     )
     names, many = (
         _names_units_and_relative_flags(fit.model),
@@ -195,9 +195,7 @@ def _change_of_readings(fit: "Fit", steps: tuple[np.ndarray, np.ndarray]) -> flo
     two steps (n,) from the best point of a `fit`.
     """
     x = fit.derivative_point
-    after, before = (
-        errors_and_slopes(fit.model, x + jnp.asarray(step, x.dtype))[0] for step in steps
-    )
+    after, before = (blocks_at(fit.model, x + jnp.asarray(step, x.dtype))[0] for step in steps)
     parts = zip(after, before, fit.noises, strict=True)
     return float(
         np.sqrt(sum(np.sum((np.asarray(a - b) / np.asarray(n)[:, None]) ** 2) for a, b, n in parts))
@@ -318,10 +316,10 @@ def _slopes_and_values_for_report(model: Model, point: Float[Array, " n"]) -> tu
     initial position or velocity is the difference from its value in the reference state.
     """
     reference = model.reference
-    start = jax.vmap(ReferenceStates.initial_state_at)(reference, point[model.index.start])
+    start = jax.vmap(ReferenceStates.initial)(reference, point[model.index.start])
 
     def initial_states(x: Array) -> list[Array]:
-        states = jax.vmap(ReferenceStates.initial_state_at)(reference, x[model.index.start])
+        states = jax.vmap(ReferenceStates.initial)(reference, x[model.index.start])
         one, numbers = jax.tree.map(lambda leaf: leaf[0], states), []
         change = parts_by_name(one, jax.vmap(minus)(states, start))
         offset = parts_by_name(one, jax.vmap(minus)(states, reference.state))
@@ -331,14 +329,14 @@ def _slopes_and_values_for_report(model: Model, point: Float[Array, " n"]) -> tu
 
     def value(x: Array) -> Array:
         numbers = [quantity_vector(model, x)]
-        for body in bodies_as_list(model.bodies(x)):
+        for body in body_list(model.bodies(x)):
             tensor = tensor_of(body)
             numbers.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
         if reports_initial_states(model):
             numbers += initial_states(x)
         return jnp.concatenate([part.reshape(-1) for part in numbers])
 
-    return jacobian_and_value(value, point)
+    return value_and_jacfwd(value, point)[::-1]
 
 
 def _mask_of_reported_numbers(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
@@ -530,9 +528,7 @@ def inertia_scale_is_undetermined(fit: "Fit") -> bool:
     first = len(names_units_and_signs(fit.model))
     slopes, values = (
         np.asarray(a)
-        for a in _slopes_and_values_for_report(
-            with_first_times_only(fit.model), fit.derivative_point
-        )
+        for a in _slopes_and_values_for_report(shortened(fit.model), fit.derivative_point)
     )
     here, moved = values[first : first + 6], slopes[first : first + 6] @ null.T
     wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)

@@ -17,14 +17,12 @@ MOST = 0.7
 
 
 def full_scale_of(values: np.ndarray) -> float | None:
-    """Return the full scale of one channel of a sensor if its readings `values` (T,) are cut off,
-    else `None`.
+    """Return the full scale of one channel of a sensor if its readings are cut off, else `None`.
 
-    The full scale is the largest value that the channel can read. Readings count as cut off if many
-    readings in a row have the largest value: at least twice as many as at the top of a smooth wave.
-    At the top of a wave about 1 + 2 √(2d/a) readings in a row are equal, where d is the smallest
-    change between successive readings (the last digit), and a is the typical second difference of
-    successive readings.
+    Readings count as cut off if many readings in a row have the largest value: at least twice as
+    many as at the top of a smooth wave. There about 1 + 2 √(2d/a) readings in a row are equal,
+    where d is the smallest change between successive readings (the last digit), and a is the
+    typical second difference.
     """
     size = np.abs(values)
     top = float(size.max(initial=0.0))
@@ -42,12 +40,10 @@ def full_scale_of(values: np.ndarray) -> float | None:
     return top if longest >= max(RUN, 2.0 * smooth) else None
 
 
-def with_full_scale_limits(recordings: Sequence[Recording]) -> list[Recording]:
-    """Return the recordings with the full scale as the `limit` of each sensor whose readings are
-    cut off.
+def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
+    """Return the recordings with the full scale as the `limit` of each sensor that was cut off.
 
-    The full scale is the largest value that a sensor can read. It is found from the readings. A
-    sensor that has a `limit` already keeps this limit.
+    A sensor that has a `limit` already keeps it.
     """
     out = list(recordings)
     for index in range(max(len(r.readings) for r in recordings)):
@@ -75,14 +71,10 @@ def with_full_scale_limits(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def describe_full_scale(readings: Sequence[Reading]) -> list[str]:
-    """Describe how many readings are at full scale, in one sentence for each sensor.
-
-    The full scale is the largest value that a sensor can read. A sensor without readings at full
-    scale is left out.
-    """
+    """Describe how many readings are at full scale, in one sentence for each such sensor."""
     out = []
     for reading in readings:
-        count = (reading.host_mask[..., None] & ~reading.usable_channel_mask).sum(axis=(0, 1))
+        count = (reading.host_mask[..., None] & ~reading.usable).sum(axis=(0, 1))
         if not count.any():
             continue
         sensor: Any = reading.sensor

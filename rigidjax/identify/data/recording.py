@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,71 +12,49 @@ from jaxtyping import Array, Bool, Float, PyTree
 from rigidjax import _checks, _show
 from rigidjax._types import NumbersLike
 from rigidjax.identify.sensors import AbstractSensor
+from rigidjax.identify.sensors.base import extras
 from rigidjax.motion.torques import Held
 
 
 class Reading(eqx.Module):
-    """Hold the readings of one sensor.
-
-    **Fields:**
-
-    - `sensor`: the sensor.
-    - `values`: (T, …) the readings.
-    - `mask`: (T,) true where there is a reading.
-    - `jitter_error`: (T, k) for a sensor with jitter (random errors of its time stamps) the error
-      of a reading whose time stamp is one standard deviation late; `None` for any other sensor. It
-      is computed along the motion of the last fit.
-
-    Here T is the number of samples in time and k the number of components of an error. Inside a
-    `Model` all arrays have a leading axis over recordings.
-
-    >>> record = Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]]))
-    >>> record.readings[0].values.shape, record.readings[0].mask.tolist()
-    ((2, 3), [True, True])
+    """Hold the readings of one sensor; inside a `Model` all arrays have a leading axis of
+    recordings.
     """
 
     sensor: AbstractSensor
     values: Float[Array, "..."]
+    # True where there is a reading.
     mask: Bool[Array, "*records times"]
+    # For a sensor with jitter the error of a reading whose time stamp is one standard deviation
+    # late, along the motion of the last fit.
     jitter_error: Float[Array, "*records times k"] | None = None
 
     def __post_init__(self) -> None:
-        if self.jitter_error is None and getattr(self.sensor, "jitter", None) is not None:
+        if self.jitter_error is None and extras(self.sensor).jitter is not None:
             shape = (*np.shape(self.mask), self.sensor.components)
             self.jitter_error = jnp.asarray(np.zeros(shape, self.values.dtype))
 
     @property
     def host_mask(self) -> np.ndarray:
-        """Return the field `mask`, true where there is a reading, as a NumPy array, for work
-        outside of `jit`.
-        """
+        """Return the `mask` as a NumPy array, for work outside of `jit`."""
         return np.asarray(self.mask)
 
     @property
-    def usable_channel_mask(self) -> np.ndarray:
-        """Return a mask (…, T, k), true for each component of a reading that is neither masked nor
-        at full scale.
-
-        The full scale is the largest value that the sensor can read. T is the number of samples in
-        time and k the number of components of an error.
-        """
+    def usable(self) -> np.ndarray:
+        """Return a mask (…, T, k), true where a component is neither masked nor at full scale."""
         mask = np.broadcast_to(
             self.host_mask[..., None], (*self.mask.shape, self.sensor.components)
         )
-        limit = getattr(self.sensor, "limit", None)
+        limit = extras(self.sensor).limit
         if limit is None:
             return mask
         return mask & (np.abs(self.values) < np.asarray(limit)[..., None, :] * (1 - 1e-6))
 
     def with_jitter(self, jitter_error: Array, deviation: Array) -> "Reading":
-        """Return these readings with another jitter (random error of the time stamps).
+        """Return these readings with another jitter; `deviation` is in s.
 
-        A search holds `jitter_error` constant. If the search changed `jitter_error`, errors would
-        count less wherever a motion changes quickly, and the search would prefer quick motions.
-
-        - `jitter_error`: (…, T, k) the error of each reading if its time stamp is one standard
-          deviation late.
-        - `deviation`: the standard deviation of the time stamps of the sensor, s.
+        A search holds `jitter_error` constant. If it changed it, errors would count less wherever a
+        motion changes quickly, and the search would prefer quick motions.
         """
 
         def parts(reading: PyTree) -> Any:
@@ -86,9 +64,7 @@ class Reading(eqx.Module):
 
     @property
     def has_known_noise(self) -> bool:
-        """Return whether the standard deviation of the sensor's noise is given, and its time stamps
-        have no jitter (random error), so that a fit estimates neither.
-        """
+        """Return whether a fit estimates neither the noise of the sensor nor its jitter."""
         return self.sensor.noise is not None and self.jitter_error is None
 
 
@@ -150,9 +126,9 @@ class Recording(eqx.Module):
             raise ValueError(f"t: wanted increasing times; t[{index}] is not above t[{index - 1}]")
         if not readings:
             raise ValueError("Recording: wanted at least one pair (sensor, values)")
-        rows = [_checked_reading(t, *reading) for reading in readings]
-        self.inputs = _checked_inputs(t, {} if inputs is None else inputs)
-        read = np.any([mask for _, _, mask, _ in rows], axis=0)
+        rows = [_reading(t, *reading) for reading in readings]
+        self.inputs = _inputs(t, {} if inputs is None else inputs)
+        read = np.any([row.mask for row in rows], axis=0)
         if read.sum() < 2:
             raise ValueError(
                 "Recording: wanted readings at two times at least, got readings at "
@@ -161,7 +137,7 @@ class Recording(eqx.Module):
         # The motion starts at the first reading and ends at the last one: the times of rows that a
         # masked array hides before the first reading or after the last one are dropped.
         within = np.maximum.accumulate(read) & np.maximum.accumulate(read[::-1])[::-1]
-        used = read | (within & np.any([hidden for *_, hidden in rows], axis=0))
+        used = read | (within & np.any([row.hidden for row in rows], axis=0))
         if any(not callable(source) for source in self.inputs.values()):
             # Drop no time if an input is an array of samples: each sample is held until the next
             # one, so that every sample is needed.
@@ -171,10 +147,21 @@ class Recording(eqx.Module):
         # If no time is dropped, index with a slice: it makes no copy of a long recording.
         kept = used if self.dropped else slice(None)
         self.t = jnp.asarray(t[kept])
-        _require_distinct_times(t[kept], self.t.dtype)
+        # NumPy is used: within a trace the numbers of a new JAX array are not known.
+        steps, held = np.diff(t[kept]), np.diff(t[kept].astype(self.t.dtype).astype(float))
+        off = np.abs(held / steps - 1)
+        index = int(np.argmax(off))
+        words = (
+            f"t: {self.t.dtype} changes the step of {steps[index]:.3g} s after {t[kept][index]} s "
+            f"to {held[index]:.3g} s; {_checks.advice_for_large_times(self.t.dtype)}"
+        )
+        if off[index] >= 1:
+            raise ValueError(words)
+        if off[index] > 0.1:
+            warnings.warn(words, stacklevel=4)
         self.readings = tuple(
-            Reading(sensor, jnp.asarray(values[kept]), jnp.asarray(mask[kept]))
-            for sensor, values, mask, _ in rows
+            Reading(row.sensor, jnp.asarray(row.values[kept]), jnp.asarray(row.mask[kept]))
+            for row in rows
         )
 
     def __repr__(self) -> str:
@@ -198,7 +185,7 @@ class Recording(eqx.Module):
         One sensor reads the number of its unmasked readings times the number of components of its
         error.
         """
-        return sum(count_numbers_read(reading) for reading in self.readings)
+        return sum(numbers_read(reading) for reading in self.readings)
 
     @property
     def sensors(self) -> tuple[AbstractSensor, ...]:
@@ -206,18 +193,8 @@ class Recording(eqx.Module):
         return tuple(reading.sensor for reading in self.readings)
 
 
-def unchecked_recording(
-    t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]
-) -> Recording:
-    """Return a `Recording` with the fields `t`, `readings` and `inputs`, without the checks that
-    `Recording(…)` makes.
-
-    The arrays may have a leading axis over recordings.
-
-    - `t`: (T,) the times, s.
-    - `readings`: for each sensor a `Reading`.
-    - `inputs`: a dict of name → samples (T, *k), or a function of time.
-    """
+def unchecked(t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]) -> Recording:
+    """Return a `Recording` without the checks of `Recording(…)`, perhaps with a leading axis."""
     record = object.__new__(Recording)
     parts = {"t": t, "readings": readings, "inputs": inputs, "dropped": 0}
     for name, part in parts.items():
@@ -226,18 +203,15 @@ def unchecked_recording(
 
 
 def readings_of(recording: Recording, sensor_class: type) -> list[Any]:
-    """Return the `Reading` of each sensor of the `recording` that is of the class
-    `sensor_class`.
-    """
+    """Return the `Reading` of each sensor of a class."""
     return [reading for reading in recording.readings if isinstance(reading.sensor, sensor_class)]
 
 
-def inputs_as_functions(recording: Recording) -> dict[str, Callable[[Any], Any]]:
-    """Return the inputs (logged quantities such as a motor command) of a `recording` as a dict of
-    name → function of time.
+def input_functions(recording: Recording) -> dict[str, Callable[[Any], Any]]:
+    """Return the inputs of a `recording` as functions of time, which hold each sample until the
+    next.
 
-    A sample of an input is held constant until the next sample. If an input is an array of samples,
-    the times of the recording must be evenly spaced.
+    If an input is samples, the times must be evenly spaced.
     """
     t, out = recording.t, {}
     for name, source in recording.inputs.items():
@@ -251,22 +225,15 @@ def inputs_as_functions(recording: Recording) -> dict[str, Callable[[Any], Any]]
     return out
 
 
-def count_numbers_read(reading: Reading) -> int:
-    """Return how many numbers a sensor read: the number of its unmasked readings times the number
-    of components of its error.
+def numbers_read(reading: Reading) -> int:
+    """Return how many numbers a sensor read: its unmasked readings times the components of its
+    error.
     """
     return reading.sensor.components * int(reading.host_mask.sum())
 
 
-def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
-    """Return the inputs (logged quantities such as a motor command) of a recording as a dict of
-    name → input, after checks.
-
-    - `t`: (T,) the times of the recording, s.
-    - `inputs`: a mapping of name → input. An input that is a function of time is returned
-      unchanged. An input may also be samples (T, *k), one array of shape k for each time; they are
-      returned as a JAX array. An error is raised for anything else.
-    """
+def _inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
+    """Return the inputs of a recording after checks, samples as JAX arrays."""
     _checks.require_instance(
         inputs, Mapping, "inputs", requirement="samples or functions of time by name"
     )
@@ -286,49 +253,22 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
     return out
 
 
-def _require_distinct_times(t: np.ndarray, dtype: np.dtype) -> None:
-    """Raise `ValueError` if two of the increasing times `t` (T,), s, become equal when they are
-    rounded to `dtype`.
+class _Rows(NamedTuple):
+    """Hold the readings of a sensor, with a row for each time of the user."""
 
-    The `dtype` is the one in which a recording stores its times, such as float32. A warning is
-    given if rounding changes a step between two successive times by more than a tenth.
-    """
-    # Use NumPy: within a trace the numbers of a new JAX array are not known.
-    steps, held = np.diff(t), np.diff(t.astype(dtype).astype(float))
-    off = np.abs(held / steps - 1)
-    index = int(np.argmax(off))
-    words = (
-        f"t: {dtype} changes the step of {steps[index]:.3g} s after {t[index]} s to "
-        f"{held[index]:.3g} s; {_checks.advice_for_large_times(dtype)}"
-    )
-    if off[index] >= 1:
-        raise ValueError(words)
-    if off[index] > 0.1:
-        warnings.warn(words, stacklevel=5)
+    sensor: AbstractSensor
+    # A valid reading is filled in where there is none, so that no NaN is left.
+    values: np.ndarray
+    # True where there is a reading.
+    mask: Bool[np.ndarray, " times"]
+    # True where a masked array hides the reading.
+    hidden: Bool[np.ndarray, " times"]
 
 
-def _checked_reading(
+def _reading(
     t: np.ndarray, sensor: AbstractSensor, values: Any, mask: NumbersLike | None = None
-) -> tuple[AbstractSensor, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the readings of a sensor after checks.
-
-    Four things are returned:
-
-    - the sensor;
-    - its readings (T, *reading_shape), where `reading_shape` is the shape of one reading of the
-      sensor; the first valid reading is filled in where there is no reading, so that no NaN is
-      left;
-    - a mask (T,), true where there is a reading;
-    - a mask (T,), true for each time whose reading a NumPy masked array hides.
-
-    **Arguments:**
-
-    - `t`: (T,) the times of the recording, s.
-    - `sensor`: the sensor.
-    - `values`: (T, …) the readings of the user. They may be a NumPy masked array.
-    - `mask`: (T,) true where there is a reading. It may be a NumPy masked array, or `None` if there
-      is a reading at each time.
-    """
+) -> _Rows:
+    """Return the readings of a sensor after checks; `values` and `mask` may be masked arrays."""
     name = type(sensor).__name__
     if not isinstance(sensor, AbstractSensor):
         raise TypeError(f"Recording: wanted pairs (sensor, values), got {name} for a sensor")
@@ -343,7 +283,8 @@ def _checked_reading(
     if rows_hidden is not None:
         values[rows_hidden] = np.nan
     # A sensor may convert its readings: attitude matrices, for example, become quaternions.
-    values = getattr(sensor, "readings", lambda values: values)(values)
+    convert = extras(sensor).readings
+    values = values if convert is None else convert(values)
     wanted = (t.size, *sensor.reading_shape)
     if values.shape != wanted:
         turned = "; transposed?" if values.shape == wanted[::-1] else ""
@@ -379,9 +320,9 @@ def _checked_reading(
     if not mask.all():
         shaped = mask.reshape(-1, *(1 for _ in across))
         values = np.where(shaped, values, values[int(np.argmax(mask))])
-    refusal = getattr(sensor, "refusal", None)
+    refusal = extras(sensor).refusal
     if refusal is not None:
         wrong, why = refusal(values)
         if wrong.any():
             raise ValueError(f"{name}: {why.format(index=int(np.argmax(wrong)))}")
-    return sensor, values, mask, hidden
+    return _Rows(sensor, values, mask, hidden)

@@ -4,7 +4,7 @@ The free numbers of an initial state are changes of this reference state.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,6 +24,7 @@ from rigidjax.identify.sensors import (
     Range,
     Velocity,
 )
+from rigidjax.identify.sensors.base import extras
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import leaf_names, plus
 from rigidjax.rotation import quaternion, so3
@@ -39,13 +40,20 @@ _TURN = 0.3
 _DETERMINED = 1e-3
 
 
-def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times (n,), s, and the attitudes (n, 4), quaternions body → world, that the
-    readings of a `recording` show.
+class Samples(NamedTuple):
+    """Hold what readings show at some times."""
 
-    The attitudes are the readings of an attitude sensor. Without such a sensor they are computed
-    from at least three markers or two directions, in the way of `rigidjax.so3.wahba`. If the
-    readings show no attitude, n is 0.
+    # In s.
+    t: Float[np.ndarray, " n"]
+    values: Float[np.ndarray, "n k"]
+
+
+def attitudes(recording: Recording) -> Samples:
+    """Return the attitudes (quaternions body → world) that the readings of a `recording` show, if
+    any.
+
+    They are the readings of an attitude sensor, or computed from at least three markers or two
+    directions in the way of `rigidjax.so3.wahba`.
     """
     t = np.asarray(recording.t)
     for reading in readings_of(recording, AttitudeSensor):
@@ -53,7 +61,7 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
         if mounting is not None:
             back = quaternion.exp(-mounting)
             q = np.asarray(jax.vmap(quaternion.multiply, (0, None))(jnp.asarray(q), back))
-        return t[reading.host_mask], q
+        return Samples(t[reading.host_mask], q)
     body, world, mask = [], [], np.ones(t.shape, bool)
     markers = readings_of(recording, Marker)
     if len(markers) >= 3:
@@ -70,49 +78,36 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
         body.append(along[:, None, :])
         world.append(np.broadcast_to(np.asarray(sensor.world), along.shape)[:, None, :])
         mask = mask & reading.host_mask
+    none = Samples(np.zeros(0), np.zeros((0, 4)))
     if not body:
-        return np.zeros(0), np.zeros((0, 4))
+        return none
     rows, sides = np.concatenate(body, axis=1)[mask], np.concatenate(world, axis=1)[mask]
     b = np.einsum("tni,tnj->tij", sides, rows)
     s = np.linalg.svd(b, compute_uv=False)
     known = s[:, 1] + np.sign(np.linalg.det(b)) * s[:, 2] > _DETERMINED * s[:, 0]
-    if not known.any():
-        return np.zeros(0), np.zeros((0, 4))
-    return t[mask][known], np.asarray(_attitudes_by_wahba(b[known]))
+    return Samples(t[mask][known], np.asarray(_wahba(b[known]))) if known.any() else none
 
 
 @jax.jit
-def _attitudes_by_wahba(sums: ArrayLike) -> Array:
-    """Return the attitudes (n, 4), quaternions body → world, that best (in the least-squares sense)
-    turn directions in the body into directions in the world.
+def _wahba(sums: Float[ArrayLike, "n 3 3"]) -> Float[Array, "n 4"]:
+    """Return the attitudes of the sums Σ w bᵀ over directions w in the world and b in the body.
 
-    The argument `sums` (n, 3, 3) holds for each of n times the sum Σ w bᵀ over several directions,
-    where w is a direction in the world, and b is the same direction in the body. The function is
-    `so3.wahba` without the check of `so3.wahba`: a `Model` calls this function within
-    `jax.ensure_compile_time_eval`, where `equinox.error_if` in a compiled function always raises an
-    error.
+    It is `so3.wahba` without its check: a `Model` calls it within `jax.ensure_compile_time_eval`,
+    where `equinox.error_if` in a compiled function always raises an error.
     """
     return jax.vmap(lambda one: quaternion.from_matrix(nearest_rotation(one)))(sums)
 
 
-def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times (n,), s, and the body rates (n, 3), rad/s, that the readings of a
-    `recording` show.
-
-    The rates are the readings of a gyro. Without a gyro they are computed from the turns between
-    attitudes. If the readings show no rate, n is 0.
-    """
+def rates(recording: Recording) -> Samples:
+    """Return the body rates, rad/s, that a gyro reads or that the attitudes show, if any."""
     for reading in readings_of(recording, Gyro):
-        return np.asarray(recording.t)[reading.host_mask], np.asarray(reading.values)[
-            reading.host_mask
-        ]
-    return rates_between_attitudes(*attitudes(recording))
+        mask = reading.host_mask
+        return Samples(np.asarray(recording.t)[mask], np.asarray(reading.values)[mask])
+    return mean_rates(*attitudes(recording))
 
 
 def require_turning(rates: np.ndarray, name: str) -> None:
-    """Raise `ValueError` if the body rates (n, 3), rad/s, are all zero, or so small that they are
-    round-off; the text `name` names them in the message.
-    """
+    """Raise `ValueError` if the body `rates`, rad/s, are all zero or round-off."""
     if rates.size and np.abs(rates).max() < 1e-14:
         raise ValueError(
             f"{name} are all zero: a body at rest shows nothing of its inertia, or the sensor was "
@@ -120,35 +115,26 @@ def require_turning(rates: np.ndarray, name: str) -> None:
         )
 
 
-def rates_between_attitudes(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return two things: times (m,), s; and for each of these times the mean body rate (m, 3),
-    rad/s, between two attitudes.
+def mean_rates(t: Float[np.ndarray, " n"], q: Float[np.ndarray | Array, "n 4"]) -> Samples:
+    """Return the mean body rates, rad/s, between attitudes that differ by a turn of about 0.3 rad.
 
-    The quaternions q (n, 4), body → world, are the attitudes at the times t (n,), s. The two
-    attitudes differ by a turn of about 0.3 rad. The time of a mean rate is the middle between the
-    times of the two attitudes.
+    The time of a mean rate is the middle between those of its attitudes.
     """
     if t.size < 2:
-        return np.zeros(0), np.zeros((0, 3))
-    steps = np.linalg.norm(_rotation_vectors_between(q[:-1], q[1:]), axis=1)
+        return Samples(np.zeros(0), np.zeros((0, 3)))
+    steps = np.linalg.norm(_turns(q[:-1], q[1:]), axis=1)
     turned = np.concatenate([[0.0], np.cumsum(steps)])
     first = np.arange(t.size - 1)
     last = np.searchsorted(turned, turned[first] + _TURN, side="right") - 1
     last = np.clip(np.maximum(last, first + 1), 1, t.size - 1)
     gap = t[last] - t[first]
-    turns = np.asarray(_rotation_vectors_between(q[first], q[last]))
-    return 0.5 * (t[first] + t[last]), turns / gap[:, None]
+    turns = np.asarray(_turns(q[first], q[last]))
+    return Samples(0.5 * (t[first] + t[last]), turns / gap[:, None])
 
 
 @jax.jit
-def _rotation_vectors_between(first: ArrayLike, last: ArrayLike) -> Array:
-    """Return the rotation vectors (n, 3), rad, in body axes, of the turns from n attitudes to n
-    other attitudes.
-
-    The arguments `first` and `last` (n, 4) are the attitudes before and after each turn, as
-    quaternions body → world. Each turn is the shortest one, so that the sign of a quaternion does
-    not matter.
-    """
+def _turns(first: Float[ArrayLike, "n 4"], last: Float[ArrayLike, "n 4"]) -> Float[Array, "n 3"]:
+    """Return the rotation vectors, rad, body axes, of the shortest turns between attitudes."""
 
     def turn(a: Array, b: Array) -> Array:
         return quaternion.log(quaternion.multiply(quaternion.conjugate(a), b))
@@ -157,47 +143,24 @@ def _rotation_vectors_between(first: ArrayLike, last: ArrayLike) -> Array:
 
 
 class ReferenceStates(eqx.Module):
-    """Hold the reference state of a recording.
+    """Hold the reference state of each recording: its initial state is a change of this state."""
 
-    A fit finds the initial state of the recording as a change of the reference state: the free
-    numbers of the initial state are zero at the reference state.
-
-    **Fields:**
-
-    - `state`: the reference state, of the type of the states of the model: `Spin` (body rate),
-      `Attitude` (attitude and body rate) or `Rigid` (with position and velocity, too).
-    - `rate`: the typical body rate of the motion, rad/s.
-    - `units`: (n,) for each free number of the initial state the change of the state if the number
-      is one. The whole change of the state is `units` times the free numbers.
-
-    For several recordings all arrays have a leading axis.
-    """
-
+    # A `Spin`, `Attitude` or `Rigid`.
     state: PyTree
+    # The typical body rate, rad/s.
     rate: Float[Array, "*records"]
+    # The change of the state for each parameter of the initial state that is one.
     units: Float[Array, "*records n"]
 
-    def initial_state_at(self, change: Float[Array, " n"]) -> PyTree:
-        """Return the initial state of one recording at the free numbers `change` (n,): the
-        reference state changed by `units` times `change`.
-
-        If the initial state is known, `change` is empty, and the reference state is returned.
-        """
+    def initial(self, change: Float[Array, " n"]) -> PyTree:
+        """Return the initial state at its parameters, which are empty if it is known."""
         return plus(self.state, self.units * change) if change.size else self.state
 
 
-def reference_states_of(recordings: Sequence[Recording], state_type: type) -> ReferenceStates:
-    """Return the reference state of each recording, found from its first readings.
-
-    A fit finds the initial state of a recording as a change of its reference state. The body rate
-    of each reference state is zero.
-
-    - `recordings`: R recordings; the result has a leading axis (R,).
-    - `state_type`: the type of the states: `Spin` (body rate), `Attitude` (attitude and body rate)
-      or `Rigid` (with position and velocity, too).
-    """
-    turns = [[*attitudes(r)[1], np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
-    places = [_first_motion_and_typical_length(r) for r in recordings]
+def references(recordings: Sequence[Recording], state_type: type) -> ReferenceStates:
+    """Return the reference states of recordings, found from their first readings, of rate zero."""
+    turns = [[*attitudes(r).values, np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
+    places = [_first_motion(r) for r in recordings]
     dtype = recordings[0].t.dtype
     # Use arrays: with Python floats a program would be compiled for each recording.
     x, v, length = (jnp.asarray(np.stack(part), dtype) for part in zip(*places, strict=True))
@@ -211,12 +174,10 @@ def reference_states_of(recordings: Sequence[Recording], state_type: type) -> Re
 
 
 def _typical_rate(recording: Recording) -> float:
-    """Return the typical size of the body rate in a `recording`, rad/s, or 1 if its readings show
-    no rate.
+    """Return the typical size of the body rate, rad/s, or 1 if the readings show no rate.
 
-    With a gyro the typical size is the root mean square of the length of its readings. Without a
-    gyro it is the size of the first mean rate between two attitudes. If attitudes show no rate, or
-    this rate is zero, it is the estimate of the first sensor that has a method `typical_rate`.
+    It is the root mean square of the readings of a gyro, else the size of the first mean rate
+    between attitudes, else the estimate of the first sensor that has a method `typical_rate`.
     """
     _, w = rates(recording)
     if readings_of(recording, Gyro):
@@ -224,23 +185,29 @@ def _typical_rate(recording: Recording) -> float:
     rate = float(np.linalg.norm(w[0])) if len(w) else 0.0
     # If there is no rate, take the estimate of the first sensor that can estimate a typical rate.
     for reading in recording.readings if rate == 0 else ():
-        sensor: Any = reading.sensor
-        if hasattr(sensor, "typical_rate"):
+        estimate = extras(reading.sensor).typical_rate
+        if estimate is not None:
             t, values = np.asarray(recording.t), np.asarray(reading.values)
-            rate = sensor.typical_rate(t[reading.host_mask], values[reading.host_mask])
+            rate = estimate(t[reading.host_mask], values[reading.host_mask])
             break
     return rate if rate > 0 else 1.0
 
 
-def _first_motion_and_typical_length(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return three things that the readings of a `recording` show: the first position (3,), m; the
-    first velocity (3,), m/s; and a typical length, m.
+class _Motion(NamedTuple):
+    """Hold the first motion of the centre of mass, or with markers of the body frame's origin.
 
-    Position and velocity belong to the centre of mass or, if markers take the place of a position
-    sensor, to the origin of the body frame. The typical length is the largest distance of a
-    position from the mean position. A position or velocity that no sensor shows is zero; a length
-    that no sensor shows is 1.
+    What no sensor shows is zero, the length 1.
     """
+
+    # In m, and m/s.
+    position: Float[np.ndarray, "3"]
+    velocity: Float[np.ndarray, "3"]
+    # The largest distance of a position from the mean position, m.
+    length: float
+
+
+def _first_motion(recording: Recording) -> _Motion:
+    """Return the first position and velocity that the readings show, and a typical length."""
     t, when, x = np.asarray(recording.t), np.zeros(0), np.zeros((0, 3))
     positions, markers = readings_of(recording, Position), readings_of(recording, Marker)
     ranges = readings_of(recording, Range)
@@ -248,34 +215,37 @@ def _first_motion_and_typical_length(recording: Recording) -> tuple[np.ndarray, 
     if positions:
         when, x = t[positions[0].host_mask], np.asarray(positions[0].values)[positions[0].host_mask]
     elif markers:
-        when, x = _origins_by_markers(recording, markers)
+        when, x = _origins(recording, markers)
     elif ranges:
         mask = np.all([r.host_mask for r in ranges], axis=0)
         stations = np.stack([np.asarray(r.sensor.station) for r in ranges])
         lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[mask]
-        when, x = t[mask], _positions_by_ranges(stations, lengths)
+        # For each station s the distance d obeys |x|² − 2 s·x + |s|² = d². Less the mean over the
+        # stations the equation is linear in x. A component of x that the stations do not determine,
+        # as in one plane, is taken from their mean position.
+        centre = stations.mean(axis=0)
+        s = stations - centre
+        sides = (s * s).sum(axis=1)[None] - lengths**2
+        sides = 0.5 * (sides - sides.mean(axis=1, keepdims=True))
+        when, x = t[mask], centre + np.linalg.lstsq(s, sides.T, rcond=1e-9)[0].T
     if speeds and (positions or not markers):
         v = np.asarray(speeds[0].values)[speeds[0].host_mask][0]
     else:
-        v = _first_velocity(when, x)
+        # The velocity is the slope of a straight line through the first five positions.
+        few = slice(0, max(2, min(5, when.size)))
+        v = np.polyfit(when[few] - when[0], x[few], 1)[0] if when.size > 1 else np.zeros(3)
     x = x if when.size else np.zeros((1, 3))
     # The typical length is the largest distance from the mean position, or 1 if all positions are
     # the same.
-    return x[0], v, float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
+    length = float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
+    return _Motion(x[0], v, length)
 
 
-def _origins_by_markers(
-    recording: Recording, markers: Sequence[Any]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times (n,), s, and the positions (n, 3), m, of the origin of the body frame,
-    computed from the positions of markers on the body.
+def _origins(recording: Recording, markers: Sequence[Any]) -> Samples:
+    """Return the positions, m, of the origin of the body frame, from those of markers on the body.
 
-    If no time has readings of all markers, only the first marker is used. If the attitude is
-    unknown at any of the n times, the mean position of the markers is returned in place of the
-    origin.
-
-    - `recording`: the recording, which holds the times and the readings that show the attitudes.
-    - `markers`: a sequence with the `Reading` of each marker.
+    If no time has readings of all markers, only the first one is used. If the attitude is unknown
+    at any of the times, the mean of the markers takes the place of the origin.
     """
     mask = np.all([r.host_mask for r in markers], axis=0)
     if not mask.any():
@@ -287,47 +257,15 @@ def _origins_by_markers(
     if np.isin(t, known).all():
         arms = jax.vmap(lambda turn: quaternion.rotate(turn, place))(q[np.isin(known, t)])
         x = x - np.asarray(arms)
-    return t, x
-
-
-def _first_velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the first velocity (3,), m/s, of a body from its positions x (n, 3), m, at the times t
-    (n,), s.
-
-    The velocity is the slope of the straight line that fits the first five positions (or all, if
-    there are fewer) best. It is zero for fewer than two positions.
-    """
-    few = slice(0, max(2, min(5, t.size)))
-    return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
-
-
-def _positions_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Return the positions x (n, 3), m, of a body from its distances to k stations.
-
-    For each station the equation `|x|² − 2 s·x + |s|² = d²` holds, where s is the position of the
-    station and d is the distance of the body from it. The mean of the equations of all stations is
-    subtracted from each equation, which removes |x|² and makes the equation linear in x. If the
-    stations do not determine a component of x, as with stations in one plane, the component is
-    taken from the mean position of the stations.
-
-    - `stations`: (k, 3) the positions of the stations, m.
-    - `lengths`: (n, k) the distance to each station, m, at each of n times.
-    """
-    centre = stations.mean(axis=0)
-    s = stations - centre
-    sides = (s * s).sum(axis=1)[None] - lengths**2
-    sides = 0.5 * (sides - sides.mean(axis=1, keepdims=True))
-    return centre + np.linalg.lstsq(s, sides.T, rcond=1e-9)[0].T
+    return Samples(t, x)
 
 
 def first_rates(
     records: Recording, counts: Int[Array | np.ndarray, " records"]
 ) -> Float[Array, "records 3"]:
-    """Return the first body rate (R, 3), rad/s, that the readings of each of R recordings show.
+    """Return the first body rate, rad/s, that each recording shows, or zero.
 
-    A rate is zero if the readings show no rate. The rates are zero for recordings without a gyro
-    that JAX traces. The argument `records` holds the recordings with a leading axis, and `counts`
-    (R,) the number of samples in time of each recording without padding.
+    They are zero for traced recordings without a gyro. `counts` is as for `stacking.on_host`.
     """
     for reading in readings_of(records, Gyro):
         xp: Any = np if _checks.is_known(reading) else jnp
@@ -335,13 +273,6 @@ def first_rates(
         return jnp.asarray(xp.take_along_axis(xp.asarray(reading.values), first, axis=1)[:, 0])
     if not _checks.is_known(records):
         return jnp.zeros((len(counts), 3), records.t.dtype)
-    each = [first_rate(recording) for recording in stacking.recordings_on_host(records, counts)]
-    return jnp.asarray(np.stack(each), records.t.dtype)
-
-
-def first_rate(recording: Recording) -> np.ndarray:
-    """Return the first body rate (3,), rad/s, that the readings of a `recording` show, or zero if
-    they show no rate.
-    """
-    _, w = rates(recording)
-    return w[0] if len(w) else np.zeros(3)
+    each = [rates(recording).values for recording in stacking.on_host(records, counts)]
+    first = np.stack([w[0] if len(w) else np.zeros(3) for w in each])
+    return jnp.asarray(first, records.t.dtype)

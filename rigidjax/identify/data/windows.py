@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Numbers
-from rigidjax.identify.data.recording import Reading, Recording, unchecked_recording
+from rigidjax.identify.data.recording import Reading, Recording, unchecked
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.sensors.states import StateSensor
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -52,14 +52,10 @@ class Horizons(NamedTuple):
     rms: dict[str, np.ndarray]
 
 
-def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"]) -> Horizons:
-    """Return the mean sizes of the `errors` of predictions over all windows, as functions of the
-    horizon (the number of steps from the start of a window).
+def by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"]) -> Horizons:
+    """Return the mean sizes of the error vectors over all windows, as functions of the horizon.
 
-    - `starts`: the states at the starts of the windows, with a leading axis (N,). Their type tells
-      of which parts an error vector consists: a `Spin` is a body rate, an `Attitude` an attitude
-      and a body rate, and a `Rigid` has a position and a velocity, too.
-    - `errors`: (N, L, n) the error vector for each of N windows and L steps.
+    The type of the `starts` tells of which parts an error vector consists.
     """
     by_kind = parts_by_name(jax.tree.map(lambda leaf: leaf[0], starts), errors)
     absolute = {k: np.asarray(jnp.mean(jnp.abs(v), (0, 2))) for k, v in by_kind.items()}
@@ -70,15 +66,8 @@ def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"])
 
 
 @jax.jit
-def constant_state_errors(starts: HasSpin, measured: HasSpin) -> Float[Array, "windows steps n"]:
-    """Return the errors (N, L, n) of a prediction that the state stays constant in each window.
-
-    For each of N windows and L steps the error is the state at the start of the window minus the
-    measured state, as a vector of n components.
-
-    - `starts`: the state at the start of each window, with a leading axis (N,).
-    - `measured`: the states that follow, with leading axes (N, L).
-    """
+def held_errors(starts: HasSpin, measured: HasSpin) -> Float[Array, "windows steps n"]:
+    """Return the errors, start minus measured state, of a prediction of a constant state."""
     return jax.vmap(jax.vmap(minus_small, (None, 0)))(starts, measured)
 
 
@@ -135,7 +124,7 @@ class Windows(eqx.Module):
         """
         if self.noise is not None:
             return jnp.asarray(np.repeat([self.noise[kind] for kind in leaf_names(self.starts)], 3))
-        squares = np.mean(np.asarray(constant_state_errors(self.starts, self.wanted)) ** 2, (0, 1))
+        squares = np.mean(np.asarray(held_errors(self.starts, self.wanted)) ** 2, (0, 1))
         each = np.sqrt(np.mean(squares.reshape(-1, 3), 1))
         return jnp.asarray(np.repeat(np.where(each == 0, 1.0, each), 3))
 
@@ -166,7 +155,7 @@ class Windows(eqx.Module):
             name: jnp.asarray(np.concatenate([rows, rows[:, -1:]], axis=1))
             for name, rows in inputs.items()
         }
-        return unchecked_recording(jnp.asarray(t), (reading,), inputs)
+        return unchecked(jnp.asarray(t), (reading,), inputs)
 
     def held_horizons(self) -> Horizons:
         """Return the errors of a prediction that the state stays constant in each window.
@@ -174,7 +163,7 @@ class Windows(eqx.Module):
         A model is of use only if its predictions have smaller errors than this prediction, which
         needs no model.
         """
-        return average_by_horizon(self.starts, constant_state_errors(self.starts, self.wanted))
+        return by_horizon(self.starts, held_errors(self.starts, self.wanted))
 
     @staticmethod
     def join(*parts: "Windows") -> "Windows":
@@ -264,9 +253,7 @@ def windows(
     if not isinstance(inputs, Mapping | None):
         raise TypeError(f"inputs: wanted arrays by name, got {type(inputs).__name__}")
     inputs = {k: _checks.without_mask(v, f"inputs[{k!r}]") for k, v in (inputs or {}).items()}
-    _require_finite_rows(times, states, inputs)
-    h, even = _sampling_step(times)
-    broken = np.concatenate([[0], np.cumsum(~even)])
+    step, broken = _sampling(times, states, inputs)
     begin = np.arange(before, times.size - length, stride)
     begin = begin[broken[begin + length] == broken[begin - before]]
     if not begin.size:
@@ -282,16 +269,26 @@ def windows(
     samples = {k: np.asarray(v, kind) for k, v in inputs.items()}
     kinds = leaf_names(states)
     if noise is not None:
-        noise = _checked_numbers_by_state_part(noise, kinds, "noise", _checks.positive_float)
+        noise = _by_part(noise, kinds, "noise", _checks.positive_float)
     if starts is not None:
+
+        def deviation(value: object, name: str) -> float:
+            number = _checks.python_float(value, name)
+            if not number > 0:
+                raise ValueError(
+                    f"{name}: wanted a positive deviation, or infinity for a start that is free, "
+                    f"got {number}"
+                )
+            return number
+
         if noise is None:
             raise ValueError(
                 "starts: deviations of the starts need the noise of the readings: give noise={…}, "
                 "too"
             )
-        starts = _checked_numbers_by_state_part(starts, kinds, "starts", _checked_start_deviation)
+        starts = _by_part(starts, kinds, "starts", deviation)
     return Windows(
-        round(h, 12),
+        round(step, 12),
         jax.tree.map(lambda a: jnp.asarray(a[begin]), arrays),
         jax.tree.map(lambda a: jnp.asarray(a[follow]), arrays),
         {k: jnp.asarray(v[rows_of]) for k, v in samples.items()},
@@ -301,20 +298,12 @@ def windows(
     )
 
 
-def _checked_numbers_by_state_part(
+def _by_part(
     numbers: object, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
 ) -> dict[str, float]:
-    """Return the numbers that a user gave for the parts of a state as a dict of kind → number,
-    after checks.
+    """Return the user's numbers for the `kinds` of a state as floats, after checks.
 
-    A kind is the name of a part of a state, such as `q` (attitude) or `omega` (body rate).
-
-    - `numbers`: the user's mapping of kind → number.
-    - `kinds`: the kinds that must be in the mapping. An error is raised if a kind is missing, or if
-      the mapping has another kind.
-    - `name`: the name of the argument `numbers` in an error.
-    - `check`: a function of two arguments: a number, and the name of the number in an error. It
-      returns the number or raises an error.
+    `check` raises an error for a number, whose name it gets.
     """
     by_kind = _checks.require_instance(numbers, Mapping, name, requirement="numbers by kind")
     if set(by_kind) != set(kinds):
@@ -322,32 +311,20 @@ def _checked_numbers_by_state_part(
     return {kind: float(check(by_kind[kind], f"{name}[{kind!r}]")) for kind in kinds}
 
 
-def _checked_start_deviation(value: object, name: str) -> float:
-    """Return the standard deviation of the measured start of a window as a float.
+class Sampling(NamedTuple):
+    """Hold how a record is sampled."""
 
-    A `ValueError` is raised unless it is positive or infinite. A window is a short part of a record
-    of measured states. Infinity means that the start is free, without a prior about the measured
-    state. The argument `value` is the number of the user, and `name` is the name of the number in
-    the error.
-    """
-    number = _checks.python_float(value, name)
-    if not number > 0:
-        raise ValueError(
-            f"{name}: wanted a positive deviation, or infinity for a start that is free, got "
-            f"{number}"
-        )
-    return number
+    # The median interval between successive times, s.
+    step: float
+    # How many gaps come before each time.
+    broken: Int[np.ndarray, " times"]
 
 
-def _require_finite_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) -> None:
-    """Raise `ValueError` unless states and inputs have finite numbers for each time, and the
-    quaternions of the states have length 1 to within 0.01.
+def _sampling(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) -> Sampling:
+    """Return how a record is sampled, after a check of its rows.
 
-    An input is a logged quantity such as a motor command.
-
-    - `times`: (T,) the times, s.
-    - `states`: the states with a leading axis (T,), in one `Spin`, `Attitude` or `Rigid`.
-    - `inputs`: a dict of name → samples (T, *k), each sample an array of shape k.
+    States and inputs must be finite, quaternions of length 1 to within 0.01, and the intervals
+    within a thousandth of their median, or gaps of more than 1.5 times the median.
     """
     rows = dict(zip(leaf_names(states), jax.tree.leaves(states), strict=True))
     rows |= {f"inputs[{k!r}]": v for k, v in inputs.items()}
@@ -370,16 +347,6 @@ def _require_finite_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str,
                 f"q: wanted quaternions of length 1, scalar first, got another in row {row}: "
                 f"{np.asarray(states.q)[row]}"
             )
-
-
-def _sampling_step(times: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return two things for successive `times` (T,), s: the time between two samples, s; and a mask
-    (T − 1,), false for each interval in which samples are missing.
-
-    The time between two samples is the median of the intervals between successive times. Samples
-    are missing in an interval of more than 1.5 times the median. `ValueError` is raised if any
-    other interval differs from the median by more than a thousandth of the median.
-    """
     gaps = np.diff(times)
     h = float(np.median(gaps))
     even = np.abs(gaps - h) <= 1e-3 * h
@@ -390,21 +357,16 @@ def _sampling_step(times: np.ndarray) -> tuple[float, np.ndarray]:
             f"t: wanted even times with or without gaps, got {gaps[i]:.6g} s after row {i} where "
             f"others are {h:.6g} s apart; resample first"
         )
-    return h, even
+    return Sampling(h, np.concatenate([[0], np.cumsum(~even)]))
 
 
 def require_windows(windows: PyTree) -> None:
-    """Raise an error unless `windows` is a `Windows` (parts of a record of measured states) whose
-    states are finite.
-
-    A `TypeError` is raised for another class, a `ValueError` for wrong shapes, NaN and infinity.
-    """
-    _checks.require_instance(
-        windows, Windows, "windows", requirement="what identify.windows returns"
-    )
-    for name, wanted in (("starts", 2), ("wanted", 3)):
+    """Raise an error unless `windows` is a `Windows` whose states are finite."""
+    wanted = "what identify.windows returns"
+    _checks.require_instance(windows, Windows, "windows", requirement=wanted)
+    for name, axes in (("starts", 2), ("wanted", 3)):
         for leaf in jax.tree.leaves(getattr(windows, name)):
-            if leaf.ndim != wanted or not leaf.shape[0]:
+            if leaf.ndim != axes or not leaf.shape[0]:
                 raise ValueError(
                     f"windows: wanted arrays with one row for each window in {name}, got an "
                     f"array of shape {leaf.shape}"
@@ -412,17 +374,10 @@ def require_windows(windows: PyTree) -> None:
             _checks.require_finite(leaf, f"windows: {name}")
 
 
-def describe_delays_outside_window_samples(
-    torque: PyTree, history: float, length: float
-) -> list[str]:
-    """Describe each delay that makes a torque read an input at times for which a window has no
-    samples.
+def outside_delays(torque: PyTree, history: float, length: float) -> list[str]:
+    """Describe each delay that makes a torque read an input where a window has no samples.
 
-    There is one text for each such delay. An input is a logged quantity such as a motor command.
-
-    - `torque`: the torque, a function of time, state and body, or `None`.
-    - `history`: the time before the start of a window for which inputs are known, s.
-    - `length`: the duration of a window, s.
+    The inputs are known for the time `history` before a window; both times are in s.
     """
     out = []
     for name, delay in delays_of(torque):
@@ -440,22 +395,20 @@ def describe_delays_outside_window_samples(
     return out
 
 
-def window_starts_weights_and_stretches(
-    windows: Windows, stretches: int
-) -> tuple[ReferenceStates, Float[Array, "windows m"] | None, Int[Array, " windows"]]:
-    """Return the starts of windows, their weights, and the stretch (group of neighbouring windows)
-    to which each window belongs.
+class WindowStarts(NamedTuple):
+    """Hold the starts of windows."""
 
-    Three things are returned:
+    # The measured starts; a fit finds a true start as a change of the measured one.
+    reference: ReferenceStates
+    # The unit of each parameter of a start over the standard deviation of the measured start;
+    # `None` if the measured starts are taken as exact.
+    weights: Float[Array, "windows m"] | None
+    # The index of the stretch of each window.
+    stretches: Int[Array, " windows"]
 
-    - The measured starts of the N `windows` as `ReferenceStates`. A fit finds the true start of a
-      window as a change of the measured start.
-    - The weights (N, m) of the m free numbers of each start, or `None` if the measured starts are
-      taken as exact. The weight of a free number is the change of the start if this number is one,
-      divided by the standard deviation of the measured start.
-    - The index (N,) of the stretch of each window. The windows, in their order, are divided into at
-      most `stretches` stretches.
-    """
+
+def window_starts(windows: Windows, stretches: int) -> WindowStarts:
+    """Return the starts of windows, and the stretches to which the windows belong."""
     count, scales = windows.count, np.asarray(windows.scales)
     dtype = windows.wanted.omega.dtype
     units = jnp.asarray(np.broadcast_to(scales, (count, scales.size)).astype(dtype))
@@ -465,4 +418,4 @@ def window_starts_weights_and_stretches(
     if windows.start_deviation is not None:
         wide = np.repeat([windows.start_deviation[kind] for kind in leaf_names(windows.starts)], 3)
         weight = jnp.asarray(np.broadcast_to(scales / wide, units.shape).astype(dtype))
-    return ReferenceStates(windows.starts, rate, units), weight, clusters
+    return WindowStarts(ReferenceStates(windows.starts, rate, units), weight, clusters)

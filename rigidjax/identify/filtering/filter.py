@@ -25,10 +25,10 @@ from rigidjax.identify.filtering.steps import (
     dynamics_of,
     time_correlated_torques,
 )
-from rigidjax.identify.model.model import Model, require_numbers, require_single_model
+from rigidjax.identify.model.model import Model, checked_x, require_single
 from rigidjax.identify.model.scene import Process, Scene
-from rigidjax.identify.model.terms import scene_from_row, torque_with_inputs
-from rigidjax.identify.model.walks import Drift, broadcast_to_shape, drifting_values
+from rigidjax.identify.model.terms import bound_torque, scene_at
+from rigidjax.identify.model.walks import Drift, broadcast_to, drifting_values
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.manifold import leaf_names, plus
@@ -149,7 +149,7 @@ def first_belief(
                 f"{name}: wanted the standard deviation of the initial {name}, got None; a {kind} "
                 "needs " + ", ".join(wanted)
             )
-    parts = [broadcast_to_shape(deviations[name], (3,), name) for name in wanted]
+    parts = [broadcast_to(deviations[name], (3,), name) for name in wanted]
     return belief_at(record.t[0], start, jnp.concatenate(parts), scene, model.walks)
 
 
@@ -220,7 +220,7 @@ def scene_and_recording(model: Model, x: Float[Array, " n"] | None) -> tuple[Sce
     is taken, or `None` for a model whose body is known. **Raises** `ValueError` for several
     recordings, for a missing x, and for a sensor that a filter cannot use.
     """
-    require_single_model(model)
+    require_single(model)
     if model.count != 1:
         raise ValueError(
             f"model: wanted one recording, got {model.count}; filter each by a model of its own, "
@@ -233,9 +233,9 @@ def scene_and_recording(model: Model, x: Float[Array, " n"] | None) -> tuple[Sce
                 "fit(model).x or model.start(body) makes them"
             )
         x = model.start()
-    scene = _scene_of_first_recording(model, require_numbers(model, x))
+    scene = _scene_of_first_recording(model, checked_x(model, x))
     steps.require_sensors(scene.sensors)
-    return scene, stacking.pick_records(model.records, 0)
+    return scene, stacking.pick(model.records, 0)
 
 
 @eqx.filter_jit
@@ -247,12 +247,12 @@ def _scene_of_first_recording(model: Model, x: Float[Array, " n"]) -> Scene:
     of thrust. Numbers of the scene that are free have the values of x (n,), the free numbers of the
     model.
     """
-    row = model.index.rows_of_recordings(x)[0]
-    record, reference, body_index = stacking.pick_records(
+    row = model.index.rows(x)[0]
+    record, reference, body_index = stacking.pick(
         (model.records, model.reference, model.body_indices), 0
     )
-    scene = scene_from_row(model, row, record, reference, body_index)
-    return dataclasses.replace(scene, torque=torque_with_inputs(scene, record))
+    scene = scene_at(model, row, record, reference, body_index)
+    return dataclasses.replace(scene, torque=bound_torque(scene, record))
 
 
 class Grid(NamedTuple):

@@ -20,7 +20,7 @@ from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.filtering import roots
 from rigidjax.identify.model.free import with_leaves
 from rigidjax.identify.model.model import TURN_OF_A_FILTER_STEP
-from rigidjax.identify.model.predict import drop_unneeded_mass, shift_in_time
+from rigidjax.identify.model.predict import needed_body, shifted
 from rigidjax.identify.model.scene import (
     Process,
     Scene,
@@ -220,7 +220,7 @@ def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: ExtendedState) -> Dyna
     - `x`: a state, whose dtype and type (`Spin`, `Attitude` or `Rigid`) the equations get.
     """
     dtype = x.motion.omega.dtype
-    body: Any = drop_unneeded_mass(in_precision(scene.body, dtype), type(x.motion))
+    body: Any = needed_body(in_precision(scene.body, dtype), type(x.motion))
     return Dynamics(
         eqx.tree_at(lambda s: s.body, scene, body),
         equations_of_motion(body, x.motion, in_precision(scene.torque, dtype)),
@@ -322,7 +322,7 @@ def linearise_readings(
             motion, when = y.motion, t
             offset = getattr(drifted, "offset", None)
             if offset is not None:
-                motion, when = shift_in_time(field_with_torques, t, motion, offset), t + offset
+                motion, when = shifted(field_with_torques, t, motion, offset), t + offset
             return drifted.error(
                 SensorInput(when, motion, dynamics.scene.body, field_with_torques), value
             )

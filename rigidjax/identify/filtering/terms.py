@@ -23,18 +23,18 @@ from rigidjax.identify.filtering.filter import (
 from rigidjax.identify.filtering.roots import LogDensityTerms
 from rigidjax.identify.filtering.steps import require_sensors
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.normal import normal_matrix_of_jacobians
+from rigidjax.identify.model.normal import normal_matrix
 from rigidjax.identify.model.scene import Scene
 from rigidjax.identify.model.terms import (
     BodyIndex,
-    differentiable_map_over_recordings,
-    errors_and_jacobians,
-    errors_of_scene,
-    jacobian_and_value,
+    bound_torque,
+    error_jacobians,
+    map_rows,
     prior_residuals,
-    scene_from_row,
-    standardised_errors_and_saturation,
-    torque_with_inputs,
+    scene_at,
+    scene_errors,
+    standardise,
+    value_and_jacfwd,
 )
 from rigidjax.motion.manifold import dimension
 
@@ -65,11 +65,11 @@ def log_density_terms_of_recording(
     **Returns** the `LogDensityTerms`, two arrays with an entry for each component of each reading:
     its error divided by its standard deviation; and the logarithm of 2π times its variance.
     """
-    scene = scene_from_row(model, free_numbers, record, reference, body_index)
+    scene = scene_at(model, free_numbers, record, reference, body_index)
     if scene.process is None and not model.walks:
         return _log_density_terms_of_motion(model, scene, record)
     require_sensors(scene.sensors)
-    scene = dataclasses.replace(scene, torque=torque_with_inputs(scene, record))
+    scene = dataclasses.replace(scene, torque=bound_torque(scene, record))
     start: Any = scene.start
     known = jnp.zeros(dimension(start), start.omega.dtype)
     first = belief_at(record.t[0], start, known, scene, model.walks)
@@ -98,12 +98,12 @@ def _log_density_terms_of_motion(model: Model, scene: Scene, record: Recording) 
     known: z is √(−2 log P), where P is the probability that a reading exceeds this bound, and l is
     zero.
     """
-    errors = errors_of_scene(model, scene, record)
+    errors = scene_errors(model, scene, record)
     scaled, log_variance = [], []
     for reading, sensor, error in zip(record.readings, scene.sensors, errors, strict=True):
         limit: Any = getattr(sensor, "limit", None)
         noise: Any = sensor.noise
-        one, full, wider = standardised_errors_and_saturation(
+        one, full, wider = standardise(
             reading.values, reading.mask, error, noise, limit, reading.jitter_error
         )
         scaled.append(one)
@@ -124,9 +124,7 @@ def log_density_terms_of_all_readings(model: Model, x: Float[Array, " n"]) -> Lo
     free numbers. Derivatives with respect to x are computed for one recording after another, in
     forward mode.
     """
-    return differentiable_map_over_recordings(
-        model.index.rows_of_recordings(x), model, log_density_terms_of_recording
-    )
+    return map_rows(model.index.rows(x), model, log_density_terms_of_recording)
 
 
 def log_posterior_density(model: Model, x: Float[Array, " n"]) -> Scalar:
@@ -160,16 +158,16 @@ def cost_gradient_and_information(model: Model, x: Float[Array, " n"]) -> Curvat
     reading minus its prediction), s is the variance of ν, and ∂ is the gradient with respect to x
     (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714, for the filter).
     """
-    value, slopes = errors_and_jacobians(model, x, log_density_terms_of_recording)
+    value, slopes = error_jacobians(model, x, log_density_terms_of_recording)
     # Compute dν/√s, with the innovation ν of variance s, from the derivative of ν/√s, by d(ν/√s) =
     # dν/√s − ½ ν/√s d(log s).
     moved = slopes.error + 0.5 * value.error[..., None] * slopes.log_variance
     both = jnp.concatenate([moved, 0.5**0.5 * slopes.log_variance], axis=1)
     places, size = model.index.places, model.size
-    gram = normal_matrix_of_jacobians([both[:, :, None, :]], places, size).core
+    gram = normal_matrix([both[:, :, None, :]], places, size).core
     each = jnp.einsum("rn,rni->ri", value.error, slopes.error)
     each = each + 0.5 * jnp.sum(slopes.log_variance, 1)
     slope = jnp.zeros(size + 1, x.dtype).at[places].add(each)[:-1]
-    rows, rest = jacobian_and_value(lambda x: prior_residuals(model, x), x)
+    rest, rows = value_and_jacfwd(lambda x: prior_residuals(model, x), x)
     cost = 0.5 * jnp.sum(rest**2) - value.total_log_density
     return Curvature(cost, gram + rows.T @ rows, slope + rest @ rows)

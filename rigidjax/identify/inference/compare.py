@@ -12,17 +12,17 @@ from rigidjax import _checks
 from rigidjax.identify.answer.fit import fit
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
-from rigidjax.identify.data.recording import Recording, count_numbers_read
-from rigidjax.identify.model.charts import Known, indices_of_body_numbers
+from rigidjax.identify.data.recording import Recording, numbers_read
+from rigidjax.identify.model.charts import Known, body_places
 from rigidjax.identify.model.free import with_steps
 from rigidjax.identify.model.index import build_index
-from rigidjax.identify.model.model import Model, with_replaced_fields
+from rigidjax.identify.model.model import Model, replaced
 from rigidjax.identify.model.terms import (
-    scene_at_starting_values,
-    white_errors_and_log_variances,
+    decorrelate,
+    starting_scene,
     whiten,
 )
-from rigidjax.identify.search.stages import errors_and_slopes
+from rigidjax.identify.search.stages import blocks_at
 
 
 class Comparison(eqx.Module):
@@ -69,7 +69,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     if not fits:
         raise ValueError("compare: wanted at least one fit, got none")
     readings = {name: one.model.records.readings for name, one in fits.items()}
-    counts = {name: tuple(map(count_numbers_read, of_fit)) for name, of_fit in readings.items()}
+    counts = {name: tuple(map(numbers_read, of_fit)) for name, of_fit in readings.items()}
     if len(set(counts.values())) > 1:
         raise ValueError(f"compare: wanted fits of the same readings, got {counts}")
     shortest = max(min(one.correlation for one in fits.values()), 1.0)
@@ -101,14 +101,14 @@ def _log_mean_square_errors(fit: Fit) -> np.ndarray:
     sensor.
     """
     out, model = 2.0 * np.log(np.maximum(fit.rms, 1e-300)), fit.model
-    errors, _ = errors_and_slopes(model, fit.x)
+    errors, _ = blocks_at(model, fit.x)
     white = whiten(model, errors, fit.noises)
     for index, (reading, e, sigma) in enumerate(
         zip(model.records.readings, white, fit.noises, strict=True)
     ):
         if reading.jitter_error is not None:
             jitter_error = reading.jitter_error / sigma[:, None]
-            _, log_variances = white_errors_and_log_variances(e, jitter_error)
+            _, log_variances = decorrelate(e, jitter_error)
             wider = np.asarray(log_variances)[reading.host_mask]
             squares = np.sum(np.asarray(e * sigma[:, None])[reading.host_mask] ** 2, axis=-1)
             out[index] = np.log(squares.mean()) + wider.mean()
@@ -166,10 +166,8 @@ def _fix_shared_numbers(model: Model, fit_of_others: Fit) -> Model:
     for slot, fitted in zip(model.slots, fit_of_others.model.slots, strict=True):
         if slot.shared is not None and fitted.shared is not None:
             x = x.at[slot.shared].set(fit_of_others.x[fitted.shared])
-    record = stacking.pick_records(model.records, 0)
-    scene = with_steps(
-        scene_at_starting_values(model, record), model.slots, model.index.rows_of_recordings(x)[0]
-    )
+    record = stacking.pick(model.records, 0)
+    scene = with_steps(starting_scene(model, record), model.slots, model.index.rows(x)[0])
     sensors = jax.tree.map(lambda leaf: leaf[None] if eqx.is_array(leaf) else leaf, scene.sensors)
     own = [
         slot if slot.each else dataclasses.replace(slot, each=True, prior=slot.spread, spread=None)
@@ -178,11 +176,9 @@ def _fix_shared_numbers(model: Model, fit_of_others: Fit) -> Model:
     ]
     chart = Known(fit_of_others.body)
     kinds = model.index.start.shape[1] // 3
-    index, slots = build_index(
-        indices_of_body_numbers(chart, None, model.count), chart.size, own, kinds
-    )
+    index, slots = build_index(body_places(chart, None, model.count), chart.size, own, kinds)
     records = eqx.tree_at(
         lambda r: [reading.sensor for reading in r.readings], model.records, list(sensors)
     )
     parts = dict(chart=chart, torque=scene.torque, records=records, slots=slots, index=index)
-    return with_replaced_fields(model, **parts)
+    return replaced(model, **parts)

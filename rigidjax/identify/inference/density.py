@@ -16,19 +16,19 @@ from rigidjax._types import Scalar
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.filtering.terms import log_posterior_density
-from rigidjax.identify.model.charts import indices_of_body_numbers
+from rigidjax.identify.model.charts import body_places
 from rigidjax.identify.model.free import Slot
 from rigidjax.identify.model.index import build_index
 from rigidjax.identify.model.model import (
     Model,
     Unpacked,
-    filter_steps_per_interval,
+    interval_steps,
+    replaced,
     scenes_of,
-    unpack_numbers,
-    with_replaced_fields,
+    unpack_at,
 )
 from rigidjax.identify.model.scene import Process, Scene, require_unknown_torque
-from rigidjax.identify.model.terms import Noise, scene_at_starting_values
+from rigidjax.identify.model.terms import Noise, starting_scene
 from rigidjax.identify.uncertainty.covariance import white_covariance
 from rigidjax.motion.torques.composite import parts_of
 
@@ -158,9 +158,9 @@ class LogDensity(eqx.Module):
         (standard deviations (R, k) for R recordings and k components), and the process.
         """
         x = _checks.array_of_shape(x, self.x0.shape, "x")
-        scenes, point = scenes_of(self.model, x), unpack_numbers(self.model, x)
+        scenes, point = scenes_of(self.model, x), unpack_at(self.model, x)
         noise: Any = tuple(sensor.noise for sensor in scenes.sensors)
-        process = stacking.pick_records(scenes.process, 0)
+        process = stacking.pick(scenes.process, 0)
         return dataclasses.replace(point, noise=noise, process=process)
 
 
@@ -262,7 +262,7 @@ def _path_of_picked_leaf(model: Model, where: Callable[[Scene], Any]) -> tuple[A
     picks a leaf of it, such as `lambda s: s.sensors[0].noise`. The leaf may be `None`, such as the
     noise of a sensor if it is unknown.
     """
-    scene = scene_at_starting_values(model, model.records)
+    scene = starting_scene(model, model.records)
     marked = eqx.tree_at(where, scene, 0.0, is_leaf=lambda node: node is None)
     pairs = jax.tree.leaves_with_path(eqx.tree_at(where, marked, _MARK))
     return next(path for path, leaf in pairs if leaf is _MARK)
@@ -289,7 +289,7 @@ def _add_free_numbers_and_reindex(
     The additional numbers come before the numbers that belong to one recording alone, which
     therefore get other indices.
     """
-    bodies = indices_of_body_numbers(model.chart, model.body_indices, model.count)
+    bodies = body_places(model.chart, model.body_indices, model.count)
     kinds = model.index.start.shape[1] // 3
     every = [*model.slots, *slots]
     index, placed = build_index(bodies, model.index.bodies, every, kinds)
@@ -305,8 +305,8 @@ def _add_free_numbers_and_reindex(
         list(noises),
         is_leaf=lambda node: node is None,
     )
-    steps = model.filter_steps if process is None else filter_steps_per_interval(model)
-    new_model = with_replaced_fields(
+    steps = model.filter_steps if process is None else interval_steps(model)
+    new_model = replaced(
         model, records=records, process=process, slots=placed, index=index, filter_steps=steps
     )
     return new_model, places

@@ -12,12 +12,12 @@ from jaxtyping import Array, Float, PyTree
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3, Vector
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.identify.model.model import Model, require_numbers, require_single_model
-from rigidjax.identify.model.normal import normal_matrix_of_jacobians
+from rigidjax.identify.model.model import Model, checked_x, require_single
+from rigidjax.identify.model.normal import normal_matrix
 from rigidjax.identify.model.terms import (
-    error_derivatives_by_delay,
-    errors_and_jacobians,
-    standardised_error_changes,
+    delay_slopes,
+    error_jacobians,
+    scaled_slopes,
 )
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.covariance import covariance_root
@@ -90,14 +90,14 @@ def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
     """
     sensors = model.records.sensors
     noises: list[Any] = [sensor.noise for sensor in sensors]
-    _, slopes = errors_and_jacobians(model, x)
+    _, slopes = error_jacobians(model, x)
     rows = []
     for index, (sensor, noise, block) in enumerate(zip(sensors, noises, slopes, strict=True)):
         jitter, late = getattr(sensor, "jitter", None), None
         if jitter is not None:
-            late = jitter.deviation[:, None, None] * error_derivatives_by_delay(model, x)[index]
-        rows.append(standardised_error_changes(block, noise, late))
-    return normal_matrix_of_jacobians(rows, model.index.places, model.size).core
+            late = jitter.deviation[:, None, None] * delay_slopes(model, x)[index]
+        rows.append(scaled_slopes(block, noise, late))
+    return normal_matrix(rows, model.index.places, model.size).core
 
 
 def _require_known_noise(model: Model, x: Float[Array, " n"]) -> None:
@@ -105,7 +105,7 @@ def _require_known_noise(model: Model, x: Float[Array, " n"]) -> None:
 
     It is also raised unless x is a vector (n,) of the free numbers of the `model`.
     """
-    require_numbers(model, x)
+    checked_x(model, x)
     for sensor in model.records.sensors:
         if sensor.noise is None:
             raise ValueError(
@@ -153,7 +153,7 @@ def best_first_rate(
     **Returns** the rate (3,), and the result of `expected_quantities` for this rate. **Raises** the
     errors of `fisher`.
     """
-    require_single_model(model)
+    require_single(model)
     max_steps = _checks.integer(max_steps, "max_steps", 1)
     _require_not_traced(model, (body, omega))
     _require_known_noise(model, model.start(body, omega))

@@ -24,9 +24,9 @@ from rigidjax.identify.filtering.terms import cost_gradient_and_information
 from rigidjax.identify.inference.density import LogDensity, map_draws
 from rigidjax.identify.model.model import Unpacked
 from rigidjax.identify.model.normal import NormalMatrix
-from rigidjax.identify.model.terms import jacobian_and_value
+from rigidjax.identify.model.terms import value_and_jacfwd
 from rigidjax.identify.search.least_squares import Settings, minimise
-from rigidjax.identify.search.stages import order_one_indicator
+from rigidjax.identify.search.stages import of_order_one
 from rigidjax.identify.uncertainty.quantities import interval_about
 from rigidjax.motion.torques.composite import parts_of
 
@@ -393,7 +393,7 @@ class Refit(eqx.Module):
         def function_of_numbers(x: Array) -> Array:
             return _checks.differentiable_array(function(self.density.unpack(x)), "function(point)")
 
-        slope, centre = map(np.asarray, jacobian_and_value(function_of_numbers, self.x))
+        centre, slope = map(np.asarray, value_and_jacfwd(function_of_numbers, self.x))
         null, reach = np.zeros((0, self.x.size)), NormalDist().inv_cdf(0.5 + 0.5 * level)
         return interval_about(centre, slope, np.asarray(self.covariance), null, reach)
 
@@ -463,7 +463,7 @@ def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: in
         cost, gram, slope = cost_gradient_and_information(density.model, x)
         return None, cost, NormalMatrix(gram), slope
 
-    order_one = order_one_indicator(density.model, density.x0.dtype)
+    order_one = of_order_one(density.model, density.x0.dtype)
     end = minimise(evaluate, density.x0, order_one, settings, None)
     covariance = jnp.linalg.inv(end.normal.core)
     draws, weights = _weighted_draws(density, end.point, covariance, key, count)

@@ -13,13 +13,13 @@ from rigidjax.identify.answer.result import Fit, require_one_fit
 from rigidjax.identify.data.windows import (
     Horizons,
     Windows,
-    average_by_horizon,
+    by_horizon,
     require_windows,
-    window_starts_weights_and_stretches,
+    window_starts,
 )
-from rigidjax.identify.model.charts import indices_of_body_numbers
+from rigidjax.identify.model.charts import body_places
 from rigidjax.identify.model.index import build_index
-from rigidjax.identify.model.model import Model, require_inputs_of_windows, with_replaced_fields
+from rigidjax.identify.model.model import Model, replaced, require_inputs
 from rigidjax.identify.model.terms import all_errors
 
 
@@ -61,10 +61,10 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
             "value for each window, which other windows do not have"
         )
     _checks.require_instance(windows.starts, type(model.reference.state), "windows.starts")
-    require_inputs_of_windows(model.torque, windows)
+    require_inputs(model.torque, windows)
     model_on_windows, x = _model_on_windows(model, fit.x, windows)
     errors = _errors_by_sensor(model_on_windows, x)[0]
-    return average_by_horizon(windows.starts, errors[:, 1:])
+    return by_horizon(windows.starts, errors[:, 1:])
 
 
 def _model_on_windows(
@@ -79,9 +79,9 @@ def _model_on_windows(
     **Arguments:** `model` the fitted model of windows; `x` (n,) its free numbers at the best point;
     `windows` the other windows.
     """
-    reference, _, clusters = window_starts_weights_and_stretches(windows, 1)
+    reference, _, clusters = window_starts(windows, 1)
     body_indices = None
-    bodies = indices_of_body_numbers(model.chart, body_indices, windows.count)
+    bodies = body_places(model.chart, body_indices, windows.count)
     index, slots = build_index(bodies, model.index.bodies, model.slots, 0)
     parts = dict(
         records=windows.records(),
@@ -94,7 +94,7 @@ def _model_on_windows(
         clusters=clusters,
         noise_groups=jnp.zeros(windows.count, jnp.int32),
     )
-    return with_replaced_fields(model, **parts), x[: index.size]
+    return replaced(model, **parts), x[: index.size]
 
 
 @eqx.filter_jit

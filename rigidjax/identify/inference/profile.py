@@ -12,7 +12,7 @@ from rigidjax._types import Scalar
 from rigidjax.identify.answer.result import Fit, require_one_fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.model.model import AbstractPull, Model
-from rigidjax.identify.search.stages import Attempt, Task, cost_of, search_whole_records
+from rigidjax.identify.search.stages import Attempt, Task, cost_of, search_whole
 from rigidjax.identify.uncertainty import quantities
 from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
 
@@ -80,7 +80,7 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     wide = np.log(1e3) if quantity.positive else 1e3 * max(abs(middle), 1e-12)
     if not np.isfinite(deviation) or deviation <= 0:
         deviation = wide / 10
-    model, kind = stacking.pad_to_few_lengths(fit.model), fit.model.records.t.dtype
+    model, kind = stacking.pad_to_few(fit.model), fit.model.records.t.dtype
     bottom = 2.0 * cost_of(model, fit.x, fit.noises)
     shares = max(fit.correlation, 1.0)
     ends = []
@@ -99,9 +99,7 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
             pulled_model = eqx.tree_at(
                 lambda m: m.pull, model, pull, is_leaf=lambda node: node is None
             )
-            point = search_whole_records(
-                Attempt(point), Task(pulled_model, fit.noises, 1e-4, 100)
-            ).x
+            point = search_whole(Attempt(point), Task(pulled_model, fit.noises, 1e-4, 100)).x
             grown = (2.0 * cost_of(model, point, fit.noises) - bottom) / shares - reach**2
             return grown, float(_value(model, point)[index])
 

@@ -167,13 +167,9 @@ class PrincipalRatios(AbstractBodyChart):
         return jnp.log(i[:2] / i[2])
 
 
-def _checked_typical_moment(value: object) -> Array:
-    """Return the argument `typical` of a chart as an array of shape (): the rough size of the
-    moments of inertia, kg m², from which a fit starts.
-
-    It raises `ValueError` unless the number `value` is positive. It raises `TypeError` if `value`
-    is a body, since a user gives a known body as `Known(body)`, and a first guess by
-    `model.start(body)`.
+def _typical(value: object) -> Array:
+    """Return the argument `typical` of a chart as an array, after checks: it is easily taken for a
+    body.
     """
     if isinstance(value, Inertia | MassProperties):
         raise TypeError(
@@ -200,7 +196,7 @@ class Tensor(AbstractBodyChart):
     Array(0.001, dtype=float64)
     """
 
-    typical: Float[Array, ""] = eqx.field(converter=_checked_typical_moment, default=1.0)
+    typical: Float[Array, ""] = eqx.field(converter=_typical, default=1.0)
     size: ClassVar[int] = 6
     log_names: ClassVar[tuple[str, ...]] = ("I1", "I2", "I3")
     plain_names: ClassVar[tuple[str, ...]] = ("Ixx", "Iyy", "Izz", "Iyz", "Ixz", "Ixy")
@@ -238,7 +234,7 @@ class Principal(AbstractBodyChart):
     Array(2., dtype=float64)
     """
 
-    typical: Float[Array, ""] = eqx.field(converter=_checked_typical_moment, default=1.0)
+    typical: Float[Array, ""] = eqx.field(converter=_typical, default=1.0)
     size: ClassVar[int] = 3
     log_names: ClassVar[tuple[str, ...]] = ("Ix", "Iy", "Iz")
     unit: ClassVar[str] = "kg m²"
@@ -307,22 +303,14 @@ class Mass(AbstractBodyChart):
 
     @property
     def _free_indices(self) -> list[int]:
-        """Return the sorted indices of the free numbers among the ten numbers of a body.
-
-        `rigidjax.body.parameters.pack` makes the ten numbers of mass (index 0), inertia (1 to 6)
-        and centre of mass (7 to 9). The free numbers are those that a fit may move.
+        """Return the sorted indices of the free numbers among the ten of
+        `rigidjax.body.parameters.pack`.
         """
         return sorted(place for name in self.free for place in _PARTS[name])
 
     @property
     def _body_length(self) -> Array:
-        """Return the size of the body of the guess (the roughly known body of this chart), m, as an
-        array of shape ().
-
-        It is the square root of the trace of 𝔖 / M, where 𝔖 is the matrix of second moments about
-        the centre of mass and M the mass. The free numbers of the centre of mass are in units of
-        this size.
-        """
+        """Return √(tr 𝔖 / M) of the guess, m, the unit of the numbers of the centre of mass."""
         return jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
 
     def body(self, vector: Numbers) -> MassProperties:
@@ -387,31 +375,22 @@ class Known(AbstractBodyChart):
 def _pad_with_zeros(
     x: Float[Array, "*rows n"], leading: int, trailing: int
 ) -> Float[Array, "*rows m"]:
-    """Return the array x (…, n) with `leading` zeros before and `trailing` zeros after its n
-    numbers, along the last axis.
-    """
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(leading, trailing)])
 
 
 class Bodies(eqx.Module):
-    """Hold the charts of several bodies. A chart maps unconstrained numbers to a body.
+    """Hold the charts of several bodies; a vector holds the parameters of one body after the other.
 
-    The vector of the numbers of all bodies holds the numbers of one body after the other. Charts
-    are of one form if they have the same structure and their arrays have the same shapes. All
-    charts of one form are stacked in one chart, so that one compiled program serves the recordings
-    of all bodies.
-
-    **Fields:**
-
-    - `names`, `charts`: the names and the charts of the bodies.
-    - `kinds`: the stacked charts, one for each form.
-    - `kind_of`: for each body the index of its form in `kinds`.
-    - `row_of`: for each body the index of its chart in the stacked chart.
+    Charts are of one kind if they have the same structure and their arrays the same shapes. All
+    charts of one kind are stacked in one chart, so that one program serves the recordings of all
+    bodies.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
     charts: tuple[AbstractBodyChart, ...]
+    # The stacked charts, one for each kind.
     kinds: tuple[AbstractBodyChart, ...]
+    # For each body the index of its kind, and of its chart in the stacked chart.
     kind_of: tuple[int, ...] = eqx.field(static=True)
     row_of: tuple[int, ...] = eqx.field(static=True)
 
@@ -438,24 +417,17 @@ class Bodies(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return how many free numbers describe the bodies of all charts together."""
         return sum(chart.size for chart in self.charts)
 
-    def all_bodies_by_name(
-        self, vector: Float[Array, " numbers"]
-    ) -> dict[str, Inertia | MassProperties]:
-        """Return all bodies as a dict of name → body, from the numbers `vector` (size,) of all
-        bodies, which holds the numbers of one body after the other.
-        """
-        rows = zip(self.names, self.charts, numbers_of_each_body(self, vector), strict=True)
-        return {name: body_with_scale_mark(chart, numbers) for name, chart, numbers in rows}
+    def by_name(self, vector: Float[Array, " numbers"]) -> dict[str, Inertia | MassProperties]:
+        """Return all bodies by name, from the parameters of all of them."""
+        rows = zip(self.names, self.charts, split_numbers(self, vector), strict=True)
+        return {name: marked_body(chart, numbers) for name, chart, numbers in rows}
 
     def body(self, vector: Numbers, body_index: Int[Array, ""]) -> Inertia | MassProperties:
-        """Return one of the bodies, from its numbers in its chart.
+        """Return one of the bodies, whose index in `names` may be traced.
 
-        - `vector`: the numbers of this body, followed by further numbers if another chart has more;
-          the further numbers are not read.
-        - `body_index`: the index of the body among `names`, which may be traced by JAX.
+        Its parameters in `vector` may be followed by others, which are not read.
         """
         kind, row = jnp.asarray(self.kind_of)[body_index], jnp.asarray(self.row_of)[body_index]
         chosen: Any = None
@@ -475,12 +447,11 @@ class Bodies(eqx.Module):
         return chosen
 
 
-def body_with_scale_mark(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
-    """Return the body that the numbers `vector` represent in a `chart`. An `Inertia` that the chart
-    finds only up to a factor gets the mark `scale="arbitrary"`, with which a torque on this body is
-    refused.
+def marked_body(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
+    """Return the body that `vector` represents, marked `scale="arbitrary"` if the chart finds no
+    scale.
 
-    The mark comes from the member `scale` of the chart. Inside a fit bodies have no such mark.
+    Inside a fit bodies have no such mark, with which a torque is refused.
     """
     body = chart.body(vector)
     if chart.scale is None or isinstance(body, MassProperties):
@@ -488,39 +459,28 @@ def body_with_scale_mark(chart: AbstractBodyChart, vector: Numbers) -> Inertia |
     return Inertia(body.tensor, chart.scale)
 
 
-def indices_of_body_numbers(
+def body_places(
     chart: AbstractBodyChart | Bodies,
     body_indices: Int[Array, " records"] | None,
     recording_count: int,
 ) -> Int[np.ndarray, "records numbers"]:
-    """Return, for each of R recordings, the indices of the numbers that describe its body among the
-    numbers of all bodies, as an array (R, K).
+    """Return the places of the parameters of each recording's body among those of all bodies.
 
-    A chart is a map from numbers to a possible body, and K is how many numbers the largest chart
-    has. The row of a body with fewer numbers is filled up with −1.
-
-    - `chart`: the chart of one body, or the charts of several bodies.
-    - `body_indices`: (R,) the index of the body of each of R recordings, or `None` for one body.
-    - `recording_count`: R, the number of recordings.
+    The row of a body with fewer parameters than another is filled up with −1.
     """
     if not isinstance(chart, Bodies):
         return np.broadcast_to(np.arange(chart.size), (recording_count, chart.size))
     widest = max(one.size for one in chart.charts)
-    parts = numbers_of_each_body(chart, np.arange(chart.size))
+    parts = split_numbers(chart, np.arange(chart.size))
     rows = [np.pad(part, (0, widest - part.size), constant_values=-1) for part in parts]
     return np.stack(rows)[np.asarray(body_indices)]
 
 
-def body_of_recording(
+def body_at(
     chart: AbstractBodyChart | Bodies, vector: Numbers, body_index: Int[Array, ""] | None
 ) -> Inertia | MassProperties:
-    """Return the body of one recording, from the free numbers of this recording.
-
-    A chart is a map from free numbers to a possible body.
-
-    - `chart`: the chart of one body, or the charts of several bodies.
-    - `vector`: the free numbers of the recording; the numbers of its body come first.
-    - `body_index`: the index of the body among several bodies, or `None` for one body.
+    """Return the body of one recording from its row, in which the parameters of the body come
+    first.
     """
     if not isinstance(chart, Bodies):
         return chart.body(vector[: chart.size])
@@ -529,36 +489,22 @@ def body_of_recording(
 
 
 def chart_list(chart: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...]:
-    """Return a tuple of the charts of all bodies, where a chart is a map from free numbers to a
-    possible body: the `chart` itself if there is one body, or the charts in a `Bodies` of several
-    bodies.
-    """
+    """Return the charts of all bodies."""
     return chart.charts if isinstance(chart, Bodies) else (chart,)
 
 
-def numbers_of_each_body(
-    chart: AbstractBodyChart | Bodies, vector: Array | np.ndarray
-) -> list[Any]:
-    """Return a list with the free numbers that describe each body. They are parts of `vector`,
-    which holds the numbers of one body after the other.
-
-    `chart` is the chart of one body, or the charts of several bodies; it says how many numbers
-    describe each body. A chart is a map from free numbers to a possible body.
-    """
+def split_numbers(chart: AbstractBodyChart | Bodies, vector: Array | np.ndarray) -> list[Any]:
+    """Return the parts of `vector` that describe each body."""
     sizes = [one.size for one in chart_list(chart)]
     return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
 
 
-def bodies_as_list(bodies: Inertia | MassProperties | dict[str, Any]) -> list[Any]:
-    """Return the result of `Model.bodies`, which is one body or a dict of several bodies, as a list
-    of bodies.
-    """
+def body_list(bodies: Inertia | MassProperties | dict[str, Any]) -> list[Any]:
+    """Return the result of `Model.bodies` as a list."""
     return list(bodies.values()) if isinstance(bodies, dict) else [bodies]
 
 
 def has_mass(chart: AbstractBodyChart) -> bool:
-    """Return whether a `chart` (a map from free numbers to a possible body) makes bodies with a
-    mass, `MassProperties`, not only an `Inertia`.
-    """
+    """Return whether a `chart` makes `MassProperties`, not only an `Inertia`."""
     sample: Any = eqx.filter_eval_shape(chart.body, jnp.zeros(chart.size))
     return isinstance(sample, MassProperties)

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import Scalar
 from rigidjax.identify.model.scene import Scene
+from rigidjax.identify.sensors.base import extras
 
 
 class Free(eqx.Module):
@@ -93,11 +93,9 @@ class Free(eqx.Module):
 
 
 def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
-    """Return, after checks, the argument `each` of a `Free` (number that a fit may move). It says
-    which recordings share a value of the number.
+    """Return the argument `each` of a `Free` after checks, a sequence of labels as a tuple.
 
-    `True`, `False` and `"body"` are returned as they are, and a sequence of labels (one for each
-    recording) as a tuple. Another `each` raises an error, in which the argument is called `name`.
+    `name` is the argument's name in an error.
     """
     if isinstance(each, bool):
         return each
@@ -108,99 +106,67 @@ def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
 
 
 class Slot(eqx.Module):
-    """Hold a `Free` (a number or an array that a fit may move) together with its place in the
-    scene.
+    """Hold a `Free` together with the place of its leaf in a `Scene`.
 
-    The scene is the body, torques, sensors and initial state of a recording. It is a JAX tree, and
-    the number or array is a leaf of this tree.
-
-    A `Slot` contains no function: a `Free` contains the function `where`, and a new function in a
-    second model would force a new compilation. A *step* is the change of the leaf (of its
-    logarithm, if `positive` is true) in units of `scale`.
-
-    **Fields:**
-
-    - `path`: the path of the leaf in the scene.
-    - `name`, `unit`, `positive`, `scale`: the arguments of the `Free` with these names.
-    - `each`: whether each recording has a value of its own.
-    - `shape`: the shape of a step, which is the shape of the leaf or broadcasts to the shape of the
-      leaf.
-    - `labels`: the labels of the groups of recordings that share a value.
-    - `groups`: (R,) the index of the group of each of R recordings; `None` if all recordings share
-      one value, or each recording has a value of its own.
-    - `prior`, `spread`: the standard deviations `prior` and `spread` of the `Free`, in units of
-      `scale`, or `None`.
-    - `estimated`: whether the fit estimates the `spread`.
-    - `column`: the index of the first step among the free numbers on which one recording depends.
-    - `shared`: (groups, *shape) the indices, among all free numbers, of the steps that recordings
-      share; `None` if no recordings share a step.
-    - `own`: (R, *shape) the indices, among all free numbers, of the steps that each recording has
-      alone. Such a step is the change of the recording's own value, or the deviation from the
-      shared step. `None` if all steps are shared.
+    It contains no function: a new `where` in a second model would force a new compilation. A *step*
+    is the change of the leaf (of its logarithm, if `positive`) in units of `scale`.
     """
 
     path: tuple[Any, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
     unit: str = eqx.field(static=True)
+    # Whether each recording has a value of its own.
     each: bool = eqx.field(static=True)
     positive: bool = eqx.field(static=True)
+    # The shape of a step, which is the shape of the leaf or broadcasts to it.
     shape: tuple[int, ...] = eqx.field(static=True)
     labels: tuple[str, ...] = eqx.field(static=True)
+    # The group of each recording; `None` if all share one value, or each has its own.
     groups: Int[Array, " records"] | None
     scale: Float[Array, ""]
+    # These are standard deviations in units of `scale`.
     prior: Float[Array, ""] | None
     spread: Float[Array, ""] | None
+    # Whether the fit estimates the spread.
     estimated: bool = eqx.field(static=True, default=False)
+    # The first column of the step in the row of a recording.
     column: int = eqx.field(static=True, default=0)
+    # The places in x of the steps that recordings share, or `None`.
     shared: Int[Array, "groups *shape"] | None = None
+    # The places in x of the steps that each recording has alone, or `None`: steps of its own value,
+    # or deviations from the shared step.
     own: Int[Array, "records *shape"] | None = None
 
     @property
-    def columns_in_row(self) -> slice:
-        """Return a slice that picks the steps of this slot from the free numbers of one recording.
-
-        A slot describes an array of the scene that a fit may move. A step is the change of one
-        number of this array, in units of `scale`.
-        """
+    def columns(self) -> slice:
+        """Return a slice that picks the step of this slot from the row of a recording."""
         return slice(self.column, self.column + int(np.prod(self.shape, dtype=int)))
 
-    def moved_value(self, start: Array, step: Array) -> Array:
-        """Return the value of the leaf (the free array of the scene) after a change by `step` from
-        the value `start`.
-
-        `step` is in units of `scale`. For a `positive` leaf it changes the logarithm of the value.
-        `step` has the shape of `start`, or a shape that broadcasts to it.
-        """
+    def moved(self, start: Array, step: Array) -> Array:
+        """Return the value of the leaf after a `step` from its value `start`."""
         if self.positive:
             return start * jnp.exp(step * self.scale)
         return start + step * self.scale
 
-    def step_between(self, start: Array, value: Array) -> Array:
-        """Return the change of the leaf (the free array of the scene) from the value `start` to the
-        value `value`, in units of `scale`.
-
-        For a `positive` leaf it is the change of the logarithm. This function is the inverse of
-        `moved_value`.
-        """
+    def step(self, start: Array, value: Array) -> Array:
+        """Return the step from the value `start` to `value`; it inverts `moved`."""
         if self.positive:
             return jnp.log(value / start) / self.scale
         return (value - start) / self.scale
 
 
-def group_of_each_recording(
-    each: str | tuple[Any, ...], body_names: Sequence[str], name: str
-) -> tuple[Int[Array, " records"], tuple[str, ...]]:
-    """Return two things: the index (R,) of the group of each of R recordings; and the labels of the
-    groups.
+class Groups(NamedTuple):
+    """Hold the groups of recordings that share the value of a parameter."""
 
-    The recordings of a group share the value of a free number. The index of a group is the index of
-    its label among the labels of the groups.
+    # The index of the group of each recording among the labels.
+    indices: Int[Array, " records"]
+    labels: tuple[str, ...]
 
-    - `each`: a tuple (R,) of labels, one for each recording: recordings with the same label are a
-      group. The text `"body"` makes a group of the recordings of each body.
-    - `body_names`: (R,) the name of the body of each recording.
-    - `name`: what the object with the labels is called in an error, which is raised unless there
-      are R labels.
+
+def group_recordings(each: str | tuple[Any, ...], body_names: Sequence[str], name: str) -> Groups:
+    """Return the groups of recordings with the same label, or of the same body for `"body"`.
+
+    `name` is what has the labels in an error.
     """
     row = list(body_names) if isinstance(each, str) else list(each)
     if len(row) != len(body_names):
@@ -209,24 +175,28 @@ def group_of_each_recording(
         )
     labels = list(dict.fromkeys(map(str, row)))
     rows = [labels.index(str(label)) for label in row]
-    return jnp.asarray(rows, jnp.int32), tuple(labels)
+    return Groups(jnp.asarray(rows, jnp.int32), tuple(labels))
+
+
+# This maps the name of a number in the scene to its unit. A bias is not in this dict: its unit is
+# the unit of its sensor.
+_UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place": "m"}
+# This maps the name of a member of a sensor to the name of the tolerance from a data sheet that
+# limits this member.
+TOLERANCES = {"scale": "scale", "skew": "cross_axis", "bias": "bias", "offset": "clock"}
 
 
 def find_slots(free: Sequence[Free], scene: Scene, body_names: Sequence[str]) -> list[Slot]:
-    """Return a `Slot` for each `Free` (number that a fit may move): the `Free` together with the
-    path of its array in a `scene`, which is the body, torques, sensors and initial state of a
-    recording.
+    """Return a `Slot` for each `Free`, without places among the parameters.
 
-    `body_names` (R,) holds the name of the body of each of R recordings. An error is raised if a
-    `Free` picks no numbers, if it picks the numbers of another `Free`, or if it has the name of
-    another `Free`.
+    An error is raised if a `Free` picks no numbers, or the numbers or the name of another one.
     """
     slots: list[Slot] = []
     for item in free:
         _checks.require_instance(item, Free, "free", requirement="Free(where, name)")
         here = f"Free {item.name!r}"
         path, value = leaf_at(item.where, scene, here, "it")
-        if any(share_numbers(slot.path, path) for slot in slots):
+        if any(overlap(slot.path, path) for slot in slots):
             raise ValueError(
                 f"{here}: another Free already frees the same numbers; give each array one Free"
             )
@@ -241,14 +211,26 @@ def find_slots(free: Sequence[Free], scene: Scene, body_names: Sequence[str]) ->
                 f"{len(body_names)}; give the spread as a number"
             )
         spread = item.scale if isinstance(item.spread, str) else item.spread
-        prior = _tolerance_of_sensor(scene, path) if item.prior is None else item.prior
+        way, prior = split_path(path).leaf, item.prior
+        if prior is None and len(way) == 3 and getattr(way[0], "name", "") == "sensors":
+            # What the sensor's data sheet states for the number is its prior.
+            tolerance = extras(scene.sensors[way[1].idx]).tolerance
+            prior = getattr(tolerance, TOLERANCES.get(way[2].name, ""), None)
         prior, spread = (
             None if x is None else jnp.asarray(x / item.scale) for x in (prior, spread)
         )
         groups, labels = None, ()
         if not isinstance(item.each, bool):
-            groups, labels = group_of_each_recording(item.each, body_names, here)
-        unit = _unit_implied_by_name(scene, path) if item.unit is None else item.unit
+            groups, labels = group_recordings(item.each, body_names, here)
+        unit = item.unit
+        if unit is None:
+            name = getattr(way[-1], "name", "")
+            unit = _UNITS.get(name, "")
+            if name == "bias":
+                holder: Any = scene
+                for key in way[:-1]:
+                    holder = getattr(holder, key.name) if hasattr(key, "name") else holder[key.idx]
+                unit = getattr(holder, "unit", "")
         slots.append(
             Slot(
                 path,
@@ -269,16 +251,31 @@ def find_slots(free: Sequence[Free], scene: Scene, body_names: Sequence[str]) ->
 
 
 class Entries(NamedTuple):
-    """Hold the last key of a path that leads to some entries of an array: their `places` in the
-    array as one row, and the `shape` in which they were picked.
-    """
+    """Hold the last key of a path that leads to some entries of an array."""
 
+    # The places of the entries in the flat array.
     places: tuple[int, ...]
+    # The shape in which they were picked.
     shape: tuple[int, ...]
 
 
+class Leaf(NamedTuple):
+    """Hold the path of the numbers that a function picks, and the numbers."""
+
+    # The path of a leaf; if only some entries of the leaf are picked, an `Entries` follows.
+    path: tuple[Any, ...]
+    value: Any
+
+
+class SplitPath(NamedTuple):
+    """Hold a path without its `Entries`, and these entries: `None` for the whole leaf."""
+
+    leaf: tuple[Any, ...]
+    entries: Entries | None
+
+
 class _Picked:
-    """Hold the place of a leaf of a tree, or of entries of it, for a function that picks one.
+    """Hold the place of a leaf of a pytree, or of entries of it, for a function that picks one.
 
     Entries are picked as in an array; any arithmetic fails, since its result is no place.
     """
@@ -307,20 +304,12 @@ _ELSEWHERE = {
 }
 
 
-def leaf_at(
-    where: Callable[[Any], Any], tree: PyTree, name: str, role: str
-) -> tuple[tuple[Any, ...], Any]:
-    """Return two things: the path of the numbers that the function `where` picks from a tree; and
-    the numbers, an array or a float.
+def leaf_at(where: Callable[[Any], Any], tree: PyTree, name: str, role: str) -> Leaf:
+    """Return the path and the value of the numbers that `where` picks from a pytree, such as a
+    `Scene`.
 
-    The path is that of a leaf; if only some entries of the leaf are picked, an `Entries` follows.
-
-    - `where`: a function of the `tree` that returns one of its leaves, or entries of it.
-    - `tree`: a tree of JAX, such as a `Scene`.
-    - `name`: what the object that has the function `where` is called in an error.
-    - `role`: what the object that needs a starting value is called in an error.
-
-    A `ValueError` is raised if `where` does not pick one array of numbers.
+    An error calls what has `where` the `name`, and what needs a starting value the `role`.
+    `ValueError` is raised if `where` does not pick one array of numbers.
     """
     pairs, structure = jax.tree.flatten_with_path(tree)
     paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
@@ -360,123 +349,60 @@ def leaf_at(
     if not (eqx.is_inexact_array(leaf) or isinstance(leaf, float)):
         raise ValueError(f"{name}: wanted numbers, got {type(leaf).__name__}")
     if np.array_equal(picked.places, places[picked.leaf]):
-        return paths[picked.leaf], leaf
+        return Leaf(paths[picked.leaf], leaf)
     flat = picked.places.ravel().tolist()
     if not flat or len(set(flat)) < len(flat):
         raise ValueError(f"{name}: wanted entries of an array, each once, got {flat}")
     path = (*paths[picked.leaf], Entries(tuple(flat), picked.places.shape))
-    return path, entries_at(leaf, path)
+    return Leaf(path, entries_at(leaf, path))
 
 
-def leaf_and_entries(path: tuple[Any, ...]) -> tuple[tuple[Any, ...], Entries | None]:
-    """Return two things: the path of the leaf to which a path leads; and the entries of the leaf
-    that it picks, or `None` for all of them.
-    """
-    return (path[:-1], path[-1]) if isinstance(path[-1], Entries) else (path, None)
+def split_path(path: tuple[Any, ...]) -> SplitPath:
+    return (
+        SplitPath(path[:-1], path[-1]) if isinstance(path[-1], Entries) else SplitPath(path, None)
+    )
 
 
-def share_numbers(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+def overlap(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
     """Return whether two paths lead to the same leaf and have an entry of it in common."""
-    (leaf, mine), (same, theirs) = leaf_and_entries(one), leaf_and_entries(other)
+    (leaf, mine), (same, theirs) = split_path(one), split_path(other)
     apart = mine is not None and theirs is not None and not set(mine.places) & set(theirs.places)
     return leaf == same and not apart
 
 
 def entries_at(leaf: Any, path: tuple[Any, ...], axes: int = 0) -> Array:
-    """Return the numbers of a `leaf` to which its `path` leads. The first `axes` axes of the leaf
-    count recordings, and are kept.
+    """Return the numbers of a `leaf` to which its `path` leads; its first `axes` axes count
+    recordings.
     """
-    leaf, (_, some) = jnp.asarray(leaf), leaf_and_entries(path)
+    leaf, (_, some) = jnp.asarray(leaf), split_path(path)
     if some is None:
         return leaf
     rows = leaf.shape[:axes]
     return leaf.reshape(*rows, -1)[..., np.array(some.places)].reshape(*rows, *some.shape)
 
 
-# This maps the name of a number in the scene to its unit. A bias is not in this dict: its unit is
-# the unit of its sensor.
-_UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place": "m"}
-
-
-def _unit_implied_by_name(scene: Scene, path: tuple[Any, ...]) -> str:
-    """Return the unit of the numbers at a `path` in a `scene`, if the name of these numbers implies
-    a unit, else an empty text.
-
-    A delay is in s, for instance, a mounting in rad, and the bias of a sensor in the unit of the
-    sensor.
-
-    - `scene`: the body, torque, sensors and initial state of a recording, as a tree of JAX.
-    - `path`: the path (a tuple of keys of JAX) of the numbers in the tree; its last key has the
-      name.
-    """
-    *way, last = leaf_and_entries(path)[0]
-    name = getattr(last, "name", "")
-    if name != "bias":
-        return _UNITS.get(name, "")
-    holder: Any = scene
-    for key in way:
-        holder = getattr(holder, key.name) if hasattr(key, "name") else holder[key.idx]
-    return getattr(holder, "unit", "")
-
-
-# This maps the name of a member of a sensor to the name of the tolerance from a data sheet that
-# limits this member.
-TOLERANCES = {"scale": "scale", "skew": "cross_axis", "bias": "bias", "offset": "clock"}
-
-
-def _tolerance_of_sensor(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
-    """Return the tolerance that a sensor states for the numbers at a `path` in a `scene`, or `None`
-    if they are not numbers of a sensor, or have no tolerance.
-
-    The tolerance is a standard deviation from a data sheet, such as the standard deviation of the
-    bias of a gyro. It is taken as the standard deviation of the prior of these numbers.
-
-    - `scene`: the body, torque, sensors and initial state of a recording, as a tree of JAX.
-    - `path`: the path (a tuple of keys of JAX) of the numbers in the tree.
-    """
-    path, _ = leaf_and_entries(path)
-    if len(path) != 3 or getattr(path[0], "name", "") != "sensors":
-        return None
-    tolerance = getattr(scene.sensors[path[1].idx], "tolerance", None)
-    return getattr(tolerance, TOLERANCES.get(path[2].name, ""), None)
-
-
 def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"]) -> Scene:
-    """Return the `scene` of a recording after the changes of its free leaves (arrays of numbers).
-
-    - `scene`: the scene with the starting value of each leaf.
-    - `slots`: a `Slot` for each free leaf, with its path, scale and columns.
-    - `row`: all free numbers of the recording. The columns of a slot (the numbers of `row` at these
-      indices) are the change of its leaf, in units of its scale.
-    """
+    """Return the `scene` after the steps of its slots, which stand in the `row` of a recording."""
     paths = [slot.path for slot in slots]
     values = []
     for slot, start in zip(slots, leaves_at(scene, paths), strict=True):
-        value = slot.moved_value(start, row[slot.columns_in_row].reshape(slot.shape))
+        value = slot.moved(start, row[slot.columns].reshape(slot.shape))
         values.append(value.astype(start.dtype))
     return with_leaves(scene, paths, values)
 
 
 def leaves_at(scene: Scene, paths: Sequence[tuple[Any, ...]]) -> tuple[Array, ...]:
-    """Return the leaves (arrays of numbers) of a `scene` at the `paths`, which are tuples of keys
-    of JAX, or entries of leaves, as JAX arrays.
-
-    A scene is the body, torques, sensors and initial state of a recording, as a tree of JAX.
-    """
+    """Return the numbers of a `scene` at the `paths` as JAX arrays."""
     leaves = dict(jax.tree.leaves_with_path(scene))
-    return tuple(entries_at(leaves[leaf_and_entries(path)[0]], path) for path in paths)
+    return tuple(entries_at(leaves[split_path(path).leaf], path) for path in paths)
 
 
 def with_leaves(scene: Scene, paths: Sequence[tuple[Any, ...]], values: Sequence[Array]) -> Scene:
-    """Return the `scene` with other leaves (arrays of numbers): the leaf at each of the `paths`,
-    which are tuples of keys of JAX, is replaced by the array in `values` with the same index.
-
-    A scene is the body, torques, sensors and initial state of a recording, as a tree of JAX.
-    """
+    """Return the `scene` with other numbers at the `paths`."""
     pairs, structure = jax.tree.flatten_with_path(scene)
     leaves = dict(pairs)
     for path, value in zip(paths, values, strict=True):
-        leaf, some = leaf_and_entries(path)
+        leaf, some = split_path(path)
         if some is not None:
             whole = jnp.asarray(leaves[leaf])
             value = whole.reshape(-1).at[np.array(some.places)].set(value.reshape(-1))

@@ -1,7 +1,8 @@
-"""Find the indices of the numbers of each recording among all free numbers of a model."""
+"""Find the places of the parameters of each recording among all parameters of a model."""
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,45 +13,36 @@ from rigidjax.identify.model.free import Slot
 
 
 class Index(eqx.Module):
-    """Hold the places (indices) of the numbers of each recording among the n free numbers x of a
-    model.
+    """Hold the places of the parameters of each recording among the n parameters x of a model.
 
-    A slot is an array of the scene (body, torques, sensors, initial state) that a fit may move, and
-    a step is a change of this array. x holds the numbers of the bodies, then the steps that
-    recordings share, then the numbers that belong to one recording alone. These are the initial
-    states of all recordings, and then the own steps of all recordings. The row of a recording holds
-    the numbers of its body, the step of each slot, and its initial state. If recordings deviate
-    from the shared step of a slot, the step in the row is the sum of two numbers of x: the shared
-    step and the deviation of the recording.
-
-    **Fields:**
-
-    - `places`: (R, columns) the place in x of each column of the rows. A slot with deviations has
-      further columns at the end, which hold the places of the deviations. A column that stands for
-      no number, as in the row of a body whose chart has fewer numbers, has the place n.
-    - `start`: (R, k) the places in x of the k free numbers of the initial state of each recording.
-    - `columns`: for each column of `places`, the column of the row to which the number at this
-      place is added.
-    - `alone`: the columns of `places` whose numbers belong to one recording alone.
-    - `width`: the number of columns of a row.
-    - `bodies`: how many numbers of x describe the bodies.
-    - `first`: the first column of the initial state in a row.
-    - `size`: n, how many free numbers there are.
+    x holds the parameters of the bodies, the steps of the `Slot`s that recordings share, the
+    initial states of all recordings, and then the steps that one recording has alone. The row of a
+    recording holds the parameters of its body, the step of each slot, and its initial state. If
+    recordings deviate from the shared step of a slot, the step in the row is the sum of the shared
+    step and of the deviation.
     """
 
+    # The place in x of each column of the rows. A slot with deviations has further columns at the
+    # end, which hold the places of the deviations. A column that stands for no parameter, as in the
+    # row of a body whose chart has fewer parameters, has the place n.
     places: Int[Array, "records columns"]
-    start: Int[Array, "records n"]
+    # The places in x of the parameters of each initial state.
+    start: Int[Array, "records k"]
+    # For each column of `places`, the column of the row to which its parameter is added.
     columns: tuple[int, ...] = eqx.field(static=True)
+    # The columns of `places` whose parameters belong to one recording alone.
     alone: tuple[int, ...] = eqx.field(static=True)
+    # The number of columns of a row.
     width: int = eqx.field(static=True)
+    # How many parameters describe the bodies.
     bodies: int = eqx.field(static=True)
+    # The first column of the initial state in a row.
     first: int = eqx.field(static=True)
+    # The number n of parameters.
     size: int = eqx.field(static=True)
 
-    def rows_of_recordings(self, x: Float[Array, " n"]) -> Float[Array, "records row"]:
-        """Return the row of each recording: the numbers (R, width) on which each of R recordings
-        depends, taken from all n free numbers x (n,) of the model.
-        """
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "records width"]:
+        """Return the row of each recording: the parameters on which it depends."""
         wide = jnp.append(x, jnp.zeros(1, x.dtype))[self.places]
         twice = np.asarray(self.columns[self.width :], int)
         if not twice.size:
@@ -58,23 +50,23 @@ class Index(eqx.Module):
         return wide[:, : self.width].at[:, twice].add(wide[:, self.width :])
 
 
+class Placed(NamedTuple):
+    """Hold the index of a model, and its slots with their places in x."""
+
+    model_index: Index
+    slots: tuple[Slot, ...]
+
+
 def build_index(
-    body_places: Int[np.ndarray, "records numbers"],
+    body_places: Int[np.ndarray, "records k"],
     body_number_count: int,
     slots: Sequence[Slot],
     vectors_in_state: int,
-) -> tuple[Index, tuple[Slot, ...]]:
-    """Return two things: the `Index` of a model, which says where the numbers of each recording are
-    among all free numbers x of the model; and the slots of the model with their places in x.
+) -> Placed:
+    """Return the index of a model, and its `slots` with their places in x.
 
-    **Arguments:**
-
-    - `body_places`: (R, K) the places in x of the numbers of each recording's body, −1 where a
-      body has fewer than K numbers.
-    - `body_number_count`: how many numbers describe all bodies.
-    - `slots`: the arrays of a scene that a fit may move, without their places in x.
-    - `vectors_in_state`: the number of three-vectors in an initial state, such as 2 for
-      attitude and rate.
+    `body_places` is −1 where a body has fewer than k parameters. `vectors_in_state` is the number
+    of three-vectors in an initial state, such as 2 for attitude and rate.
     """
     count, end = len(body_places), body_number_count
 
@@ -102,38 +94,21 @@ def build_index(
             if of_each is not None:
                 twice.append(of_each.reshape(count, width))
                 columns += range(column, column + width)
-        parts = (None if x is None else jnp.asarray(x, jnp.int32) for x in (of_all, of_each))
-        placed.append(_slot_with_places(slot, column, *parts))
+        parts = [None if x is None else jnp.asarray(x, jnp.int32) for x in (of_all, of_each)]
+        placed.append(dataclasses.replace(slot, column=column, shared=parts[0], own=parts[1]))
         column += width
-    blocks.append(start)
     width = column + start.shape[1]
-    places = np.concatenate([*blocks, *twice], axis=1)
+    places = np.concatenate([*blocks, start, *twice], axis=1)
     places = np.where(places < 0, end, places)
-    alone = tuple(np.flatnonzero((places >= first_alone).all(axis=0) & (places < end).all(axis=0)))
+    alone = np.flatnonzero((places >= first_alone).all(axis=0) & (places < end).all(axis=0))
     index = Index(
         jnp.asarray(places, jnp.int32),
         jnp.asarray(start, jnp.int32),
         (*range(width), *columns),
-        tuple(int(place) for place in alone),
+        tuple(alone.tolist()),
         width,
         body_number_count,
         column,
         end,
     )
-    return index, tuple(placed)
-
-
-def _slot_with_places(slot: Slot, column: int, shared: Array | None, own: Array | None) -> Slot:
-    """Return a `slot` with the places of its numbers among the free numbers of the model.
-
-    A slot is an array of the scene (the body, torque, sensors and initial state) that a fit may
-    move.
-
-    - `slot`: the slot without these places.
-    - `column`: the index of its first number among the free numbers of one recording.
-    - `shared`: (groups, …) the indices of the numbers that groups of recordings share, among all
-      free numbers of the model; `None` if each recording has numbers of its own alone.
-    - `own`: (R, …) the indices of the numbers that each of R recordings has alone, among all free
-      numbers of the model; `None` if all numbers are shared.
-    """
-    return dataclasses.replace(slot, column=column, shared=shared, own=own)
+    return Placed(index, tuple(placed))

@@ -17,26 +17,26 @@ from rigidjax._types import HasAttitude, HasPose, NumbersLike, Scalar
 from rigidjax.body import validation
 from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.identify.data import stacking
-from rigidjax.identify.data.full_scale import with_full_scale_limits
+from rigidjax.identify.data.full_scale import with_limits
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.data.reference_states import (
     ReferenceStates,
     first_rates,
-    reference_states_of,
+    references,
 )
 from rigidjax.identify.data.windows import (
     Windows,
-    describe_delays_outside_window_samples,
+    outside_delays,
     require_windows,
-    window_starts_weights_and_stretches,
+    window_starts,
 )
 from rigidjax.identify.model.charts import (
     AbstractBodyChart,
     Bodies,
-    body_with_scale_mark,
+    body_places,
     chart_list,
     has_mass,
-    indices_of_body_numbers,
+    marked_body,
 )
 from rigidjax.identify.model.free import (
     Free,
@@ -44,8 +44,8 @@ from rigidjax.identify.model.free import (
     checked_labels,
     entries_at,
     find_slots,
-    group_of_each_recording,
-    leaf_and_entries,
+    group_recordings,
+    split_path,
 )
 from rigidjax.identify.model.index import Index, build_index
 from rigidjax.identify.model.predict import AbstractIntegrator, HeldSteps, integrator_for
@@ -57,12 +57,13 @@ from rigidjax.identify.model.scene import (
     require_unknown_torque,
 )
 from rigidjax.identify.model.terms import (
+    FirstOrder,
     all_errors,
-    jacobian_and_value,
-    map_over_recordings,
-    scene_at_starting_values,
-    scene_from_row,
-    states_and_torque_of_scene,
+    map_recordings,
+    motion_in,
+    scene_at,
+    starting_scene,
+    value_and_jacfwd,
 )
 from rigidjax.identify.model.walks import Drift, Walk, find_drifts
 from rigidjax.identify.sensors import AbstractSensor
@@ -82,18 +83,16 @@ EVEN = 1e-3
 
 
 class AbstractPull(eqx.Module):
-    """Compute residuals that pull the free numbers x of a fit, or quantities that depend on x,
-    towards chosen values.
+    """Compute residuals that pull parameters, or quantities that depend on them, towards chosen
+    values.
 
     A fit adds these residuals to the residuals of the readings and priors.
     """
 
     @abc.abstractmethod
     def __call__(self, model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-        """Return j residuals, in standard deviations. Half the sum of their squares is added to the
-        misfit of a fit.
-
-        `model` is the model that is fitted, and x (n,) its free numbers.
+        """Return residuals in standard deviations; half the sum of their squares is added to the
+        cost.
         """
 
 
@@ -221,22 +220,36 @@ class Model(eqx.Module):
     ):
         windows = recording if isinstance(recording, Windows) else None
         if windows is None:
-            recordings, charts, names = _charts_and_names(recording, chart)
+            recordings, charts, names = _members(recording, chart)
         else:
             require_windows(windows)
             recordings, names = [], ("",) * windows.count
             charts: Any = Bodies(chart) if isinstance(chart, Mapping) else chart
         free = (free,) if isinstance(free, str) else free  # pyright: ignore[reportAssignmentType]
-        _require_argument_types(charts, free, loss, prior, integrator)
+        for one in chart_list(charts):
+            known = isinstance(one, Inertia | MassProperties)
+            hint = "give a known body as Known(body)" if known else ""
+            hint = "was () forgotten?" if isinstance(one, type) else hint
+            wanted = "what of the body is free, such as Ratios() or PrincipalRatios()"
+            _checks.require_instance(one, AbstractBodyChart, "Model", requirement=wanted, hint=hint)
+        wanted = "a sequence of Free(where, name)"
+        _checks.require_instance(free, Sequence, "free", requirement=wanted)
+        for name, value, kind in (
+            ("loss", loss, AbstractLoss),
+            ("prior", prior, Entropic),
+            ("integrator", integrator, AbstractIntegrator),
+        ):
+            if value is not None:
+                _checks.require_instance(value, kind, name)
         if torque is not None:
             require_torque(torque)
             require_known_torque(torque)
         if process is not None:
             require_unknown_torque(process)
         if windows is None:
-            data = _data_of_recordings(recordings, torque, charts)
+            data = _recorded(recordings, torque, charts)
         else:
-            data = _data_of_windows(windows, torque, charts, stretches)
+            data = _windowed(windows, torque, charts, stretches)
         self.records, self.counts, self.reference = data.records, data.counts, data.reference
         self.state_kind = data.state_kind
         self.start_weight, self.clusters = data.start_weight, data.clusters
@@ -250,30 +263,41 @@ class Model(eqx.Module):
         apart = checked_labels(noise_each, "noise_each")
         if isinstance(apart, bool):
             apart = tuple(range(len(names))) if apart else ("",) * len(names)
-        self.noise_groups, _ = group_of_each_recording(apart, names, "noise_each")
+        self.noise_groups = group_recordings(apart, names, "noise_each").indices
         scene = Scene(None, torque, process, data.sensors, None)
         self.walks = find_drifts(walks, scene)
         slots = find_slots(free, scene, names)
-        _require_unused_names(slots, charts)
-        bodies = indices_of_body_numbers(charts, self.body_indices, len(names))
+        taken = {"Ωx", "Ωy", "Ωz"}
+        for one in chart_list(charts):
+            taken |= {*one.log_names, *one.plain_names}
+        for slot in slots:
+            if slot.name in taken:
+                words = "a quantity of the body has this name; give another"
+                raise ValueError(f"Free {slot.name!r}: {words}")
+        bodies = body_places(charts, self.body_indices, len(names))
         self.index, self.slots = build_index(bodies, charts.size, slots, data.vectors_in_state)
-        turn = 1.5 * data.widest * float(np.max(np.asarray(self.reference.rate)))
         if windows is not None and process is not None:
             raise ValueError(
                 "process: a filter follows one record from its beginning; give a Recording instead "
                 "of windows"
             )
-        if windows is not None or _sampled_inputs_read(torque, self.records):
-            _require_held_steps_or_none(integrator)
+        if windows is not None or _sampled(torque, self.records):
+            if integrator is not None and not isinstance(integrator, HeldSteps):
+                raise ValueError(
+                    "integrator: samples as inputs are held through one step from each time to the "
+                    "next; give None, or a function of time such as rigidjax.torques.Linear(t, "
+                    "samples) as the input"
+                )
             integrator = HeldSteps()
         elif integrator is None and torque is not None:
-            integrator = integrator_for(turn)
+            rate = float(np.max(np.asarray(self.reference.rate)))
+            integrator = integrator_for(1.5 * data.widest * rate)
         self.integrator = integrator
         # A model without a random torque or drift needs no Kalman filter, and not the number of the
         # filter's steps. The number would only force a new compilation for a recording whose
         # longest interval between times is longer or shorter.
         filtered = process is not None or self.walks
-        self.filter_steps = filter_steps_per_interval(self) if filtered else 1
+        self.filter_steps = interval_steps(self) if filtered else 1
 
     @property
     def size(self) -> int:
@@ -293,7 +317,7 @@ class Model(eqx.Module):
         recordings. These readings are left out here.
         """
         return tuple(
-            stacking.take_rows(stacking.pick_records(self.records, index), count)
+            stacking.take_rows(stacking.pick(self.records, index), count)
             for index, count in enumerate(np.asarray(self.counts).tolist())
         )
 
@@ -328,7 +352,7 @@ class Model(eqx.Module):
 
         **Raises:** `ValueError` for a body that the chart cannot represent, or a wrong shape.
         """
-        require_single_model(self)
+        require_single(self)
         if isinstance(self.chart, Bodies):
             by_name = dict(body) if isinstance(body, Mapping) else {}
             names, charts = self.chart.names, self.chart.charts
@@ -336,12 +360,12 @@ class Model(eqx.Module):
                 raise ValueError(f"body: wanted bodies by name, of {', '.join(names)}, or None")
             vector = jnp.concatenate(
                 [
-                    _numbers_in_chart(chart, by_name.get(n))
+                    _chart_vector(chart, by_name.get(n))
                     for n, chart in zip(names, charts, strict=True)
                 ]
             )
         else:
-            vector = _numbers_in_chart(self.chart, body)
+            vector = _chart_vector(self.chart, body)
         kind = jnp.result_type(float)
         if omega is None and not self.index.start.size:
             rates = np.zeros((1, 3))
@@ -368,10 +392,11 @@ class Model(eqx.Module):
 
         For several recordings the states have a leading axis.
         """
-        x = require_numbers(self, x)
+        x = checked_x(self, x)
         if _checks.is_known((self, x)):
-            return _compiled_quantities(with_first_times_only(self), x)
-        return unpack_numbers(self, x)
+            # Outside of `jit` each operation would be compiled as a program of its own.
+            return eqx.filter_jit(unpack_at)(shortened(self), x)
+        return unpack_at(self, x)
 
     def bodies(self, x: Float[Array, " n"]) -> Any:
         """Return the body that the free numbers x (n,) represent, or for several bodies a dict of
@@ -379,14 +404,14 @@ class Model(eqx.Module):
         """
         numbers = x[: self.index.bodies]
         if isinstance(self.chart, Bodies):
-            return self.chart.all_bodies_by_name(numbers)
-        return body_with_scale_mark(self.chart, numbers)
+            return self.chart.by_name(numbers)
+        return marked_body(self.chart, numbers)
 
     def scenes(self, x: Float[Array, " n"]) -> Scene:
         """Return the scene (body, torques, sensors, initial state) of each recording at the free
         numbers x (n,), with a leading axis of recordings.
         """
-        return scenes_of(self, require_numbers(self, x))
+        return scenes_of(self, checked_x(self, x))
 
     def values(self, x: Float[Array, " n"]) -> dict[str, Array]:
         """Return the values of all `Free`s at the free numbers x (n,), as a dict of name → array,
@@ -396,7 +421,7 @@ class Model(eqx.Module):
         recordings has a value. For a `Free` named "drag" with a `spread` the shared value is under
         "drag", and the values of the R recordings are under "drag, own".
         """
-        return values_of(self, require_numbers(self, x))
+        return values_of(self, checked_x(self, x))
 
     def motion(self, x: Float[Array, " n"]) -> Any:
         """Return the states at the times of the recording for the free numbers x (n,), with a
@@ -404,14 +429,14 @@ class Model(eqx.Module):
 
         For several recordings an axis of recordings comes before the time axis.
         """
-        x = require_numbers(self, x)
+        x = checked_x(self, x)
 
         def motion_of_recording(row: Array, record: Recording, *others: PyTree) -> Any:
-            scene = scene_from_row(self, row, record, *others)
-            return motion_of(states_and_torque_of_scene(self, scene, record)[0])
+            scene = scene_at(self, row, record, *others)
+            return motion_of(motion_in(self, scene, record).states)
 
-        states = map_over_recordings(motion_of_recording, self, self.index.rows_of_recordings(x))
-        return stacking.pick_records(states, 0) if self.count == 1 else states
+        states = map_recordings(motion_of_recording, self, self.index.rows(x))
+        return stacking.pick(states, 0) if self.count == 1 else states
 
     def errors(self, x: Float[Array, " n"]) -> tuple[Float[Array, "*records times _"], ...]:
         """Return reading minus prediction for each sensor at the free numbers x, in the sensor's
@@ -419,253 +444,149 @@ class Model(eqx.Module):
 
         The difference is zero for a masked reading.
         """
-        x = require_numbers(self, x)
+        x = checked_x(self, x)
         out = all_errors(self, x)
         return tuple(e[0] for e in out) if self.count == 1 else out
 
 
-class _RecordedData(NamedTuple):
-    """Hold the parts of a `Model` that come from its recordings, or from windows (short parts of a
-    record of measured states), each of which is then treated as a recording.
-
-    **Fields:**
-
-    - `records`: all R recordings as one `Recording`, whose arrays have a leading axis (R,).
-    - `counts`: (R,) how many sample times each recording has, without padding.
-    - `sensors`: the sensors of one recording.
-    - `state_kind`: the type of the states: `Spin`, `Attitude` or `Rigid`.
-    - `reference`: the state of each recording from which its initial state is measured: the free
-      numbers of the initial state are changes of this state.
-    - `start_weight`: (R, n) for windows whose initial states have a prior about the measured
-      states: one over the standard deviation of each of the n free numbers of an initial state, in
-      the unit of the number. `None` without such a prior.
-    - `clusters`: (R,) the index of the stretch (group of neighbouring windows) of each window;
-      `None` for recordings.
-    - `vectors_in_state`: the number of three-vectors (such as attitude and rate) of a free initial
-      state, 0 if the initial state is known.
-    - `widest`: the longest time between two successive times of a recording, s; 0 for windows.
+class _Recorded(NamedTuple):
+    """Hold the parts of a `Model` that come from R recordings or windows, which are then treated as
+    recordings.
     """
 
+    # All recordings as one, whose arrays have a leading axis.
     records: Recording
+    # How many sample times each recording has without padding.
     counts: Int[np.ndarray, " records"]
     sensors: tuple[AbstractSensor, ...]
     state_kind: type
+    # The parameters of an initial state are changes of the reference state.
     reference: ReferenceStates
+    # For windows whose initial states have a prior about the measured states: one over the standard
+    # deviation of each parameter of an initial state.
     start_weight: Float[Array, "records n"] | None
+    # The index of the stretch of each window; `None` for recordings.
     clusters: Int[Array, " records"] | None
+    # The number of three-vectors of a free initial state, 0 if the initial state is known.
     vectors_in_state: int
+    # The longest time between two successive times of a recording, s; 0 for windows.
     widest: float
 
 
-def _data_of_recordings(
-    recordings: list[Recording], torque: Torque | None, charts: AbstractBodyChart | Bodies
-) -> _RecordedData:
-    """Return the parts of a `Model` that come from recordings, after checks: the stacked readings,
-    and a reference state of each recording.
-
-    The initial state of a recording is free: its free numbers are changes of the reference state,
-    which is found from the first readings. A chart is a map from free numbers to a possible body.
-
-    - `recordings`: the recordings, in their order.
-    - `torque`: the torque of the model, whose inputs (logged quantities such as a motor command)
-      every recording must have, or `None`.
-    - `charts`: the chart of one body, or the charts of several bodies. If the sensors or the torque
-      need a position, the charts must describe bodies with a mass.
-    """
-    _require_recordings(recordings)
-    recordings = with_full_scale_limits(recordings)
-    _require_inputs(torque, [recording.inputs for recording in recordings])
+def _recorded(
+    recordings: list[Any], torque: Torque | None, charts: AbstractBodyChart | Bodies
+) -> _Recorded:
+    """Return the parts of a `Model` that come from recordings, after checks."""
+    if not recordings:
+        raise ValueError("Model: wanted at least one Recording, got an empty sequence")
+    for item in recordings:
+        _checks.require_instance(item, Recording, "Model", requirement="a Recording")
+        if not _checks.is_known((item.t, [reading.values for reading in item.readings])):
+            raise TypeError(
+                "recording: wanted known readings, got traced ones; make the Model outside "
+                "of jax.jit, jax.grad and jax.vmap, and give it to them as an argument"
+            )
+        lengths = {item.t.shape, *(reading.mask.shape for reading in item.readings)}
+        if len(lengths) > 1 or item.t.ndim != 1:
+            raise ValueError(
+                "recording: wanted a single recording, as Recording(t, …) makes it, got times and "
+                f"masks of shapes {sorted(lengths)}; give several recordings as a sequence"
+            )
+        _checks.numeric_array(item.t, "recording")
+    recordings = with_limits(recordings)
     for number, one in enumerate(recordings):
-        _require_even_times(torque, one, number)
+        missing = [name for name in input_names_of(torque) if name not in one.inputs]
+        if missing:
+            raise ValueError(
+                f"torque: it reads {', '.join(map(repr, missing))}, and recording {number} has "
+                f"{', '.join(map(repr, one.inputs)) or 'no inputs'}; give "
+                "Recording(…, inputs={name: samples or a function of time})"
+            )
+    for number, one in enumerate(recordings):
+        # Each sample is held over one step, and all steps are equal.
+        names, steps = _sampled(torque, one), np.diff(np.asarray(one.t, float))
+        if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
+            raise ValueError(
+                f"inputs[{names[0]!r}]: samples are held through even steps, and the times of "
+                f"recording {number} have steps from {steps.min():.6g} to {steps.max():.6g} "
+                "s; resample them, or give a function of time such as rigidjax.torques.Linear(t, "
+                "samples)"
+            )
     records, counts = stacking.stack(recordings)
     sensors = recordings[0].sensors
-    state_kind = _smallest_state_type(sensors, torque, charts)
+    state_kind = _state_type(sensors, torque, charts)
     # The readings are concrete arrays even if the torque is traced by JAX. The reference states are
     # computed at compile time, so that they are concrete arrays, too.
     with jax.ensure_compile_time_eval():
-        reference = reference_states_of(recordings, state_kind)
-    vectors_in_state = dimension(stacking.pick_records(reference.state, 0)) // 3
+        reference = references(recordings, state_kind)
+    vectors_in_state = dimension(stacking.pick(reference.state, 0)) // 3
     widest = max(float(np.diff(r.t).max()) for r in recordings)
-    return _RecordedData(
+    return _Recorded(
         records, counts, sensors, state_kind, reference, None, None, vectors_in_state, widest
     )
 
 
-def _data_of_windows(
+def _windowed(
     windows: Windows, torque: Torque | None, charts: AbstractBodyChart | Bodies, stretches: int
-) -> _RecordedData:
-    """Return the parts of a `Model` that come from windows, after checks.
-
-    Windows are short parts of a record of measured states. Each window starts in its measured
-    state, or in a free state about the measured state.
-
-    - `windows`: the windows.
-    - `torque`: the torque of the model, whose inputs (logged quantities such as a motor command)
-      the windows must have, or `None`.
-    - `charts`: the chart (a map from free numbers to a possible body) of one body, or the charts of
-      several bodies. If the measured states or the torque need a position, the charts must describe
-      bodies with a mass.
-    - `stretches`: the number of stretches (groups of neighbouring windows) into which the windows
-      are divided, at least 2.
-    """
-    require_inputs_of_windows(torque, windows)
+) -> _Recorded:
+    """Return the parts of a `Model` that come from windows, after checks."""
+    require_inputs(torque, windows)
     records = windows.records()
-    counts = np.full(windows.count, windows.length + 1, np.int32)
-    state_kind = _smallest_state_type(records.sensors, torque, charts)
+    sensors, counts = records.sensors, np.full(windows.count, windows.length + 1, np.int32)
+    state_kind = _state_type(sensors, torque, charts)
     stretches = _checks.integer(stretches, "stretches", 2)
-    reference, weight, clusters = window_starts_weights_and_stretches(windows, stretches)
-    _require_state_type(windows, state_kind)
-    vectors_in_state = (
-        0 if weight is None else dimension(stacking.pick_records(reference.state, 0)) // 3
-    )
-    return _RecordedData(
-        records,
-        counts,
-        records.sensors,
-        state_kind,
-        reference,
-        weight,
-        clusters,
-        vectors_in_state,
-        0.0,
+    reference, weight, clusters = window_starts(windows, stretches)
+    if not isinstance(windows.starts, state_kind):
+        raise TypeError(
+            f"windows: wanted measured states of type {state_kind.__name__}, which the torque "
+            f"needs, got {type(windows.starts).__name__}"
+        )
+    free = weight is not None
+    vectors_in_state = dimension(stacking.pick(reference.state, 0)) // 3 if free else 0
+    return _Recorded(
+        records, counts, sensors, state_kind, reference, weight, clusters, vectors_in_state, 0.0
     )
 
 
-def _require_argument_types(
-    charts: AbstractBodyChart | Bodies,
-    free: object,
-    loss: object,
-    prior: object,
-    integrator: object,
-) -> None:
-    """Raise `TypeError` unless the arguments of a `Model` have the right types.
-
-    - `charts`: must be one `AbstractBodyChart` (a map from free numbers to a possible body), or a
-      `Bodies`, which holds the charts of several bodies.
-    - `free`: must be a sequence, whose members are checked later. Each member should be a `Free`, a
-      number that a fit may move.
-    - `loss`: must be an `AbstractLoss`, which gives outliers less weight, or `None`.
-    - `prior`: must be an `Entropic`, a prior about a roughly known body, or `None`.
-    - `integrator`: must be an `AbstractIntegrator`, which computes the motion, or `None`.
-    """
-    for one in chart_list(charts):
-        known = isinstance(one, Inertia | MassProperties)
-        hint = "give a known body as Known(body)" if known else ""
-        hint = "was () forgotten?" if isinstance(one, type) else hint
-        wanted = "what of the body is free, such as Ratios() or PrincipalRatios()"
-        _checks.require_instance(one, AbstractBodyChart, "Model", requirement=wanted, hint=hint)
-    _checks.require_instance(free, Sequence, "free", requirement="a sequence of Free(where, name)")
-    for name, value, kind in (
-        ("loss", loss, AbstractLoss),
-        ("prior", prior, Entropic),
-        ("integrator", integrator, AbstractIntegrator),
-    ):
-        if value is not None:
-            _checks.require_instance(value, kind, name)
-
-
-def _require_unused_names(slots: Sequence[Slot], charts: AbstractBodyChart | Bodies) -> None:
-    """Raise `ValueError` if a `Free` (a number that a fit may move) has the name of a quantity that
-    a fit reports of the body, such as "I1", or of its rate, such as "Ωx".
-
-    - `slots`: the prepared `Free`s of a model. A `Slot` is a `Free` together with its place in the
-      scene (the body, torque, sensors and initial state).
-    - `charts`: the chart of one body, or the charts of several bodies, whose quantities are
-      reported. A chart is a map from free numbers to a possible body.
-    """
-    taken = {name for one in chart_list(charts) for name in (*one.log_names, *one.plain_names)}
-    for slot in slots:
-        if slot.name in taken | {"Ωx", "Ωy", "Ωz"}:
-            words = "a quantity of the body has this name; give another"
-            raise ValueError(f"Free {slot.name!r}: {words}")
-
-
-def unpack_numbers(model: Model, x: Float[Array, " n"]) -> Unpacked:
-    """Return the body, the initial state and the values of the `Free`s (other numbers that a fit
-    may move) that the free numbers x (n,) of a `model` represent, without a check of x.
-
-    For several recordings the initial states have a leading axis.
-    """
-    starts = jax.vmap(ReferenceStates.initial_state_at)(model.reference, x[model.index.start])
-    state0 = stacking.pick_records(starts, 0) if model.count == 1 else starts
+def unpack_at(model: Model, x: Float[Array, " n"]) -> Unpacked:
+    """Return what `Model.unpack` returns, without a check of x."""
+    starts = jax.vmap(ReferenceStates.initial)(model.reference, x[model.index.start])
+    state0 = stacking.pick(starts, 0) if model.count == 1 else starts
     return Unpacked(x, model.bodies(x), state0, values_of(model, x))
 
 
 @eqx.filter_jit
-def _compiled_quantities(model: Model, x: Float[Array, " n"]) -> Unpacked:
-    """Return the quantities that the free numbers x (n,) of a `model` represent, computed in one
-    compiled program.
-
-    Without `jit` each operation of JAX is compiled as a program of its own: the first call took
-    seconds. The quantities are the body, the initial state, and the values of the `Free`s, which
-    are the other numbers that a fit may move.
-    """
-    return unpack_numbers(model, x)
+def unpack_jacobian(model: Model, x: Float[Array, " n"]) -> FirstOrder:
+    """Return the quantities that x represents, and their Jacobian."""
+    return value_and_jacfwd(lambda x: unpack_at(model, x), x)
 
 
-def unpack_with_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
-    """Return two things: the quantities that the free numbers x (n,) of a `model` represent; and
-    the derivatives of these quantities with respect to x, along a new last axis of each array.
+def shortened(model: Model) -> Model:
+    """Return the model with the first time of each recording only, as NumPy arrays.
 
-    The quantities are the body, the initial state, and the values of the `Free`s, which are the
-    other numbers that a fit may move.
-    """
-    slopes, point = _compiled_jacobian_and_quantities(with_first_times_only(model), x)
-    return point, slopes
-
-
-@eqx.filter_jit
-def _compiled_jacobian_and_quantities(
-    model: Model, x: Float[Array, " n"]
-) -> tuple[Unpacked, Unpacked]:
-    """Return two things, computed in one compiled program: the derivatives of the quantities that
-    the free numbers x (n,) of a `model` represent, along a new last axis of each array; and these
-    quantities.
-
-    The quantities are the body, the initial state, and the values of the `Free`s, which are the
-    other numbers that a fit may move.
-    """
-    return jacobian_and_value(lambda x: unpack_numbers(model, x), x)
-
-
-def with_first_times_only(model: Model) -> Model:
-    """Return the model with only the first time of each recording, and with its recordings as NumPy
-    arrays.
-
-    The bodies, the initial states and the values of the `Free`s depend on no reading. A program
-    that computes them from the shortened model is compiled once, and not again for recordings of
-    another length.
+    What depends on no reading is then compiled once, not again for recordings of another length.
     """
     records = jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, model.records)
-    return with_replaced_fields(model, records=stacking.take_rows(records, 1, axis=1))
+    return replaced(model, records=stacking.take_rows(records, 1, axis=1))
 
 
 def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
-    """Return the scene (body, torques, sensors, initial state) of each recording of a `model` at
-    the free numbers x (n,), with a leading axis of recordings, without a check of x.
-    """
-
-    def scene_of_recording(row: Array, *rest: PyTree) -> Scene:
-        return scene_from_row(model, row, *rest)
-
-    rows = model.index.rows_of_recordings(x)
-    return eqx.filter_vmap(scene_of_recording)(
-        rows, model.records, model.reference, model.body_indices
+    """Return what `Model.scenes` returns, without a check of x."""
+    return eqx.filter_vmap(lambda row, *rest: scene_at(model, row, *rest))(
+        model.index.rows(x), model.records, model.reference, model.body_indices
     )
 
 
 def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
-    """Return the values of all `Free`s (numbers of torque and sensors that a fit may move) of a
-    `model` at the free numbers x (n,), as a dict of name → array, without a check of x.
-
-    The shapes are (R, …) for a `Free` that has a value for each of R recordings, (groups, …) for a
-    value for each group of recordings, else that of a single value.
-    """
-    rows, out = model.index.rows_of_recordings(x), {}
-    starts = starting_values_of_free_numbers(model)
-    for slot, start in zip(model.slots, starts, strict=True):
-        steps = rows[:, slot.columns_in_row].reshape(model.count, *slot.shape)
-        own = slot.moved_value(start, steps)
+    """Return what `Model.values` returns, without a check of x."""
+    rows, out = model.index.rows(x), {}
+    leaves = dict(jax.tree.leaves_with_path(starting_scene(model, model.records)))
+    for slot in model.slots:
+        of_each = slot.path[0].name == "sensors"
+        leaf = entries_at(leaves[split_path(slot.path).leaf], slot.path, int(of_each))
+        start = leaf if of_each else jnp.broadcast_to(leaf, (model.count, *leaf.shape))
+        steps = rows[:, slot.columns].reshape(model.count, *slot.shape)
+        own = slot.moved(start, steps)
         if slot.shared is None:
             out[slot.name] = own
             continue
@@ -673,32 +594,17 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
         if slot.groups is not None:
             groups = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
             first = jnp.argmax(slot.groups[None, :] == groups[:, None], axis=1)
-        value = slot.moved_value(start[first], x[slot.shared])
+        value = slot.moved(start[first], x[slot.shared])
         out[slot.name] = value[0] if slot.groups is None else value
         if slot.spread is not None:
             out[f"{slot.name}, own"] = own
     return out
 
 
-def starting_values_of_free_numbers(model: Model) -> list[Float[Array, "records ..."]]:
-    """Return the starting values of the `Free`s (numbers that a fit may move) of a `model`: a list
-    with an array (R, *shape) for each `Free`, which holds its values in R recordings.
-    """
-    scene, out = scene_at_starting_values(model, model.records), []
-    leaves = dict(jax.tree.leaves_with_path(scene))
-    for slot in model.slots:
-        of_each = slot.path[0].name == "sensors"
-        leaf = entries_at(leaves[leaf_and_entries(slot.path)[0]], slot.path, int(of_each))
-        out.append(leaf if of_each else jnp.broadcast_to(leaf, (model.count, *leaf.shape)))
-    return out
+def interval_steps(model: Model) -> int:
+    """Return how many steps a Kalman filter takes between two successive times of a recording.
 
-
-def filter_steps_per_interval(model: Model) -> int:
-    """Return how many integration steps a Kalman filter takes between two successive times of the
-    recordings of a `model`.
-
-    The number is so large that a body at 1.5 times its typical rate turns by at most
-    `TURN_OF_A_FILTER_STEP` radians in a step, even in the longest interval.
+    In a step a body at 1.5 times its typical rate turns by at most `TURN_OF_A_FILTER_STEP`.
     """
     widest = np.max(np.diff(np.asarray(model.records.t), axis=1), initial=0.0)
     turn = 1.5 * float(widest) * float(np.max(np.asarray(model.reference.rate)))
@@ -708,10 +614,8 @@ def filter_steps_per_interval(model: Model) -> int:
     return math.ceil(steps) if 1.0 < steps < math.inf else 1
 
 
-def require_single_model(model: PyTree) -> Model:
-    """Return `model`, and raise `TypeError` or `ValueError` unless `model` is a single `Model`, not
-    a batch of models.
-    """
+def require_single(model: PyTree) -> Model:
+    """Return `model`, after a check that it is a single `Model`, not a batch of models."""
     _checks.require_instance(model, Model, "model")
     records, rate = model.records, model.reference.rate
     shapes = {records.t.shape, *(reading.mask.shape for reading in records.readings)}
@@ -726,13 +630,11 @@ def require_single_model(model: PyTree) -> Model:
     return model
 
 
-def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
-    """Return the free numbers x (n,) of a `model` as an array, after checks.
-
-    An error is raised unless x has n numbers of the dtype of the recordings, and all of them are
-    finite. Traced numbers are not checked for being finite.
+def checked_x(model: Model, x: NumbersLike) -> Float[Array, " n"]:
+    """Return the parameters x of a `model` as an array, after a check of shape, type and
+    finiteness.
     """
-    require_single_model(model)
+    require_single(model)
     hint = "model.start(body) makes them"
     numbers = _checks.numeric_array(x, "x")
     if numbers.ndim == 1 and numbers.size > model.size:
@@ -751,9 +653,8 @@ def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
     return numbers
 
 
-def with_replaced_fields(model: Model, **values: Any) -> Model:
-    """Return the model after a replacement of some of its fields, without checks. The new values
-    are given by the names of the fields.
+def replaced(model: Model, **values: Any) -> Model:
+    """Return the model with other `values` of some fields, by name, without checks.
 
     `dataclasses.replace` would call `Model(…)`, and `equinox.tree_at` cannot replace a tuple that
     has no leaves.
@@ -764,42 +665,9 @@ def with_replaced_fields(model: Model, **values: Any) -> Model:
     return new
 
 
-def _require_state_type(windows: Windows, state_type: type) -> None:
-    """Raise `TypeError` unless the measured states in `windows` (short parts of a record of
-    measured states) are of the type `state_type`, which the torque needs.
-
-    `state_type` is `Spin`, `Attitude` or `Rigid`.
-    """
-    if not isinstance(windows.starts, state_type):
-        raise TypeError(
-            f"windows: wanted measured states of type {state_type.__name__}, which the torque "
-            f"needs, got {type(windows.starts).__name__}"
-        )
-
-
-def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) -> None:
-    """Raise `ValueError` if a torque reads an input (a logged quantity such as the speed of a
-    wheel) that a recording lacks.
-
-    - `torque`: the torque, which reads an input by its name; `None` reads no input.
-    - `inputs`: for each recording a dict of name → samples or function of time.
-    """
-    for number, of_one in enumerate(inputs):
-        missing = [name for name in input_names_of(torque) if name not in of_one]
-        if missing:
-            raise ValueError(
-                f"torque: it reads {', '.join(map(repr, missing))}, and recording {number} has "
-                f"{', '.join(map(repr, of_one)) or 'no inputs'}; give "
-                "Recording(…, inputs={name: samples or a function of time})"
-            )
-
-
-def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
-    """Raise `ValueError` if `windows` lack an input that the `torque` reads, or lack the samples
-    that a delayed input needs before or after a window.
-
-    A window is a short part of a record of measured states. An input is a logged quantity such as a
-    motor command. The `torque` may be `None`.
+def require_inputs(torque: Torque | None, windows: Windows) -> None:
+    """Raise `ValueError` if `windows` lack an input that the `torque` reads, or samples for its
+    delays.
     """
     missing = [name for name in input_names_of(torque) if name not in windows.inputs]
     if missing:
@@ -809,92 +677,37 @@ def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
             "windows(t, states, {name: samples}, …)"
         )
     known, length = windows.before * windows.step, windows.length * windows.step
-    if wrong := describe_delays_outside_window_samples(torque, known, length):
+    if wrong := outside_delays(torque, known, length):
         raise ValueError("; ".join(wrong))
 
 
-def describe_delays_outside_windows(model: Model, x: Float[Array, " n"]) -> list[str]:
-    """Return a text for each delay that needs samples outside of the windows of a `model`, at the
-    free numbers x (n,) of the model.
-
-    A window is a short part of a record of measured states. A delay shifts an input (a logged
-    quantity such as a motor command) in time. No text is returned for a model of recordings.
-    """
+def late_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
+    """Return a text for each delay at x that needs samples outside of the windows of a `model`."""
     if model.clusters is None or not delays_of(model.torque):
         return []
     t, rows = np.asarray(model.records.t)[0], max(len(a[0]) for a in model.records.inputs.values())
     step = float(t[1] - t[0])
     known, length = (rows - t.size) * step, (t.size - 1) * step
-    return describe_delays_outside_window_samples(_compiled_scenes(model, x).torque, known, length)
+    torque = eqx.filter_jit(scenes_of)(model, x).torque
+    return outside_delays(torque, known, length)
 
 
-@eqx.filter_jit
-def _compiled_scenes(model: Model, x: Float[Array, " n"]) -> Scene:
-    """Return the scene (body, torques, sensors, initial state) of each recording of a `model` at
-    the free numbers x (n,), with a leading axis of recordings, computed in one compiled program.
-
-    The program is compiled, since single operations of JAX are slow outside of a compiled program.
-    """
-    return scenes_of(model, x)
-
-
-def _sampled_inputs_read(torque: Torque | None, recording: Recording) -> list[str]:
-    """Return the names of the inputs (logged quantities such as a motor command) that the `torque`
-    reads and that the `recording` holds as samples, not as functions of time.
-
-    No name is returned if the `torque` is `None`.
-    """
+def _sampled(torque: Torque | None, recording: Recording) -> list[str]:
+    """Return the names of the inputs that the `torque` reads as samples, not as functions."""
     return [name for name in input_names_of(torque) if not callable(recording.inputs[name])]
 
 
-def _require_even_times(torque: Torque | None, recording: Recording, recording_index: int) -> None:
-    """Raise `ValueError` if the `torque` reads sampled inputs, and the times of the `recording` are
-    not evenly spaced to a thousandth of the first step.
+class _Members(NamedTuple):
+    """Hold all recordings, with the chart of one body or the charts of several."""
 
-    Inputs are logged quantities such as a motor command. Each sample is held constant over one
-    step, and all steps are equal; an input that is a function of time needs no even times.
-
-    - `torque`: the torque of the model, or `None`.
-    - `recording`: the recording with the times and inputs.
-    - `recording_index`: the index of the recording in the model, for the error.
-    """
-    names, steps = _sampled_inputs_read(torque, recording), np.diff(np.asarray(recording.t, float))
-    if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
-        raise ValueError(
-            f"inputs[{names[0]!r}]: samples are held through even steps, and the times of "
-            f"recording {recording_index} have steps from {steps.min():.6g} to {steps.max():.6g} "
-            "s; resample them, or give a function of time such as rigidjax.torques.Linear(t, "
-            "samples)"
-        )
+    recordings: list[Any]
+    charts: Any
+    # The name of the body of each recording, empty if there is only one body.
+    names: tuple[str, ...]
 
 
-def _require_held_steps_or_none(integrator: object) -> None:
-    """Raise `ValueError` unless the `integrator` that a user gave is a `HeldSteps` or `None`. A
-    `HeldSteps` takes one step from each time to the next and holds samples constant over this step.
-
-    This check is made for a model of windows, or with sampled inputs. All other integrators are
-    refused for such a model, because they do not hold the samples constant.
-    """
-    if integrator is not None and not isinstance(integrator, HeldSteps):
-        raise ValueError(
-            "integrator: samples as inputs are held through one step from each time to the next; "
-            "give None, or a function of time such as rigidjax.torques.Linear(t, samples) as the "
-            "input"
-        )
-
-
-def _charts_and_names(recording: Any, chart: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
-    """Return three things: the list of all recordings; the chart of one body, or the charts of
-    several bodies in a `Bodies`; and a tuple with the name of the body of each recording.
-
-    A chart is a map from free numbers to a possible body. If there is only one body, its name is an
-    empty text.
-
-    - `recording`: one `Recording`, a sequence of recordings, or for several bodies a dict of name →
-      one recording or a sequence of them.
-    - `chart`: the chart of the body, or for several bodies a dict of name → chart. An error is
-      raised unless both dicts have the same names.
-    """
+def _members(recording: Any, chart: Any) -> _Members:
+    """Return the recordings, charts and names that the arguments of a `Model` give."""
     if isinstance(recording, Mapping) or isinstance(chart, Mapping):
         if not (isinstance(recording, Mapping) and isinstance(chart, Mapping)):
             raise TypeError(
@@ -918,47 +731,18 @@ def _charts_and_names(recording: Any, chart: Any) -> tuple[list[Recording], Any,
                 raise ValueError(f"Model: wanted a recording of {name!r}, got none")
             rows += of_body
             names += [name] * len(of_body)
-        return rows, Bodies(chart), tuple(names)
+        return _Members(rows, Bodies(chart), tuple(names))
     if isinstance(recording, Recording):
-        return [recording], chart, ("",)
+        return _Members([recording], chart, ("",))
     rows = list(recording) if isinstance(recording, Sequence) else [recording]
-    return rows, chart, ("",) * len(rows)
+    return _Members(rows, chart, ("",) * len(rows))
 
 
-def _require_recordings(recordings: Sequence[Any]) -> None:
-    """Raise an error unless there is at least one recording, and each member of the sequence
-    `recordings` is a single `Recording` of known numbers.
-
-    A batch of recordings (arrays with a further leading axis) is refused, and so are readings that
-    are traced by JAX.
-    """
-    if not recordings:
-        raise ValueError("Model: wanted at least one Recording, got an empty sequence")
-    for item in recordings:
-        _checks.require_instance(item, Recording, "Model", requirement="a Recording")
-        if not _checks.is_known((item.t, [reading.values for reading in item.readings])):
-            raise TypeError(
-                "recording: wanted known readings, got traced ones; make the Model outside "
-                "of jax.jit, jax.grad and jax.vmap, and give it to them as an argument"
-            )
-        lengths = {item.t.shape, *(reading.mask.shape for reading in item.readings)}
-        if len(lengths) > 1 or item.t.ndim != 1:
-            raise ValueError(
-                "recording: wanted a single recording, as Recording(t, …) makes it, got times and "
-                f"masks of shapes {sorted(lengths)}; give several recordings as a sequence"
-            )
-        _checks.numeric_array(item.t, "recording")
-
-
-def _numbers_in_chart(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " chart"]:
-    """Return the free numbers (size,) that represent a `body` in a `chart` (a map from free numbers
-    to a possible body), or zeros if `body` is `None`.
-
-    An error is raised for a batch of bodies, for a body with NaN or infinity, and for a body that
-    has no finite numbers in the chart.
-    """
+def _chart_vector(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " chart"]:
+    """Return the parameters of a `body` in a `chart`, or zeros for `None`."""
     if body is None:
-        return _zeros_by_numpy(chart.size)
+        # NumPy makes the zeros, since JAX would compile a program for each shape.
+        return jnp.asarray(np.zeros(chart.size, jnp.result_type(float)))
     one = validation.require_single_body(body, (Inertia, MassProperties), "body")
     if _checks.is_known(one):
         jax.tree.map(lambda leaf: _checks.require_finite(leaf, "body"), one)
@@ -973,29 +757,13 @@ def _numbers_in_chart(chart: AbstractBodyChart, body: Body | None) -> Float[Arra
     return vector
 
 
-def _zeros_by_numpy(*shape: int) -> Array:
-    """Return an array of zeros of this `shape` (one integer for each axis) in JAX's default float
-    type.
-
-    NumPy makes the zeros, since JAX would compile a program for each shape.
-    """
-    return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
-
-
-def _smallest_state_type(
+def _state_type(
     sensors: Sequence[AbstractSensor], torque: Torque | None, charts: AbstractBodyChart | Bodies
 ) -> type:
-    """Return the smallest type of state (`Spin`, `Attitude` or `Rigid`) that the sensors and the
-    torque need.
+    """Return the smallest type of state that the sensors and the torque need.
 
-    `Rigid`, a state with a position, is needed if a sensor or the torque reads the position, or if
-    a part of the torque is a force. The equations of motion of such a state need the mass.
-
-    - `sensors`: the sensors of a recording.
-    - `torque`: the torque on the body, or `None`.
-    - `charts`: the chart (a map from free numbers to a possible body) of one body, or the charts of
-      several bodies. `ValueError` is raised if `Rigid` is needed and one of the charts describes an
-      inertia without a mass.
+    `ValueError` is raised if that is `Rigid`, whose equations of motion need the mass, and a chart
+    describes an inertia without a mass.
     """
     needed = [sensor.feels for sensor in sensors]
     if torque is not None:

@@ -12,47 +12,35 @@ from jaxtyping import Array, Float, Int
 
 
 class OwnBlocks(eqx.Module):
-    """Hold some blocks of a normal matrix of n numbers: the blocks in the rows of the own numbers
-    of each recording.
-
-    Each of R recordings has k own numbers, which no other recording has. The core is the s numbers
-    that recordings share, so that n = s + R k.
-
-    **Fields:**
-
-    - `own`: (R, k, k) the blocks of the own numbers of each recording.
-    - `sides`: (R, k, s) the blocks between the own numbers and the numbers of the core.
-    - `at`: (R, k) the indices of the own numbers among the n numbers.
-    """
+    """Hold the blocks of a normal matrix in the rows of the k own parameters of each recording."""
 
     own: Float[Array, "records k k"]
     sides: Float[Array, "records k s"]
+    # The places of the own parameters among all parameters.
     at: Int[Array, "records k"]
 
 
 class NormalMatrix(eqx.Module):
-    """Hold the normal matrix of a least-squares problem of n numbers, such as JᵀJ with the Jacobian
-    J of the residuals.
+    """Hold the normal matrix of a least-squares problem of n parameters, such as JᵀJ with the
+    Jacobian J.
 
-    **Fields:**
-
-    - `core`: (s, s) the block of the first s numbers, which recordings share.
-    - `own_blocks`: the blocks of the other numbers, each of which belongs to one recording alone.
-      `None` if there are no other numbers; then s = n.
+    The first s parameters, the core, are shared; n = s + R k for R recordings with k own
+    parameters.
     """
 
     core: Float[Array, "s s"]
+    # `None` if no recording has own parameters; then s = n.
     own_blocks: OwnBlocks | None = None
 
     @property
     def diagonal(self) -> Float[Array, " n"]:
-        """Return the diagonal (n,) of this normal matrix."""
+        """Return the diagonal of this matrix."""
         own = self.own_blocks and jnp.diagonal(self.own_blocks.own, axis1=1, axis2=2)
-        return self._join_shared_and_own(jnp.diagonal(self.core), own)
+        return self._join(jnp.diagonal(self.core), own)
 
     def add_diagonal(self, diagonal: Float[Array, " n"]) -> "NormalMatrix":
-        """Return this normal matrix with `diagonal` (n,) added to its diagonal."""
-        shared, own = self._split_shared_and_own(diagonal)
+        """Return this matrix with `diagonal` added to its diagonal."""
+        shared, own = self._split(diagonal)
         core, alone = self.core + jnp.diag(shared), self.own_blocks
         if alone is None:
             return NormalMatrix(core)
@@ -60,24 +48,18 @@ class NormalMatrix(eqx.Module):
             core, OwnBlocks(alone.own + jax.vmap(jnp.diag)(own), alone.sides, alone.at)
         )
 
-    def add_residual_rows(self, rows: Float[Array, "m n"]) -> "NormalMatrix":
-        """Return the normal matrix of a larger least-squares problem, which has m residuals more
-        than the problem of this matrix.
+    def add_rows(self, rows: Float[Array, "m n"]) -> "NormalMatrix":
+        """Return the normal matrix of the problem with m more residuals, from their Jacobian
+        `rows`.
 
-        The `rows` (m, n) are the derivatives of the m further residuals with respect to the n
-        numbers. These residuals may depend only on numbers of the core, which are the numbers
-        that recordings share.
+        These residuals may depend on the core alone.
         """
         rows = rows[:, : self.core.shape[0]]
         return NormalMatrix(self.core + rows.T @ rows, self.own_blocks)
 
-    def scale_rows_and_columns(self, unit: Float[Array, " n"]) -> "NormalMatrix":
-        """Return the matrix D M D, where M is this normal matrix and D the diagonal matrix of
-        `unit` (n,).
-
-        It is the normal matrix with respect to x / `unit` instead of the numbers x.
-        """
-        shared, own = self._split_shared_and_own(unit)
+    def scaled(self, unit: Float[Array, " n"]) -> "NormalMatrix":
+        """Return D M D for this matrix M and D = diag(`unit`): the normal matrix of x / `unit`."""
+        shared, own = self._split(unit)
         core, alone = self.core * (shared[:, None] * shared[None, :]), self.own_blocks
         if alone is None:
             return NormalMatrix(core)
@@ -86,52 +68,40 @@ class NormalMatrix(eqx.Module):
         return NormalMatrix(core, OwnBlocks(alone.own * rows * own[:, None, :], sides, alone.at))
 
     def __matmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        shared, own = self._split_shared_and_own(x)
+        shared, own = self._split(x)
         first, alone = self.core @ shared, self.own_blocks
         if alone is None:
             return first
         first = first + jnp.einsum("rks,rk->s", alone.sides, own)
         from_core = jnp.einsum("rks,s->rk", alone.sides, shared)
-        return self._join_shared_and_own(
-            first, jnp.einsum("rkl,rl->rk", alone.own, own) + from_core
-        )
+        return self._join(first, jnp.einsum("rkl,rl->rk", alone.own, own) + from_core)
 
     def solve(self, rhs: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
         """Return the solution x of `matrix @ x = rhs`, or NaN unless this matrix is positive
         definite.
-
-        `rhs` (n,) or (n, columns) holds one right-hand side or several; x has the shape of `rhs`.
         """
         alone, count = self.own_blocks, self.core.shape[0]
         if alone is None:
-            return _solve_by_cholesky(self.core, rhs)
-        shared, own = self._split_shared_and_own(rhs.reshape(rhs.shape[0], -1))
-        taken = jax.vmap(_solve_by_cholesky)(alone.own, jnp.concatenate([alone.sides, own], axis=2))
+            return _cholesky_solve(self.core, rhs)
+        shared, own = self._split(rhs.reshape(rhs.shape[0], -1))
+        taken = jax.vmap(_cholesky_solve)(alone.own, jnp.concatenate([alone.sides, own], axis=2))
         rest = jnp.einsum("rks,rkt->st", alone.sides, taken)
-        first = _solve_by_cholesky(self.core - rest[:, :count], shared - rest[:, count:])
+        first = _cholesky_solve(self.core - rest[:, :count], shared - rest[:, count:])
         last = taken[:, :, count:] - jnp.einsum("rks,st->rkt", taken[:, :, :count], first)
-        return self._join_shared_and_own(first, last).reshape(rhs.shape)
+        return self._join(first, last).reshape(rhs.shape)
 
-    def _split_shared_and_own(self, x: Array) -> tuple[Array, Array]:
-        """Return two parts of an array x (n, …), which has one entry for each of the n numbers of
-        the normal matrix.
+    def _split(self, x: Array) -> tuple[Array, Array]:
+        """Return the entries (s, …) of the core in x (n, …), and those (R, k, …) of the own
+        parameters.
 
-        The two parts are the entries (s, …) of the s numbers that recordings share; and the entries
-        (R, k, …) of the k numbers that each of R recordings has alone. If no recording has numbers
-        alone, both results are the whole of x.
+        Without own parameters both are the whole of x.
         """
         return (
             (x, x) if self.own_blocks is None else (x[: self.core.shape[0]], x[self.own_blocks.at])
         )
 
-    def _join_shared_and_own(self, shared: Array, own: Array | None) -> Array:
-        """Return an array (n, …) with one entry for each of the n numbers of the normal matrix,
-        joined from two parts.
-
-        - `shared`: (s, …) the entries of the s numbers that recordings share.
-        - `own`: (R, k, …) the entries of the k numbers that each of R recordings has alone. If no
-          recording has such numbers, `own` is not read, and the result is `shared`.
-        """
+    def _join(self, shared: Array, own: Array | None) -> Array:
+        """Return the array (n, …) that `_split` splits; without own parameters it is `shared`."""
         if self.own_blocks is None:
             return shared
         first, at = shared.shape[0], self.own_blocks.at
@@ -139,31 +109,24 @@ class NormalMatrix(eqx.Module):
         return whole.at[:first].set(shared).at[at].set(own)
 
 
-def _solve_by_cholesky(matrix: Array, rhs: Array) -> Array:
-    """Return the solution x of `matrix @ x = rhs` by Cholesky's decomposition, or NaN unless the
-    symmetric `matrix` (n, n) is positive definite.
-
-    `rhs` (n,) or (n, columns) holds one right-hand side or several; x has the shape of `rhs`.
-    """
+def _cholesky_solve(
+    matrix: Float[Array, "n n"], rhs: Float[Array, "n *columns"]
+) -> Float[Array, "n *columns"]:
+    """Return the solution x of `matrix @ x = rhs`, or NaN unless `matrix` is positive definite."""
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), rhs)
 
 
-def normal_matrix_of_jacobians(
-    jacobians: Sequence[Array], places: Array, size: int, own_columns: np.ndarray | None = None
+def normal_matrix(
+    jacobians: Sequence[Float[Array, "records ... m"]],
+    places: Int[Array, "records m"],
+    size: int,
+    own_columns: np.ndarray | None = None,
 ) -> NormalMatrix:
-    """Return the normal matrix Σ JᵀJ of the Jacobians J (R, T, j, m) of all sensors.
+    """Return the normal matrix Σ JᵀJ of the Jacobians of all sensors.
 
-    J holds the derivatives of j residuals at T times with respect to the m numbers of one of R
-    recordings.
-
-    **Arguments:**
-
-    - `jacobians`: J of each sensor.
-    - `places`: (R, m) the index of each column of J among all numbers; a column that stands for no
-      number has the index `size`.
-    - `size`: how many numbers there are in all.
-    - `own_columns`: the columns of the numbers that one recording has alone; `None` puts all
-      numbers into the core, the dense first block of the result.
+    The `places` of the columns of J among all parameters are `size` for a column that stands for
+    none. `own_columns` are the columns of the parameters that one recording has alone; with `None`
+    all parameters are in the core.
     """
     count, columns = places.shape
     alone = np.zeros(0, int) if own_columns is None else own_columns

@@ -6,7 +6,7 @@ import abc
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import diffrax as dfx
 import equinox as eqx
@@ -20,6 +20,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.identify.sensors import AbstractSensor, SensorInput
+from rigidjax.identify.sensors.base import extras
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, CoupledEquations, with_own_states
 from rigidjax.motion.torques.base import Torque
@@ -50,38 +51,23 @@ State = Spin | Attitude | Rigid
 class AbstractIntegrator(eqx.Module):
     """Integrate a forced motion inside a fit, with derivatives in forward mode.
 
-    To make an integrator of your own, write a subclass with the method `states`, which returns the
-    states at the times `ts`. At its end a fit compares its predictions with the predictions of an
-    integrator of shorter steps (`refine`). If a prediction changes by more than a twentieth of its
-    noise, the fit goes on with the shorter steps.
-
-    >>> class Halves(AbstractIntegrator):  # two equal steps from one sample to the next
-    ...     def states(self, body, state0, ts, torque):
-    ...         return FixedSteps(2).states(body, state0, ts, torque)
-    >>> issubclass(Halves, AbstractIntegrator)
-    True
+    To make an integrator of your own, write a subclass with the method `states`. At its end a fit
+    compares its predictions with those of an integrator of shorter steps (`refine`); if one changes
+    by more than a twentieth of its noise, the fit goes on with the shorter steps.
     """
 
     @abc.abstractmethod
     def states(
         self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
     ) -> PyTree:
-        """Return the states of a forced motion at the times `ts` (T,), s, with a leading time axis.
+        """Return the states of a forced motion at the times `ts`, s; `state0` is that at `ts[0]`.
 
-        The states are a `motion.Coupled` if the torque has states of its own, such as the speed of
-        a motor.
-
-        - `body`: the body.
-        - `state0`: the state at `ts[0]`.
-        - `torque`: the torque on the body.
+        They are a `motion.Coupled` if the torque has states of its own, such as the speed of a
+        motor.
         """
 
     def refine(self) -> "AbstractIntegrator | None":
-        """Return an integrator of shorter steps, or `None` if shorter steps are not possible.
-
-        A fit compares the predictions of both integrators to see whether its steps are short
-        enough.
-        """
+        """Return an integrator of shorter steps, or `None` if shorter steps are not possible."""
         return None
 
 
@@ -123,15 +109,9 @@ class FixedSteps(AbstractIntegrator):
         return FixedSteps(2 * self.substeps, self.solver, self.last)
 
 
-def _tolerance_converter(name: str) -> Callable[[ScalarLike], Array]:
-    """Return a function that converts a tolerance (one number) to an array of shape (), for use as
-    the `converter` of a dataclass field.
-
-    `name` is the name of the field. It appears in the error that the function raises unless the
-    tolerance is one number that JAX does not trace. A compiled program takes an array as an
-    argument, so that another tolerance needs no new compilation.
-    """
-    return lambda value: jnp.asarray(_checks.python_float(value, name), jnp.result_type(float))
+def _tolerance(value: ScalarLike, name: str) -> Array:
+    """Return a tolerance as an array: another one needs no new compilation."""
+    return jnp.asarray(_checks.python_float(value, name), jnp.result_type(float))
 
 
 class Adaptive(AbstractIntegrator):
@@ -145,8 +125,8 @@ class Adaptive(AbstractIntegrator):
     1e-09
     """
 
-    rtol: Float[Array, ""] = eqx.field(converter=_tolerance_converter("rtol"), default=1e-9)
-    atol: Float[Array, ""] = eqx.field(converter=_tolerance_converter("atol"), default=1e-12)
+    rtol: Float[Array, ""] = eqx.field(converter=partial(_tolerance, name="rtol"), default=1e-9)
+    atol: Float[Array, ""] = eqx.field(converter=partial(_tolerance, name="atol"), default=1e-12)
 
     def __check_init__(self):
         _checks.positive_float(self.rtol, "rtol")
@@ -179,12 +159,7 @@ class Adaptive(AbstractIntegrator):
 
 
 def integrator_for(turn: float) -> AbstractIntegrator:
-    """Return an integrator that is precise enough for a body that turns by at most `turn` rad
-    between two samples.
-
-    It takes few fixed steps between two samples if `turn` is small, and adaptive steps if it is
-    large.
-    """
+    """Return an integrator for a body that turns by at most `turn` rad between two samples."""
     if turn <= TURN_OF_ORDER_4:
         return FixedSteps(1, solvers.RungeKutta4())
     substeps = max(1, math.ceil(turn / TURN_A_STEP))
@@ -198,14 +173,7 @@ def states_at(
     ts: Float[Array, " times"],
     torque: Torque | None,
 ) -> PyTree:
-    """Return the states of a motion at the times `ts` (T,), s, with a leading time axis.
-
-    - `integrator`: the integrator of a forced motion; it is not used for a free body.
-    - `body`: the body.
-    - `state0`: the state at `ts[0]`.
-    - `torque`: the torque on the body, or `None` for a free body, whose motion is computed by the
-      closed form.
-    """
+    """Return the states of a motion at the times `ts`, s; a free body needs no `integrator`."""
     if torque is not None:
         assert integrator is not None
         return integrator.states(body, state0, ts, torque)
@@ -213,15 +181,11 @@ def states_at(
 
 
 class HeldSteps(AbstractIntegrator):
-    """Integrate with one step of order 4 from each sample to the next, and hold the inputs constant
-    in each step.
+    """Integrate with one step of order 4 between samples, and hold the inputs constant in each
+    step.
 
-    An input is a logged quantity such as a motor command. The samples must be evenly spaced in
-    time. The value of a delayed input changes inside a step; the step is then split at the change.
-
-    **Arguments:** `last` the index of the last time whose state is needed, `None` for all times.
-
-    >>> HeldSteps().last
+    The samples must be evenly spaced. If a delayed input changes inside a step, the step is split
+    there.
     """
 
     last: Int[Array, ""] | None = eqx.field(default=None, repr=False)
@@ -229,9 +193,9 @@ class HeldSteps(AbstractIntegrator):
     def states(
         self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
     ) -> PyTree:
-        return self.states_with_inputs(body, state0, ts, torque, {})
+        return self.driven_states(body, state0, ts, torque, {})
 
-    def states_with_inputs(
+    def driven_states(
         self,
         body: Body,
         state0: State,
@@ -239,17 +203,12 @@ class HeldSteps(AbstractIntegrator):
         torque: Torque,
         inputs: dict[str, Array],
     ) -> PyTree:
-        """Return the states at the times `ts` (T,), s, under a torque that reads sampled inputs,
-        with a leading time axis.
+        """Return the states at `ts` under a torque that reads sampled `inputs`, by name (before +
+        T, *k).
 
-        The torque's own states (such as the state of a motor) are first integrated over the samples
-        before `ts[0]`, while the body is held at its initial state.
-
-        - `body`, `state0`: the body, and its state at `ts[0]`.
-        - `torque`: the torque on the body.
-        - `inputs`: a dict of name → samples (before + T, *k), where `before` is the number of
-          samples before `ts[0]`. The sample in row before + i is held constant in the step from
-          `ts[i]` to `ts[i + 1]`.
+        The sample in row before + i is held in the step from `ts[i]` to `ts[i + 1]`. The torque's
+        own states, such as the speed of a motor, are first integrated over the samples before
+        `ts[0]`, while the body is held at its initial state.
         """
         count, size = ts.shape[0] - 1, (ts[1] - ts[0]).astype(state0.omega.dtype)
         before = max((len(rows) - ts.shape[0] for rows in inputs.values()), default=0)
@@ -279,26 +238,29 @@ class HeldSteps(AbstractIntegrator):
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, later)
 
 
-def shift_in_time(field: Callable[..., Any], t: Array, state: PyTree, offset: Array) -> PyTree:
-    """Return the state at the time t + `offset`, s, from the `state` at the time t, s.
-
-    It takes four equal steps of the classical Runge–Kutta method of order 4 along the equations of
-    motion `field`, a function (t, state, args) that returns the time derivative of the state.
-    """
+def shifted(field: Callable[..., Any], t: Array, state: PyTree, offset: Array) -> PyTree:
+    """Return the state at t + `offset`, s, by four equal steps of order 4 along `field`."""
     h = offset / 4.0
     for index in range(4):
         state = state_after_step(KUTTA4, lambda t, y: field(t, y, None), t + index * h, h, state)
     return state
 
 
-def drop_unneeded_mass(body: Body, state_type: type) -> Body:
-    """Return the part of a `body` that the equations of motion of a state of type `state_type`
-    need.
-
-    Only the equations of motion of a `Rigid` state need the mass; for all other states the result
-    is the `Inertia`.
+def needed_body(body: Body, state_type: type) -> Body:
+    """Return the `Inertia` of a body for all types of state but `Rigid`, which alone needs the
+    mass.
     """
     return body.inertia if isinstance(body, MassProperties) and state_type is not Rigid else body
+
+
+class Along(NamedTuple):
+    """Hold the times at which a sensor reads, and its inputs along a motion."""
+
+    # In s, after the clock offset.
+    times: Float[Array, " times"]
+    # The states at these times; a `Coupled` if the torque has states of its own.
+    states: Any
+    input_at: Callable[[Array, PyTree], SensorInput]
 
 
 def sensor_inputs(
@@ -309,23 +271,15 @@ def sensor_inputs(
     state0: State,
     states: PyTree,
     delay: Array | None = None,
-) -> tuple[Array, PyTree, Callable[[Array, PyTree], SensorInput]]:
-    """Return three things: the times at which a sensor reads; the states at these times; and a
-    function that makes the `SensorInput` from one time and state.
+) -> Along:
+    """Return what a sensor with the time stamps `ts`, s, reads along a motion.
 
-    **Arguments:**
-
-    - `sensor`: the sensor; if it has a clock offset, it reads at t + `offset` for the time stamp t.
-    - `body`, `torque`: the body and the torque of the motion.
-    - `ts`: (T,) the time stamps of the readings, s.
-    - `state0`: the initial state of the body.
-    - `states`: the states at `ts`; if the torque has states of its own (such as the speed of a
-      motor), a `Coupled`, which holds the states of the body and of the torque.
-    - `delay`: a further time, s, that is added to the clock offset, one number or (T,).
+    The `states` are those at `ts`. `delay`, one number or one for each time, s, is added to the
+    clock offset of the sensor.
     """
-    turned = drop_unneeded_mass(body, type(state0))
+    turned = needed_body(body, type(state0))
     field = equations_of_motion(turned, state0, torque)
-    offset, times = getattr(sensor, "offset", None), ts
+    offset, times = extras(sensor).offset, ts
     if delay is not None:
         offset = delay if offset is None else offset + delay
     if offset is not None:
@@ -335,77 +289,48 @@ def sensor_inputs(
         else:
             whole = CoupledEquations(field, turned) if isinstance(states, Coupled) else field
             axes = (0, 0, 0 if jnp.ndim(offset) else None)
-            states = jax.vmap(partial(shift_in_time, whole), axes)(ts, states, offset)
+            states = jax.vmap(partial(shifted, whole), axes)(ts, states, offset)
 
     def input_at(t: Array, state: PyTree) -> SensorInput:
         if not isinstance(state, Coupled):
             return SensorInput(t, state, body, field)
         return SensorInput(t, state.motion, body, freeze_own_states(field, state.own), state.own)
 
-    return times, states, input_at
+    return Along(times, states, input_at)
 
 
 def errors_along(
-    sensor: AbstractSensor,
-    values: Array,
-    times: Array,
-    states: PyTree,
-    input_at: Callable[[Array, PyTree], SensorInput],
+    sensor: AbstractSensor, values: Float[Array, "times *shape"], along: Along
 ) -> Float[Array, "times k"]:
-    """Return the errors (T, k), reading minus prediction, of the readings of a sensor along a
-    motion.
-
-    - `sensor`: the sensor, whose error has k components.
-    - `values`: (T, …) the readings.
-    - `times`: (T,) the times at which the sensor reads, s.
-    - `states`: the states at these times, with a leading time axis.
-    - `input_at`: a function of a time and a state that returns the `SensorInput` from which the
-      sensor predicts its reading.
-
-    The arguments `times`, `states` and `input_at` are the results of `sensor_inputs`.
-    """
+    """Return the errors of a sensor along a motion, reading minus prediction."""
+    name, wanted = type(sensor).__name__, (sensor.components,)
 
     def error(t: Array, state: PyTree, value: Array) -> Array:
-        return _checked_error(sensor, input_at(t, state), value)
+        # A user may have written the sensor's method `error`.
+        motion = along.input_at(t, state)
+        try:
+            error = sensor.error(motion, value)
+        except AttributeError as wrong:
+            if type(motion.state).__name__ not in str(wrong):
+                raise
+            raise TypeError(
+                f"{name}.error: {wrong}; it has feels = {sensor.feels.__name__}, but it reads more "
+                "than that: set feels = rj.motion.HasAttitude, or rj.motion.HasPose"
+            ) from wrong
+        if jnp.shape(error) != wanted:
+            raise ValueError(
+                f"{name}.error: wanted reading minus prediction of shape {wanted}, as components = "
+                f"{sensor.components} says, got {jnp.shape(error)}"
+            )
+        return error
 
-    lowpass = getattr(sensor, "lowpass", None)
+    times, states, _ = along
+    lowpass = extras(sensor).lowpass
     if lowpass is None:
         return jax.vmap(error)(times, states, values)
     # The error of a reading of zero is minus the prediction. The low-pass filter smooths this
     # prediction, not the reading.
     return values + lowpass(times, jax.vmap(error)(times, states, jnp.zeros_like(values)))
-
-
-def _checked_error(sensor: AbstractSensor, motion: SensorInput, value: Array) -> Array:
-    """Return the error (k,), reading minus prediction, of one reading of a `sensor` whose error has
-    k components, after checks.
-
-    A user may have written the sensor's method `error`. A `TypeError` is raised if this method
-    reads a part of the state that the sensor's member `feels` does not name, and a `ValueError` if
-    it returns another shape than (k,).
-
-    - `sensor`: the sensor.
-    - `motion`: what the sensor predicts the reading from: time, state, body and equations of
-      motion.
-    - `value`: the reading.
-    """
-    name = type(sensor).__name__
-    try:
-        error = sensor.error(motion, value)
-    except AttributeError as wrong:
-        if type(motion.state).__name__ not in str(wrong):
-            raise
-        raise TypeError(
-            f"{name}.error: {wrong}; it has feels = {sensor.feels.__name__}, but it reads more "
-            "than that: set feels = rj.motion.HasAttitude, or rj.motion.HasPose"
-        ) from wrong
-    wanted = (sensor.components,)
-    if jnp.shape(error) != wanted:
-        raise ValueError(
-            f"{name}.error: wanted reading minus prediction of shape {wanted}, as components = "
-            f"{sensor.components} says, got {jnp.shape(error)}"
-        )
-    return error
 
 
 def simulate_readings(
@@ -452,22 +377,46 @@ def simulate_readings(
     if not sensors:
         raise ValueError("sensor: wanted a sensor or several, got none")
     for one in sensors:
-        _require_sensor_for_simulation(one, state0, key)
+        name, wanted = type(one).__name__, "a sensor such as Gyro(0.01), or several"
+        _checks.require_instance(one, AbstractSensor, "sensor", requirement=wanted)
+        if not isinstance(state0, one.feels):
+            raise TypeError(
+                f"{name} needs a state with {one.feels.__name__}, got {type(state0).__name__}; "
+                "take Attitude, or Rigid for what depends on the position"
+            )
+        if one.noise is not None and jnp.shape(one.noise) != (one.components,):
+            raise ValueError(
+                f"sensor: {name}: noise: wanted shape ({one.components},), of one sensor, got "
+                f"{jnp.shape(one.noise)}; for many use jax.vmap"
+            )
+        if key is not None and one.noise is None:
+            raise ValueError(
+                f"{name}: noise=None gives no size of the noise to draw; give noise, or key=None"
+            )
+        jitter, lowpass = extras(one).jitter, extras(one).lowpass
+        if key is not None and jitter is not None and (jitter.estimated or lowpass is not None):
+            raise ValueError(
+                f"{name}: wanted a jitter in s, and no lowpass beside it, to draw times; or "
+                "key=None"
+            )
+        if extras(one).reading_of is None and math.prod(one.reading_shape) != one.components:
+            raise ValueError(
+                f"{name}: its readings of shape {one.reading_shape} are not its error of "
+                f"{one.components} numbers plus a prediction; write a method reading_of(motion, "
+                "error), the reading whose error is this one"
+            )
     start: Any = state0
-    sol = simulate(drop_unneeded_mass(body, type(state0)), start, ts, torque)
+    sol = simulate(needed_body(body, type(state0)), start, ts, torque)
     states = sol.ys if sol.own is None else Coupled(sol.ys, sol.own)
     count = len(sensors)
     keys = [None] * count if key is None else jax.random.split(_checks.random_key(key), count)
     motion = body, torque, sol.ts, start, states
-    out = tuple(
-        _readings_along_motion(one, *motion, key=own)
-        for one, own in zip(sensors, keys, strict=True)
-    )
+    out = tuple(_readings(one, *motion, key=own) for one, own in zip(sensors, keys, strict=True))
     return out if several else out[0]
 
 
 @eqx.filter_jit
-def _readings_along_motion(
+def _readings(
     sensor: AbstractSensor,
     body: Inertia | MassProperties,
     torque: Torque | None,
@@ -477,74 +426,22 @@ def _readings_along_motion(
     *,
     key: PRNGKeyArray | None,
 ) -> Float[Array, "times ..."]:
-    """Return the readings (T, *reading_shape) of one sensor at T times along a motion, in the unit
-    of the sensor, computed in one compiled program.
-
-    `reading_shape` is the shape of one reading of the sensor.
-
-    - `sensor`: the sensor, with its bias, clock offset, low-pass filter and full scale.
-    - `body`, `torque`: the body, and the torque of the motion or `None`.
-    - `ts`: (T,) the time stamps of the readings, s.
-    - `state0`: the initial state of the body.
-    - `states`: the states at `ts`; if the torque has states of its own (such as the speed of a
-      motor), a `Coupled`, which holds the states of the body and of the torque.
-    - `key`: the random key of the noise and of the jitter (random error of the time stamps); `None`
-      for readings without noise and jitter.
-    """
-    jitter, late = getattr(sensor, "jitter", None), None
-    if key is not None and jitter is not None:
+    """Return the readings of one sensor at the time stamps `ts` along a motion, in one program."""
+    members, late = extras(sensor), None
+    if key is not None and members.jitter is not None:
         key, own = jax.random.split(key)
-        late = jitter.deviation * jax.random.normal(own, ts.shape, ts.dtype)
-    times, states, input_at = sensor_inputs(sensor, body, torque, ts, state0, states, late)
+        late = members.jitter.deviation * jax.random.normal(own, ts.shape, ts.dtype)
+    along = sensor_inputs(sensor, body, torque, ts, state0, states, late)
     error = jnp.zeros((ts.shape[0], sensor.components), ts.dtype)
     if key is not None:
         assert sensor.noise is not None
         error = sensor.noise[None] * jax.random.normal(key, error.shape, ts.dtype)
-    reading = getattr(sensor, "reading_of", None)
+    reading = members.reading_of
     if reading is not None:
-        values = jax.vmap(lambda t, y, e: reading(input_at(t, y), e))(times, states, error)
+        values = jax.vmap(lambda t, y, e: reading(along.input_at(t, y), e))(*along[:2], error)
     else:
         nothing = jnp.zeros((ts.shape[0], *sensor.reading_shape), ts.dtype)
-        missed = errors_along(sensor, nothing, times, states, input_at)
+        missed = errors_along(sensor, nothing, along)
         values = (error - missed).reshape(ts.shape[0], *sensor.reading_shape)
-    limit = getattr(sensor, "limit", None)
+    limit = members.limit
     return values if limit is None else jnp.clip(values, -limit[None], limit[None])
-
-
-def _require_sensor_for_simulation(sensor: PyTree, state0: State, key: object) -> None:
-    """Raise an error unless `sensor` is a sensor whose readings of a motion can be simulated.
-
-    - `sensor`: must be a single sensor, not a batch. Its readings must have as many numbers as its
-      error has components, unless the sensor has a method `reading_of`.
-    - `state0`: the initial state of the motion, which must have the parts that the sensor reads.
-    - `key`: a random key, or `None` for readings without noise and jitter. With a key the noise of
-      the sensor must be known. With a key a sensor that has jitter (a random error of its time
-      stamps) must have jitter of known size and no low-pass filter.
-    """
-    name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
-    _checks.require_instance(sensor, AbstractSensor, "sensor", requirement=wanted)
-    if not isinstance(state0, sensor.feels):
-        raise TypeError(
-            f"{name} needs a state with {sensor.feels.__name__}, got {type(state0).__name__}; take "
-            "Attitude, or Rigid for what depends on the position"
-        )
-    if sensor.noise is not None and jnp.shape(sensor.noise) != (sensor.components,):
-        raise ValueError(
-            f"sensor: {name}: noise: wanted shape ({sensor.components},), of one sensor, got "
-            f"{jnp.shape(sensor.noise)}; for many use jax.vmap"
-        )
-    if key is not None and sensor.noise is None:
-        raise ValueError(
-            f"{name}: noise=None gives no size of the noise to draw; give noise, or key=None"
-        )
-    jitter, lowpass = getattr(sensor, "jitter", None), getattr(sensor, "lowpass", None)
-    if key is not None and jitter is not None and (jitter.estimated or lowpass is not None):
-        raise ValueError(
-            f"{name}: wanted a jitter in s, and no lowpass beside it, to draw times; or key=None"
-        )
-    if not hasattr(sensor, "reading_of") and math.prod(sensor.reading_shape) != sensor.components:
-        raise ValueError(
-            f"{name}: its readings of shape {sensor.reading_shape} are not its error of "
-            f"{sensor.components} numbers plus a prediction; write a method reading_of(motion, "
-            "error), the reading whose error is this one"
-        )

@@ -99,13 +99,6 @@ class Huber(AbstractLoss):
         return 1.0 / jnp.sqrt(jnp.maximum(s, 1.0))
 
 
-def _checked_weight(value: float) -> Scalar:
-    """Return the weight of a prior, the factor by which its term in the cost is multiplied, as an
-    array of shape (), and raise `ValueError` unless the number `value` is positive.
-    """
-    return jnp.asarray(_checks.positive_float(value, "weight"), jnp.result_type(float))
-
-
 class Entropic(eqx.Module):
     """Define the entropic prior `w D(body, guess)`, where D is the log-determinant divergence of
     two bodies.
@@ -126,7 +119,9 @@ class Entropic(eqx.Module):
     """
 
     guess: Inertia | MassProperties
-    weight: Scalar = eqx.field(converter=_checked_weight)
+    weight: Scalar = eqx.field(
+        converter=lambda w: jnp.asarray(_checks.positive_float(w, "weight"), jnp.result_type(float))
+    )
 
     def __check_init__(self) -> None:
         validation.require_single_body(self.guess, (Inertia, MassProperties), "guess")
@@ -151,36 +146,22 @@ class Entropic(eqx.Module):
         factor = jnp.linalg.cholesky(jnp.linalg.solve(root, half.T))
         n = factor.shape[0]
         rows, columns = jnp.tril_indices(n, -1)
-        parts = jnp.concatenate(
-            [factor[rows, columns], _signed_root_of_divergence(jnp.diagonal(factor))]
-        )
+        # The divergence of each variance c² from the variance 1 has a root that is smooth at c = 1
+        # if it has the sign of c − 1. Near c = 1 the formula would lose its digits; the series is
+        # that in (1 + x)² − 1 − 2 log(1 + x) = 2 x² (1 − x/3 + x²/4 − x³/5 + …).
+        c = jnp.diagonal(factor)
+        x = c - 1.0
+        near = jnp.abs(x) < 1e-2
+        series = 1.0 - x * (1 / 3 - x * (1 / 4 - x * (1 / 5 - x * (1 / 6 - x * (1 / 7 - x / 8)))))
+        far = jnp.where(near, 2.0, c)
+        exact = jnp.sign(far - 1.0) * jnp.sqrt(far * far - 1.0 - 2.0 * jnp.log(far))
+        signed = jnp.where(near, x * jnp.sqrt(2.0 * series), exact)
+        parts = jnp.concatenate([factor[rows, columns], signed])
         return jnp.sqrt(2.0 * self.weight) * parts
 
 
-def _signed_root_of_divergence(c: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return `√(c² − 1 − 2 log c)` with the sign of c − 1 for each of n positive numbers c (n,).
-
-    With this sign the root is a smooth function of c also at c = 1, where the root is zero. Its
-    square is the log-determinant divergence of the variance c² from the variance 1. Near c = 1 the
-    root is computed by a series, since the formula would lose its digits there.
-    """
-    x = c - 1.0
-    near = jnp.abs(x) < 1e-2
-    # This is the series in parentheses in (1 + x)² − 1 − 2 log(1 + x) = 2 x² (1 − x/3 + x²/4 − x³/5
-    # + …).
-    series = 1.0 - x * (1 / 3 - x * (1 / 4 - x * (1 / 5 - x * (1 / 6 - x * (1 / 7 - x / 8)))))
-    far = jnp.where(near, 2.0, c)
-    exact = jnp.sign(far - 1.0) * jnp.sqrt(far * far - 1.0 - 2.0 * jnp.log(far))
-    return jnp.where(near, x * jnp.sqrt(2.0 * series), exact)
-
-
 def _pseudo_inertia(body: MassProperties) -> Float[Array, "4 4"]:
-    """Return the pseudo-inertia J (4, 4) of a `body`: the second moments `J = ∫ r̃ r̃ᵀ dm` of the
-    four-vectors r̃ = (r, 1).
-
-    Here r is the position of the mass element dm in the body frame, and the integral is over the
-    body.
-    """
+    """Return the pseudo-inertia `J = ∫ r̃ r̃ᵀ dm` of a `body`, with the four-vectors r̃ = (r, 1)."""
     m, c = body.mass, body.com
     upper = body.second_moment + m * c[:, None] * c[None, :]
     side = (m * c)[:, None]

@@ -43,9 +43,7 @@ class Scene(eqx.Module):
 
 
 def require_unknown_torque(process: PyTree) -> None:
-    """Raise `TypeError` unless `process` is an unknown torque (a `RandomTorque` or
-    `CorrelatedTorque`), or a `Sum` of unknown torques.
-    """
+    """Raise `TypeError` unless `process` is an unknown torque, or a `Sum` of unknown torques."""
     wanted = "a RandomTorque, a CorrelatedTorque or a Sum of them"
     for part in parts_of(process) or (process,):
         _checks.require_instance(
@@ -54,9 +52,7 @@ def require_unknown_torque(process: PyTree) -> None:
 
 
 def require_known_torque(torque: Torque | None) -> None:
-    """Raise `TypeError` if the `torque` or a summand of it is an unknown torque (a `RandomTorque`
-    or `CorrelatedTorque`), which belongs in the argument `process` of a `Model`.
-    """
+    """Raise `TypeError` if the `torque` or a summand of it is an unknown torque."""
     for part in parts_of(torque):
         if isinstance(part, RandomTorque | CorrelatedTorque):
             raise TypeError(

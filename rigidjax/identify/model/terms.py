@@ -1,7 +1,7 @@
 """Compute the errors of all readings, and their derivatives recording by recording."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,18 +11,19 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
 from rigidjax.identify.data import stacking
-from rigidjax.identify.data.recording import Recording, inputs_as_functions
+from rigidjax.identify.data.recording import Recording, input_functions
 from rigidjax.identify.data.reference_states import ReferenceStates
-from rigidjax.identify.model.charts import Bodies, body_of_recording
+from rigidjax.identify.model.charts import Bodies, body_at
 from rigidjax.identify.model.free import with_steps
 from rigidjax.identify.model.predict import (
     HeldSteps,
-    drop_unneeded_mass,
     errors_along,
+    needed_body,
     sensor_inputs,
     states_at,
 )
 from rigidjax.identify.model.scene import Scene
+from rigidjax.identify.sensors.base import extras
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import Input, bind
 from rigidjax.rotation.barrier import match_batch_axes, platform
@@ -30,80 +31,92 @@ from rigidjax.rotation.barrier import match_batch_axes, platform
 if TYPE_CHECKING:
     from rigidjax.identify.model.model import Model
 
-# A `Row` holds the free numbers of one recording. A `BodyIndex` is the index of the body of a
-# recording among several bodies, or `None` for one body.
+# A `Row` holds the parameters of one recording, as `Index` describes. A `BodyIndex` is the index of
+# the body of a recording among several bodies, or `None` for one body.
 Row = Float[Array, " columns"]
 BodyIndex = Array | None
-# `Blocks` are two tuples with one array for each sensor, for R recordings, T times and k
-# components: the errors (R, T, k); and the derivatives (R, T, k, m) of these errors with respect to
-# the m free numbers on which a recording depends (its row).
-Blocks = tuple[tuple[Array, ...], tuple[Array, ...]]
-# `SensorErrors` holds one array for each sensor, such as its errors (R, T, k).
+# `SensorErrors` holds one array for each sensor, such as its errors (R, T, k), for R recordings, T
+# times and k components.
 SensorErrors = tuple[Array | np.ndarray, ...]
-# `Noise` holds the standard deviations (R, k) of each sensor, for R recordings and k components.
+# `Noise` holds the standard deviations (R, k) of each sensor.
 Noise = tuple[Float[Array, "records _"], ...]
 
 
-def scene_at_starting_values(model: "Model", record: Recording) -> Scene:
-    """Return the scene (torques and sensors) of a recording, in which all free numbers have their
-    starting values. Its body and initial state are still `None`.
+class FirstOrder(NamedTuple):
+    """Hold the value of a function and its Jacobian, both arrays or pytrees of arrays."""
 
-    `model` has the torques, and `record` the sensors.
-    """
+    value: Any
+    # The parameters are the last axis of each array.
+    jacobian: Any
+
+
+# `Blocks` holds for each sensor the errors (R, T, k), and their Jacobian (R, T, k, m) with respect
+# to the m columns of a row.
+Blocks = FirstOrder
+
+
+class Motion(NamedTuple):
+    """Hold the states at the times of a recording, and the torque with its inputs."""
+
+    # The states have a leading time axis.
+    states: Any
+    torque: Torque | None
+
+
+class White(NamedTuple):
+    """Hold independent errors of variance one."""
+
+    errors: Float[Array, "*rows k"]
+    # The variance of each component if all before it are given: the squares of the diagonal of L.
+    log_variances: Float[Array, "*rows k"]
+
+
+class Standardised(NamedTuple):
+    """Hold the errors of one sensor in standard deviations."""
+
+    errors: Float[Array, "times k"]
+    # True for a channel at full scale.
+    saturated: Bool[Array, "times k"]
+    # The logarithm of the factor by which jitter multiplies each variance; `None` without jitter.
+    widening: Float[Array, "times k"] | None
+
+
+def starting_scene(model: "Model", record: Recording) -> Scene:
+    """Return the scene of a recording at the starting values, without body and initial state."""
     return Scene(None, model.torque, model.process, record.sensors, None)
 
 
-def scene_from_row(
+def scene_at(
     model: "Model", row: Row, record: Recording, reference: ReferenceStates, body_index: BodyIndex
 ) -> Scene:
-    """Return the scene (body, torques, sensors, initial state) of one recording at given free
-    numbers.
-
-    - `row`: the free numbers of the recording: those of its body, of the `Free`s (other numbers
-      that a fit may move), and of its initial state, as `Index` describes.
-    - `record`: the recording.
-    - `reference`: a known state of the recording; the free numbers of its initial state are changes
-      of this state.
-    - `body_index`: the index of the body of the recording among several bodies, or `None` for one
-      body.
-    """
-    scene = with_steps(scene_at_starting_values(model, record), model.slots, row)
-    body = body_of_recording(model.chart, row, body_index)
-    start = reference.initial_state_at(row[model.index.first :])
+    """Return the scene of one recording at its parameters, which its `row` holds."""
+    scene = with_steps(starting_scene(model, record), model.slots, row)
+    body = body_at(model.chart, row, body_index)
+    start = reference.initial(row[model.index.first :])
     return Scene(body, scene.torque, scene.process, scene.sensors, start)
 
 
-def states_and_torque_of_scene(
-    model: "Model", scene: Scene, record: Recording
-) -> tuple[PyTree, Torque | None]:
-    """Return two things: the states at the times of a recording, with a leading time axis; and the
-    torque of the scene, with the inputs (logged quantities) of the recording bound to it.
-
-    - `model`: the model, whose integrator is used.
-    - `scene`: the body, the torque and the initial state.
-    - `record`: the recording, with the times and the inputs.
-    """
+def motion_in(model: "Model", scene: Scene, record: Recording) -> Motion:
+    """Return the states at the times of a recording, and the torque that reads its inputs."""
     assert scene.body is not None and scene.start is not None
-    body: Any = drop_unneeded_mass(scene.body, model.state_kind)
+    body: Any = needed_body(scene.body, model.state_kind)
     functions = {name: source for name, source in record.inputs.items() if callable(source)}
     if isinstance(model.integrator, HeldSteps) and scene.torque is not None:
         samples = {n: rows for n, rows in record.inputs.items() if n not in functions}
         unbound = {name: Input(name) for name in samples}
         torque = bind(scene.torque, functions | unbound)
-        states = model.integrator.states_with_inputs(body, scene.start, record.t, torque, samples)
-        return states, torque_with_inputs(scene, record)
-    torque = torque_with_inputs(scene, record)
-    return states_at(model.integrator, body, scene.start, record.t, torque), torque
+        states = model.integrator.driven_states(body, scene.start, record.t, torque, samples)
+        return Motion(states, bound_torque(scene, record))
+    torque = bound_torque(scene, record)
+    states = states_at(model.integrator, body, scene.start, record.t, torque)
+    return Motion(states, torque)
 
 
-def torque_with_inputs(scene: Scene, record: Recording) -> Torque | None:
-    """Return the torque of a `scene` that reads the inputs (logged quantities such as a motor
-    command) of the recording `record`, or `None` without a torque.
-    """
-    return bind(scene.torque, inputs_as_functions(record))
+def bound_torque(scene: Scene, record: Recording) -> Torque | None:
+    return bind(scene.torque, input_functions(record))
 
 
-def errors_in_sensor_units(
+def sensor_errors(
     model: "Model",
     row: Row,
     record: Recording,
@@ -111,55 +124,37 @@ def errors_in_sensor_units(
     body_index: BodyIndex,
     delay: Array | None = None,
 ) -> tuple[Array, ...]:
-    """Return the errors (T, k) of each sensor in one recording, in the unit of the sensor.
+    """Return the errors of each sensor in one recording, in the unit of the sensor.
 
-    The error is reading minus prediction; it is zero for a masked reading.
-
-    **Arguments:**
-
-    - `row`: the free numbers of the recording.
-    - `record`: the readings of the recording.
-    - `reference`: a known state of the recording; the free numbers of its initial state are changes
-      of this state.
-    - `body_index`: the index of the body of the recording, or `None` for one body.
-    - `delay`: a time, s, that is added to the clock offset of each sensor; `None` for none.
+    The error is reading minus prediction, and zero for a masked reading. `delay`, s, is added to
+    the clock offset of each sensor.
     """
-    scene = scene_from_row(model, row, record, reference, body_index)
-    return errors_of_scene(model, scene, record, delay)
+    scene = scene_at(model, row, record, reference, body_index)
+    return scene_errors(model, scene, record, delay)
 
 
-def errors_of_scene(
+def scene_errors(
     model: "Model", scene: Scene, record: Recording, delay: Array | None = None
 ) -> tuple[Array, ...]:
-    """Return the errors (T, k) of each sensor in its unit, for a given `scene` (body, torques,
-    sensors, initial state) of the recording `record`.
-
-    The error is reading minus prediction; it is zero for a masked reading. `delay` is a time, s,
-    that is added to the clock offset of each sensor; `None` for none.
+    """Return the errors of each sensor in a `scene` of the recording `record`, as `sensor_errors`
+    does.
     """
-    states, torque = states_and_torque_of_scene(model, scene, record)
+    states, torque = motion_in(model, scene, record)
     assert scene.body is not None and scene.start is not None
     out, motion = [], (scene.body, torque, record.t, scene.start, states)
     for reading, sensor in zip(record.readings, scene.sensors, strict=True):
-        errors = errors_along(sensor, reading.values, *sensor_inputs(sensor, *motion, delay))
+        errors = errors_along(sensor, reading.values, sensor_inputs(sensor, *motion, delay))
         out.append(jnp.where(reading.mask[:, None], errors, 0.0))
     return tuple(out)
 
 
-def map_over_recordings(function: Callable[..., PyTree], model: "Model", *arguments: PyTree) -> Any:
-    """Return `function(*arguments, record, reference, body_index)` of every recording, with a
-    leading axis of recordings.
+def map_recordings(function: Callable[..., PyTree], model: "Model", *arguments: PyTree) -> Any:
+    """Return `function(*arguments, record, reference, body_index)` of every recording.
 
-    On a CPU the recordings are computed one after another. XLA compiles the loop over the times of
-    one recording, which changes a few dozen numbers in each step, to one kernel. Batched over
-    recordings, this loop runs at half the speed. On other devices all recordings are computed
-    together.
-
-    - `function`: a function of one recording.
-    - `model`: the model, which has the R recordings, their reference states, and the index of the
-      body of each recording.
-    - `arguments`: trees of arrays with a leading axis (R,), such as the free numbers of each
-      recording; `function` is called with the parts of one recording.
+    The arguments and the result have a leading axis of recordings. On a CPU the recordings are
+    computed one after another: XLA compiles the loop over the times of one recording, which changes
+    a few dozen numbers in each step, to one kernel. Batched over recordings this loop runs at half
+    the speed.
     """
     trees = *arguments, model.records, model.reference, model.body_indices
     arrays, rest = eqx.partition(trees, eqx.is_array)
@@ -171,7 +166,7 @@ def map_over_recordings(function: Callable[..., PyTree], model: "Model", *argume
         # For a single recording the function is called directly: a loop over recordings would only
         # make the compiled program larger.
         return jax.tree.map(
-            lambda leaf: leaf[None], function_of_recording(stacking.pick_records(arrays, 0))
+            lambda leaf: leaf[None], function_of_recording(stacking.pick(arrays, 0))
         )
     if platform() == "cpu":
         return lax.map(function_of_recording, arrays, batch_size=1)
@@ -179,220 +174,149 @@ def map_over_recordings(function: Callable[..., PyTree], model: "Model", *argume
 
 
 def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
-    """Return the errors (R, T, k), reading minus prediction, of each sensor at the free numbers x
-    (n,) of a `model`, in the unit of the sensor.
+    """Return the errors of each sensor of a `model` in the sensor's unit, reading minus prediction.
 
-    Derivatives with respect to x are computed recording by recording, in forward mode.
+    Derivatives are computed as by `map_rows`.
     """
-    return differentiable_map_over_recordings(
-        model.index.rows_of_recordings(x), model, errors_in_sensor_units
-    )
+    return map_rows(model.index.rows(x), model, sensor_errors)
 
 
 @eqx.filter_custom_jvp
-def differentiable_map_over_recordings(
+def map_rows(
     rows: Float[Array, "records columns"], model: "Model", function: Callable[..., PyTree]
 ) -> Any:
-    """Return `function(model, row, record, reference, body_index)` of every recording, with a
-    leading axis of recordings.
+    """Return `function(model, row, record, reference, body_index)` of every recording.
 
-    The last four arguments are the free numbers, the readings, the reference state and the index of
-    the body of one recording. Only derivatives with respect to the rows are defined. They are
-    computed recording by recording, in forward mode.
-
-    - `rows`: (R, columns) the free numbers of each of R recordings, one row for each recording.
-    - `function`: a function such as `errors_in_sensor_units`, which returns an array or a tree of
-      arrays for one recording.
+    Only derivatives with respect to the rows are defined; they are computed recording by recording,
+    in forward mode.
     """
 
     def function_of_row(row: Row, *rest: PyTree) -> Any:
         return function(model, row, *rest)
 
-    return match_batch_axes(map_over_recordings(function_of_row, model, rows), rows)
+    return match_batch_axes(map_recordings(function_of_row, model, rows), rows)
 
 
-@differentiable_map_over_recordings.def_jvp
-def _jvp_of_map_over_recordings(
+@map_rows.def_jvp
+def _map_rows_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[PyTree, PyTree]:
-    """Return two things: the values of a function for each of R recordings, with a leading axis
-    (R,); and the derivatives of these values along a change of the free numbers.
-
-    It is the rule by which JAX differentiates `differentiable_map_over_recordings`. An error is
-    raised if anything but the free numbers changes.
-
-    - `primals`: the three arguments of `differentiable_map_over_recordings`: the free numbers (R,
-      columns) of each of R recordings; the model; and the function.
-    - `tangents`: the changes of these three arguments.
-    """
     (rows, model, function), (step, *rest) = primals, tangents
     if jax.tree.leaves(rest):
         raise TypeError(
             "model: wanted derivatives in the free numbers x alone, not in the numbers of the "
             "model; make them free by a Free(where, name)"
         )
-    out, slopes = _values_and_jacobians(model, rows, function)
+    out, slopes = _row_jacobians(model, rows, function)
     along = jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, step), slopes)
     return match_batch_axes(out, rows), along
 
 
-def errors_and_jacobians(
-    model: "Model", x: Float[Array, " n"], function: Callable[..., PyTree] = errors_in_sensor_units
-) -> tuple[Any, Any]:
-    """Return two things: the value of `function` for each of R recordings (R, …); and its
-    derivatives (R, …, m) with respect to the m free numbers of the recording.
+def error_jacobians(
+    model: "Model", x: Float[Array, " n"], function: Callable[..., PyTree] = sensor_errors
+) -> FirstOrder:
+    """Return the value of `function` for each recording, and its Jacobian with respect to the row.
 
-    The indices of these m free numbers among all free numbers are the row of the recording in
-    `model.index.places` (R, m).
-
-    - `x`: (n,) the free numbers of the `model`.
-    - `function`: a function such as `errors_in_sensor_units`, with the same arguments, of one
-      recording.
+    The last axis (m) of the Jacobian is that of `model.index.places`.
     """
-    out, slopes = _values_and_jacobians(model, model.index.rows_of_recordings(x), function)
+    out, slopes = _row_jacobians(model, model.index.rows(x), function)
     columns = jnp.asarray(model.index.columns, jnp.int32)
     if columns.size > model.index.width:
         slopes = jax.tree.map(lambda block: block[..., columns], slopes)
-    return out, slopes
+    return FirstOrder(out, slopes)
 
 
-def _values_and_jacobians(
-    model: "Model", rows: Array, function: Callable[..., PyTree[Array]]
-) -> tuple[PyTree[Array], PyTree[Array]]:
-    """Return two things: the value of `function` for every recording, with a leading axis (R,) of
-    recordings; and the derivatives of these values with respect to the free numbers of the
-    recording, along a new last axis.
+def _row_jacobians(
+    model: "Model", rows: Float[Array, "records columns"], function: Callable[..., PyTree[Array]]
+) -> FirstOrder:
+    """Return the value of a `function` for `map_rows`, and its Jacobian in the rows."""
 
-    - `model`: the model, which has the R recordings.
-    - `rows`: (R, columns) the free numbers of each recording.
-    - `function`: a function of one recording, called as `function(model, row, record, reference,
-      body_index)` with the free numbers, the readings, the reference state and the index of the
-      body of the recording. It returns an array or a tree of arrays, such as the errors of the
-      readings.
-    """
-
-    def value_and_jacobian(row: Row, *rest: PyTree) -> tuple[PyTree, PyTree]:
+    def linear(row: Row, *rest: PyTree) -> FirstOrder:
         # Forward mode is cheaper than reverse mode, to compile and to run, for a dozen numbers and
         # one long loop over time.
-        slopes, out = jacobian_and_value(lambda row: function(model, row, *rest), row)
-        return out, slopes
+        return value_and_jacfwd(lambda row: function(model, row, *rest), row)
 
-    return map_over_recordings(value_and_jacobian, model, rows)
+    return map_recordings(linear, model, rows)
 
 
 @eqx.filter_jit
-def error_derivatives_by_delay(
-    model: "Model", x: Float[Array, " n"]
-) -> tuple[Float[Array, "..."], ...]:
-    """Return, for each sensor, the derivative (R, T, k) of its errors with respect to a delay of
-    its clock, in the sensor's unit per second, at the free numbers x (n,) of the `model`.
+def delay_slopes(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
+    """Return the derivative of each sensor's errors with respect to a delay of its clock, per
+    second.
     """
 
     def derivative_of_recording(row: Row, *rest: PyTree) -> Any:
         now = jnp.zeros((), model.records.t.dtype)
-        return jax.jvp(
-            lambda s: errors_in_sensor_units(model, row, *rest, delay=s), (now,), (now + 1,)
-        )[1]
+        return jax.jvp(lambda s: sensor_errors(model, row, *rest, delay=s), (now,), (now + 1,))[1]
 
-    return map_over_recordings(derivative_of_recording, model, model.index.rows_of_recordings(x))
+    return map_recordings(derivative_of_recording, model, model.index.rows(x))
 
 
-def jacobian_and_value(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tuple[Any, Any]:
-    """Return two things, computed in forward mode: the derivatives (…, n) of a function at x with
-    respect to x; and the value (…) of the function.
-    """
+def value_and_jacfwd(function: Callable[[Array], Any], x: Float[Array, " n"]) -> FirstOrder:
+    """Return the value of a `function` at x and its Jacobian, by forward mode."""
 
     def value_and_aux(x: Array) -> tuple[PyTree, PyTree]:
         value = function(x)
         return value, value
 
-    return jax.jacfwd(value_and_aux, has_aux=True)(x)
+    jacobian, value = jax.jacfwd(value_and_aux, has_aux=True)(x)
+    return FirstOrder(value, jacobian)
 
 
 def whiten(model: "Model", errors: SensorErrors, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors (R, T, k) of each sensor in standard deviations.
-
-    Jitter, which is the random error of time stamps, correlates the errors of the k components of a
-    reading; these errors are made independent. A reading at full scale is treated as a limit of the
-    true value. Both are done by `standardised_errors_and_saturation`.
-
-    - `model`: the model, which has the readings of R recordings.
-    - `errors`: for each sensor the errors (R, T, k) in its unit.
-    - `noise`: for each sensor the standard deviations (R, k) of its noise.
-    """
+    """Return the errors of each sensor in standard deviations, as `standardise` computes them."""
     out = []
     for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
-        limit = getattr(reading.sensor, "limit", None)
+        limit = extras(reading.sensor).limit
         parts: Any = reading.values, reading.mask, error, sigma, limit, reading.jitter_error
-        out.append(jax.vmap(standardised_errors_and_saturation)(*parts)[0])
+        out.append(jax.vmap(standardise)(*parts).errors)
     return tuple(out)
 
 
-def white_errors_and_log_variances(
-    errors: Float[Array, "*rows k"], jitter_error: Float[Array, "*rows k"]
-) -> tuple[Float[Array, "*rows k"], Float[Array, "*rows k"]]:
-    """Return two arrays (…, k), from errors e (…, k) whose covariance is `1 + v vᵀ`: independent
-    errors of variance one (white errors); and the logarithms of conditional variances.
+def decorrelate(errors: Float[Array, "*rows k"], jitter_error: Float[Array, "*rows k"]) -> White:
+    """Return independent errors of variance one from errors e whose covariance is `1 + v vᵀ`.
 
-    Here 1 is the unit matrix, and v (…, k) is the `jitter_error`, the error due to a time stamp
-    that is one standard deviation late. Both e and v are in standard deviations of the noise. The
-    independent errors are `L⁻¹ e`, where L is the Cholesky factor of the covariance. The
-    conditional variance of a component is its variance if all components before it are given. It is
-    the square of the diagonal element of L.
+    Here v is the `jitter_error`, the error due to a time stamp that is one standard deviation late;
+    e and v are in standard deviations of the noise. The result is `L⁻¹ e` with the Cholesky factor
+    L of the covariance.
     """
     e, v = errors, jitter_error
     along, total = jnp.cumsum(v * e, axis=-1), 1.0 + jnp.cumsum(v * v, axis=-1)
     none = jnp.zeros_like(total[..., :1])
     along = jnp.concatenate([none, along[..., :-1]], axis=-1)
     before = jnp.concatenate([none + 1.0, total[..., :-1]], axis=-1)
-    return (e - v * along / before) * jnp.sqrt(before / total), jnp.log(total / before)
+    return White((e - v * along / before) * jnp.sqrt(before / total), jnp.log(total / before))
 
 
-def standardised_error_changes(
-    error_changes: Array | np.ndarray, sigma: Array | np.ndarray, jitter_error: Array | None
+def scaled_slopes(
+    tangents: Array | np.ndarray, sigma: Array | np.ndarray, jitter_error: Array | None
 ) -> Float[Array, "..."] | Float[np.ndarray, "..."]:
-    """Return n changes (R, T, k, n) of a sensor's errors, converted to standard deviations.
+    """Return tangents of a sensor's errors in standard deviations, made independent as by
+    `decorrelate`.
 
-    The `error_changes` are in the unit of the sensor, such as derivatives of the errors with
-    respect to n numbers. They are divided by the standard deviations `sigma` (R, k) of the noise. A
-    `jitter_error` (R, T, k) is the error due to a time stamp that is one standard deviation late,
-    in the unit of the sensor. If it is given, the changes are also transformed as
-    `white_errors_and_log_variances` transforms errors to independent ones.
+    The tangents and the `jitter_error` are in the unit of the sensor.
     """
-    scaled = error_changes / sigma[:, None, :, None]
+    scaled = tangents / sigma[:, None, :, None]
     if jitter_error is None:
         return scaled
-    return jax.vmap(
-        lambda e: white_errors_and_log_variances(e, jitter_error / sigma[:, None])[0], -1, -1
-    )(scaled)
+    return jax.vmap(lambda e: decorrelate(e, jitter_error / sigma[:, None]).errors, -1, -1)(scaled)
 
 
-def standardised_errors_and_saturation(
+def standardise(
     values: Float[Array, "times *components"],
     mask: Bool[Array, " times"],
     error: Float[Array, "times k"],
     sigma: Float[Array, " k"],
     limit: Float[Array, " k"] | None,
     jitter_error: Float[Array, "times k"] | None,
-) -> tuple[Float[Array, "times k"], Bool[Array, "times k"], Float[Array, "times k"] | None]:
-    """Return three things: the errors of one sensor in standard deviations; a mask of saturated
-    channels; and the effect of jitter.
+) -> Standardised:
+    """Return the errors of one sensor in standard deviations.
 
-    The effect of jitter is the logarithm of the factor by which jitter multiplies each variance, or
-    `None` without jitter. The reading of a saturated channel says only that the true value is at
-    least as large as the limit. Its error is `√(−2 log Φ(z))` in magnitude, where z is the excess
-    of the prediction over the limit in standard deviations and Φ is the normal distribution
-    function (Tobin 1958, doi:10.2307/1907382).
-
-    **Arguments:**
-
-    - `values`: the readings at T times.
-    - `mask`: (T,) true where there is a reading.
-    - `error`: (T, k) reading minus prediction, in the unit of the sensor.
-    - `sigma`: (k,) the standard deviations of the noise, in the unit of the sensor.
-    - `limit`: (k,) the full scale, or `None`.
-    - `jitter_error`: (T, k) the error, in the unit of the sensor, that a time stamp makes if it is
-      one standard deviation late, or `None`.
+    `error` and `jitter_error`, the error of a time stamp that is one standard deviation late, are
+    in the unit of the sensor. The reading of a channel at full scale (`limit`) says only that the
+    true value is at least as large. Its error is `√(−2 log Φ(z))` in magnitude, where z is the
+    excess of the prediction over the limit in standard deviations (Tobin 1958,
+    doi:10.2307/1907382).
     """
     scaled, wider = error / sigma[None], None
     full = jnp.zeros(scaled.shape, bool)
@@ -402,30 +326,26 @@ def standardised_errors_and_saturation(
         v = jitter_error / sigma[None]
         # The reading of a channel at full scale carries no information about the error of its time
         # stamp. Its part of the jitter error is therefore set to zero.
-        white, wider = white_errors_and_log_variances(scaled, jnp.where(full, 0.0, v))
+        white, wider = decorrelate(scaled, jnp.where(full, 0.0, v))
         scaled = jnp.where(full, scaled / jnp.sqrt(1.0 + v * v), white)
     if limit is None:
-        return scaled, full, wider
+        return Standardised(scaled, full, wider)
     side = jnp.sign(values)
     z = jnp.where(full, -side * scaled, 0.0)
     # Here z is the excess of the prediction over the limit in standard deviations. For a large z
     # the argument of the root underflows to zero, where a square root has no derivative. The error
     # is therefore set to zero beyond z = 5.
     root = jnp.sqrt(-2.0 * jax.scipy.special.log_ndtr(jnp.minimum(z, 5.0)))
-    return jnp.where(full, -side * jnp.where(z < 5.0, root, 0.0), scaled), full, wider
+    errors = jnp.where(full, -side * jnp.where(z < 5.0, root, 0.0), scaled)
+    return Standardised(errors, full, wider)
 
 
 def reading_residuals(
     model: "Model", errors: SensorErrors, noise: Noise, weights: Float[Array, "records times"]
 ) -> tuple[Array, ...]:
-    """Return the residuals (R, T, k) of the readings of each sensor, for least squares.
+    """Return the residuals of the readings of each sensor, shrunk by the robust loss.
 
-    The errors are divided by their standard deviations, shrunk by the robust loss of the `model`,
-    and multiplied by the weights.
-
-    - `errors`: for each sensor the errors (R, T, k) in its unit.
-    - `noise`: for each sensor the standard deviations (R, k) of its noise.
-    - `weights`: (R, T) a factor of each reading, such as zero for a reading that is not fitted.
+    The factor `weights` of a reading is zero if the reading is not fitted.
     """
     out = []
     for scaled in whiten(model, errors, noise):
@@ -435,32 +355,25 @@ def reading_residuals(
     return tuple(out)
 
 
-def residuals_and_jacobians(
+def residual_jacobians(
     function: Callable[[tuple[Array, ...]], tuple[Array, ...]],
     errors: SensorErrors,
     slopes: SensorErrors,
-) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Return two things: the residuals `function(errors)`; and their derivatives (R, T, k, n) with
-    respect to n numbers.
+) -> FirstOrder:
+    """Return the residuals `function(errors)` and their Jacobians.
 
-    - `function`: a function of the errors of all sensors; each of its residuals depends only on the
-      errors of the same reading.
-    - `errors`: for each sensor the errors (R, T, k).
-    - `slopes`: for each sensor the derivatives (R, T, k, n) of its errors with respect to the n
-      numbers.
+    Each residual may depend only on the errors of its own reading.
     """
     # The product of the derivative of `function` with the slopes is cheap, since each residual
     # depends only on the errors of the same reading: no matrix of all residuals by all errors is
     # made.
     value, push = jax.linearize(function, errors)
-    return value, jax.vmap(push, in_axes=-1, out_axes=-1)(slopes)
+    return FirstOrder(value, jax.vmap(push, in_axes=-1, out_axes=-1)(slopes))
 
 
 def prior_weights(model: "Model") -> Float[Array, " n"]:
-    """Return the weight (n,) of each free number of a `model`: one over the standard deviation of
-    its prior, whose mean is zero.
-
-    The weight is zero for a number without a prior.
+    """Return one over the standard deviation of the prior of each parameter, or zero without a
+    prior.
     """
     weights = jnp.zeros(model.index.size, model.records.t.dtype)
     for slot in model.slots:
@@ -473,14 +386,11 @@ def prior_weights(model: "Model") -> Float[Array, " n"]:
     return weights
 
 
-def body_prior_and_pull_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-    """Return the residuals (j,) of the prior of the body and of the `AbstractPull` of a `model`, at
-    the free numbers x (n,) of the model.
+def joint_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
+    """Return the residuals of the prior of the body and of the `AbstractPull`, if the model has
+    them.
 
-    Such a residual may depend on several free numbers; the priors of single numbers are not
-    included. An `AbstractPull` is an addition to the misfit that pulls free numbers, or quantities
-    that depend on them, towards chosen values. A `model` need not have a prior of the body or a
-    pull, so that j may be zero.
+    Such a residual depends on several parameters at once.
     """
     out = [jnp.zeros(0, x.dtype)]
     if model.prior is not None:
@@ -493,26 +403,18 @@ def body_prior_and_pull_residuals(model: "Model", x: Float[Array, " n"]) -> Floa
 
 
 def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """Return all residuals of a `model` that do not belong to readings, at the free numbers x (n,).
-
-    The first n residuals belong to the priors of the single free numbers. Then come the residuals
-    of the prior of the body, and of an `AbstractPull`, an addition to the misfit that pulls free
-    numbers towards chosen values.
+    """Return all residuals that belong to no reading: of each parameter's prior, and
+    `joint_residuals`.
     """
-    return jnp.concatenate([prior_weights(model) * x, body_prior_and_pull_residuals(model, x)])
+    return jnp.concatenate([prior_weights(model) * x, joint_residuals(model, x)])
 
 
 def reading_weights(
     model: "Model", errors: SensorErrors, noise: Noise
 ) -> tuple[Float[Array, "..."], ...]:
-    """Return, for each sensor, the weights (R, T) of its readings in the normal equations, for R
-    recordings of T times.
+    """Return the weights of each sensor's readings in the normal equations, zero for a masked one.
 
-    With a robust loss ρ(s), the weight is dρ/ds, where s is the squared length of the error in
-    standard deviations. Without a loss the weight is 1. It is zero for a masked reading.
-
-    - `errors`: for each sensor the errors (R, T, k) in its unit.
-    - `noise`: for each sensor the standard deviations (R, k) of its noise.
+    With a robust loss ρ(s) the weight is dρ/ds, else 1.
     """
     masks = [reading.mask for reading in model.records.readings]
     if model.loss is None:
@@ -522,8 +424,6 @@ def reading_weights(
     return tuple(jnp.where(mask, weight(e), 0.0) for mask, e in zip(masks, scaled, strict=True))
 
 
-def half_sum_of_squares(tree: PyTree) -> Float[Array, ""]:
-    """Return half the sum of the squares of all numbers in a `tree` of arrays, such as the misfit
-    of a tree of residuals.
-    """
+def half_squares(tree: PyTree) -> Float[Array, ""]:
+    """Return half the sum of the squares of all numbers in a pytree."""
     return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

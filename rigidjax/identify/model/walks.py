@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import NumbersLike
-from rigidjax.identify.model.free import leaf_at, leaves_at, share_numbers
+from rigidjax.identify.model.free import leaf_at, leaves_at, overlap
 from rigidjax.identify.model.scene import Scene
 
 
@@ -41,38 +41,24 @@ class Walk(eqx.Module):
     ):
         words = "of a scene, such as lambda s: s.sensors[0].bias"
         self.where = _checks.require_function(where, "where", words)
-        self.deviation = require_nonnegative(deviation, "deviation")
-        self.density = require_nonnegative(density, "density")
+        self.deviation = nonnegative(deviation, "deviation")
+        self.density = nonnegative(density, "density")
 
 
 class Drift(eqx.Module):
-    """Hold a `Walk` (a sensor error that drifts) together with its place in the scene.
+    """Hold a `Walk` together with the path of its leaf in a `Scene`.
 
-    The scene is the body, torques, sensors and initial state of a recording. It is a JAX tree, and
-    the error is a leaf of this tree.
-
-    A `Drift` contains no function: a `Walk` contains the function `where`, and a new function in a
-    second model would force a new compilation.
-
-    **Fields:**
-
-    - `path`: the path of the leaf in the scene.
-    - `deviation`, `density`: the arguments of the `Walk` with these names, broadcast to the shape
-      of the leaf.
+    It contains no function: a new `where` in a second model would force a new compilation.
     """
 
     path: tuple[Any, ...] = eqx.field(static=True)
+    # Those of the `Walk`, broadcast to the shape of the leaf.
     deviation: Float[Array, "*shape"]
     density: Float[Array, "*shape"]
 
 
 def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]:
-    """Return the `Drift` of each `Walk` (sensor error that drifts): the `Walk` with the path of its
-    numbers in a `scene`.
-
-    An error is raised if a `Walk` picks something other than an array of numbers of a sensor, or
-    numbers that another `Walk` has.
-    """
+    """Return the `Drift` of each `Walk`; two of them may not pick the same numbers."""
     wanted = "a sequence of Walk(where, deviation)"
     _checks.require_instance(walks, (Walk, Sequence), "walks", requirement=wanted)
     drifts: list[Drift] = []
@@ -84,11 +70,11 @@ def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]
                 f"Walk: wanted a number of a sensor, such as s.sensors[0].bias, got one of the "
                 f"{path[0].name}; give an unknown torque as process="
             )
-        if any(share_numbers(drift.path, path) for drift in drifts):
+        if any(overlap(drift.path, path) for drift in drifts):
             raise ValueError("Walk: another Walk moves the same numbers; give each array one Walk")
         value = jnp.asarray(value)
         parts = (
-            broadcast_to_shape(number, value.shape, name).astype(value.dtype)
+            broadcast_to(number, value.shape, name).astype(value.dtype)
             for number, name in ((walk.deviation, "deviation"), (walk.density, "density"))
         )
         drifts.append(Drift(path, *parts))
@@ -96,33 +82,23 @@ def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]
 
 
 def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
-    """Return the values of the drifting sensor errors in a `scene` (the body, torques, sensors and
-    initial state of a recording), one array for each of the `drifts`. A `Drift` holds the path of
-    its error in the scene.
-    """
     return leaves_at(scene, [drift.path for drift in drifts])
 
 
-def require_nonnegative(value: NumbersLike, name: str) -> Array:
-    """Return `value` (one number or several) as an array, after a check that its numbers are finite
-    and not below zero.
-
-    If they are not, a `ValueError` is raised, in which the argument is called `name`.
-    """
+def nonnegative(value: NumbersLike, name: str) -> Array:
+    """Return `value` as an array, after a check that its numbers are finite and not below zero."""
     array, wanted = _checks.numeric_array(value, name), "a finite number that is not below zero"
     if not array.size:
         raise ValueError(f"{name}: wanted {wanted}, got none")
     return _checks.require_positive(array, name, wanted, allow_zero=True)
 
 
-def broadcast_to_shape(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
-    """Return `value` as an array of the shape `shape`: one number is repeated, and an array of this
-    shape is unchanged.
+def broadcast_to(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
+    """Return `value`, one number or an array of this `shape`, as an array of this `shape`.
 
-    A `ValueError`, in which the argument is called `name`, is raised if `value` has another shape,
-    or a number that is not finite or below zero.
+    An error is raised as by `nonnegative`.
     """
-    numbers = require_nonnegative(value, name)
+    numbers = nonnegative(value, name)
     if numbers.shape not in ((), shape):
         raise ValueError(f"{name}: wanted one number or shape {shape}, got {numbers.shape}")
     return jnp.broadcast_to(numbers, shape)

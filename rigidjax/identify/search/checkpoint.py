@@ -22,14 +22,12 @@ from rigidjax.identify.search.stages import Attempt
 
 
 def without_arrays(attempt: Attempt) -> Attempt:
-    """Return the `attempt` (the result of the search from one start) with `blocks` set to `None`,
-    since the errors and derivatives in it take much memory.
-    """
+    """Return the `attempt` without its `blocks`, which take much memory."""
     return attempt if attempt.blocks is None else dataclasses.replace(attempt, blocks=None)
 
 
 def report_progress(progress: Callable[[str], Any] | None, line: str) -> None:
-    """Call the function `progress` with a `line` of text, unless `progress` is `None`.
+    """Call the function `progress` with a `line` of text.
 
     If the line cannot be written, a warning is given and the search goes on.
     """
@@ -45,10 +43,7 @@ def report_progress(progress: Callable[[str], Any] | None, line: str) -> None:
 
 
 def require_folder(path: str | Path) -> None:
-    """Raise `ValueError` if the folder of the file `path` does not exist, or if `path` is a folder.
-
-    The check runs before a search, which would otherwise fail after its first start.
-    """
+    """Raise `ValueError` before a search whose checkpoint is no file in an existing folder."""
     path = Path(path)
     if not path.parent.is_dir():
         raise ValueError(f"checkpoint {path}: there is no folder {path.parent}")
@@ -76,18 +71,12 @@ def fingerprint(*trees: PyTree) -> str:
 
 
 class Checkpoint:
-    """Hold the result (an `Attempt`) of the search from each finished start, and save the results
-    to a file.
+    """Hold the results of the finished starts of a search, and save them to a file.
 
-    **Arguments:**
-
-    - `path`: the place of the file; `None` for no file.
-    - `example`: an `Attempt` whose arrays have the shapes of the arrays in the file.
-    - `print_of`: the `fingerprint` of everything that the search depends on.
-
-    The file is written after every start; if it exists already, it is read first. **Raises**
-    `ValueError` if an existing file belongs to another search; such a file is not overwritten. A
-    file that cannot be written causes a warning.
+    The arrays in the file have the shapes of those of `example`; `print_of` is the `fingerprint` of
+    everything that the search depends on. The file is written after every start; if it exists
+    already, it is read first. `ValueError` is raised if it belongs to another search, and it is
+    then not overwritten.
     """
 
     def __init__(self, path: str | Path | None, example: Attempt, print_of: str):
@@ -95,13 +84,12 @@ class Checkpoint:
         self.print_of = print_of
         self.done: list[Attempt] = []
         if self.path is not None and self.path.exists():
-            self._read_attempts(self.path)
+            self._read(self.path)
 
     def save(self, attempts: Sequence[Attempt]) -> None:
-        """Write the `attempts` (the results of the search from all finished starts) to the file.
+        """Write the `attempts` to the file, which is replaced in one (atomic) step.
 
-        The old file is replaced in one (atomic) step. A warning is given if the file cannot be
-        written.
+        A warning is given if the file cannot be written.
         """
         if self.path is None:
             return
@@ -124,12 +112,8 @@ class Checkpoint:
             with contextlib.suppress(OSError):
                 part.unlink(missing_ok=True)
 
-    def _read_attempts(self, path: Path) -> None:
-        """Read the file `path`, and put the results of all finished starts into the member `done`.
-
-        `ValueError` is raised for a damaged file, and for a file that the search of another model
-        or with other options has written.
-        """
+    def _read(self, path: Path) -> None:
+        """Read the results of all finished starts into the member `done`."""
         try:
             with path.open("rb") as file:
                 head = json.loads(file.readline())

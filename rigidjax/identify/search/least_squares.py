@@ -49,82 +49,63 @@ NOISY, LITTLE = 10.0, 1e-4
 EXACT = 1e-6
 
 
-def _setting_as_array(value: ArrayLike) -> np.ndarray:
-    """Return a setting of a search (the number `value`) as a NumPy array of JAX's default float
-    type.
-
-    NumPy is used, since a conversion by JAX is slow outside of a compiled program.
-    """
+def _array(value: ArrayLike) -> np.ndarray:
+    """Return a setting as a NumPy array: a conversion by JAX is slow outside of `jit`."""
     return np.asarray(value, jnp.result_type(float))
 
 
 class Settings(eqx.Module):
-    """Hold the settings of a search for the least cost as arrays, so that other values need no new
-    compilation of the search.
+    """Hold the settings of a search as arrays, so that others need no new compilation.
 
-    The gain of a step is the fall of the cost. **Arguments**, where zero switches off each of
-    `aim`, `near`, `count` and `level`:
-
-    - `tolerance`: the search has converged if the next step changes each number by less than this
-      many standard deviations of the number. Here the standard deviation of a number is computed
-      with all other numbers fixed.
-    - `damping`: the damping of the first step.
-    - `steps`: the largest number of steps.
-    - `aim`: a cost that another search reached; this search ends if it would need more than
-      `PATIENCE` steps to reach this cost at its present pace.
-    - `near`: the search ends at a cost of this value or less.
-    - `count`: the number of errors, if the noise is unknown; the standard deviation of an error is
-      then estimated by the root mean square of all errors. With zero this standard deviation is
-      one.
-    - `level`: the search ends after a step whose gain is about the predicted gain, but less than
-      this fraction of the mean gain of a fit that follows only the noise of the readings.
+    The gain of a step is the fall of the cost. Zero switches off each of `aim`, `near`, `count` and
+    `level`.
     """
 
-    tolerance: Any = eqx.field(converter=_setting_as_array)
-    damping: Any = eqx.field(converter=_setting_as_array)
+    # The search has converged if the next step changes each parameter by less than this many of its
+    # standard deviations with all other parameters fixed.
+    tolerance: Any = eqx.field(converter=_array)
+    # The damping of the first step.
+    damping: Any = eqx.field(converter=_array)
+    # The largest number of steps.
     steps: Any = eqx.field(converter=lambda steps: np.asarray(steps, np.int32))
-    aim: Any = eqx.field(converter=_setting_as_array, default=0.0)
-    near: Any = eqx.field(converter=_setting_as_array, default=0.0)
-    count: Any = eqx.field(converter=_setting_as_array, default=0.0)
-    level: Any = eqx.field(converter=_setting_as_array, default=0.0)
+    # A cost that another search reached: this one ends if it would need more than PATIENCE steps to
+    # reach it at its present pace.
+    aim: Any = eqx.field(converter=_array, default=0.0)
+    # The search ends at a cost of this value or less.
+    near: Any = eqx.field(converter=_array, default=0.0)
+    # The number of errors, if the noise is unknown: the standard deviation of an error is then
+    # their root mean square, else one.
+    count: Any = eqx.field(converter=_array, default=0.0)
+    # The search ends after a step whose gain is about the predicted gain, but less than this
+    # fraction of the mean gain of a fit that follows only the noise of the readings.
+    level: Any = eqx.field(converter=_array, default=0.0)
 
 
 class LMState(eqx.Module):
-    """Hold the state of a search for the least cost of n numbers by the method of Levenberg and
-    Marquardt.
+    """Hold the state of a search for the least cost by the method of Levenberg and Marquardt."""
 
-    **Fields:**
-
-    - `first`: the cost at the starting point.
-    - `point`: (n,) the best point so far.
-    - `cost`, `normal`, `slope`: the cost, its normal matrix (n, n) and its gradient (n,) at the
-      best point.
-    - `trial`, `hoped`: the next point (n,) to evaluate, and the predicted gain (fall of the cost)
-      there.
-    - `damping`: the damping of the step to the next point.
-    - `pace`: the mean fall of the logarithm of the cost in a step.
-    - `taken`: the number of evaluations.
-    - `done`, `converged`: whether the search has ended, and whether it converged.
-    - `evaluation`, `evaluated_at_best`: the values kept from the last evaluation, and whether this
-      evaluation was at the best point.
-    - `rise`: the rise of the cost at the last trial point divided by the predicted gain; zero if
-      the trial point was better, or if the cost there was not finite.
-    """
-
+    # The cost at the starting point.
     first: Float[Array, ""]
+    # The best point so far, with its cost, normal matrix and gradient.
     point: Float[Array, " n"]
     cost: Float[Array, ""]
     normal: NormalMatrix
     slope: Float[Array, " n"]
+    # The next point to evaluate, the predicted gain there, and the damping of the step to it.
     trial: Float[Array, " n"]
     hoped: Float[Array, ""]
     damping: Float[Array, ""]
+    # The mean fall of the logarithm of the cost in a step.
     pace: Float[Array, ""]
+    # The number of evaluations.
     taken: Int[Array, ""]
     done: Bool[Array, ""]
     converged: Bool[Array, ""]
+    # The values kept from the last evaluation, and whether it was at the best point.
     evaluation: Any
     evaluated_at_best: Bool[Array, ""]
+    # The rise of the cost at the last trial point divided by the predicted gain; zero if the point
+    # was better, or if the cost there was not finite.
     rise: Float[Array, ""]
 
 
@@ -139,26 +120,16 @@ def minimise(
 ) -> LMState:
     """Minimise a cost by the method of Levenberg and Marquardt, and return the last state.
 
+    `evaluate` returns values to keep, the cost, the normal matrix and the gradient at a point. The
+    cost is half a sum of squares, or minus a log-density with Fisher's information as the normal
+    matrix (scoring). `order_one` is one for each parameter that no step may change by more than
+    `LONGEST`, else zero. `zeros` and `zero_normal` have the shapes of the values to keep and of a
+    normal matrix that is not one dense block. `gain_of_noise` is the mean gain of a fit that
+    follows only the noise, see `Settings.level`.
+
     Source: Marquardt 1963, doi:10.1137/0111030; the damping follows the ratio of actual to
     predicted gain as in Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares
     problems, section 3.2.
-
-    **Arguments:**
-
-    - `evaluate`: a function that returns, at a point, values to keep, the cost, the normal matrix
-      and the gradient. The cost is half a sum of squares, or minus a log-density with Fisher's
-      information as the normal matrix (scoring).
-    - `start`: (n,) the point at which the search begins; if no steps are allowed, only this point
-      is evaluated.
-    - `order_one`: (n,) one for each number of order one, which no step may change by more than
-      `LONGEST`; zero for each number that may have any size.
-    - `settings`: the settings of the search.
-    - `zeros`: a tree of zeros with the shapes of the values to keep.
-    - `zero_normal`: zeros with the shapes of the normal matrix, if it is not one dense matrix
-      (`NormalMatrix.own_blocks`).
-    - `gain_of_noise`: given the kept values and the normal matrix, this function returns the mean
-      gain (fall of the cost) of a fit that follows only the noise of the readings (see
-      `Settings.level`); or `None`.
     """
     number, kind = start.size, start.dtype
     begun = LMState(
@@ -179,37 +150,22 @@ def minimise(
         jnp.zeros((), kind),
     )
 
-    def evaluate_and_update(state: LMState) -> LMState:
-        return _next_state(state, evaluate(state.trial), order_one, settings, gain_of_noise)
-
     return lax.while_loop(
-        lambda now: ~now.done & (now.taken <= settings.steps), evaluate_and_update, begun
+        lambda now: ~now.done & (now.taken <= settings.steps),
+        lambda now: _next(now, evaluate(now.trial), order_one, settings, gain_of_noise),
+        begun,
     )
 
 
-def _next_state(
+def _next(
     state: LMState,
     evaluation: tuple[Any, Array, NormalMatrix, Array],
     order_one: Array,
     settings: Settings,
     gain_of_noise: Callable[[Any, NormalMatrix], Array] | None,
 ) -> LMState:
-    """Return the state of a search by the method of Levenberg and Marquardt after one evaluation of
-    the cost of n numbers.
-
-    The point of the evaluation is accepted if its cost is lower than the lowest cost so far. The
-    damping is adapted to the ratio of actual to predicted gain (fall of the cost), and the next
-    point is computed.
-
-    - `state`: the state before the evaluation.
-    - `evaluation`: what was found at the point `state.trial`: values to keep, the cost, the normal
-      matrix (n, n) and the gradient (n,).
-    - `order_one`: (n,) one for each number of order one, which no step may change by more than
-      `LONGEST`; zero for each number that may have any size.
-    - `settings`: the settings of the search, such as its tolerance.
-    - `gain_of_noise`: a function of the kept values and the normal matrix that returns the gain of
-      a fit that follows only the noise. The search may end after a step whose gain is less than the
-      fraction `settings.level` of this gain. With `None` the search does not end in this way.
+    """Return the state after the `evaluation` at `state.trial`; the arguments are as for
+    `minimise`.
     """
     values, cost, normal, slope = evaluation
     parts = jax.tree.leaves((cost, normal, slope))
@@ -240,7 +196,15 @@ def _next_state(
         (state.trial, cost, normal, slope),
         (state.point, state.cost, state.normal, state.slope),
     )
-    move, root = _damped_step_and_scale(normal, slope, order_one, damping)
+    diagonal = normal.diagonal
+    diagonal = jnp.maximum(diagonal, jnp.maximum(1e-12 * jnp.max(diagonal), 1e-300))
+    # The normal matrix is scaled to ones on its diagonal, so that the Cholesky factorisation loses
+    # no digits if the units of the parameters are very different.
+    root = jnp.sqrt(diagonal)
+    damped = damping * jnp.maximum(diagonal, order_one) / root**2
+    move = -normal.scaled(1.0 / root).add_diagonal(damped).solve(slope / root) / root
+    far = jnp.max(jnp.abs(move) * order_one)
+    move = move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300))
     sound = jnp.isfinite(move).all()
     move = jnp.where(sound, move, 0.0)
     hoped = -(slope @ move) - 0.5 * move @ (normal @ move)
@@ -274,29 +238,3 @@ def _next_state(
         better,
         rise,
     )
-
-
-def _damped_step_and_scale(
-    normal: NormalMatrix, slope: Array, order_one: Array, damping: Array
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Return two things: the damped step (n,) of Levenberg and Marquardt from a point; and the
-    square root (n,) of the diagonal of the normal matrix.
-
-    The step is shortened so that no number of order one changes by more than `LONGEST`.
-
-    - `normal`, `slope`: the normal matrix (n, n) and the gradient (n,) of the cost at the point.
-    - `order_one`: (n,) one for numbers of order one, zero for other numbers.
-    - `damping`: the damping. The damping times the diagonal of the normal matrix is added to this
-      diagonal; for a number of order one whose diagonal element is less than one, the damping
-      itself is added.
-    """
-    diagonal = normal.diagonal
-    diagonal = jnp.maximum(diagonal, jnp.maximum(1e-12 * jnp.max(diagonal), 1e-300))
-    # The normal matrix is scaled to ones on its diagonal, so that the Cholesky factorisation loses
-    # no digits if the units of the numbers are very different.
-    root = jnp.sqrt(diagonal)
-    damped = damping * jnp.maximum(diagonal, order_one) / root**2
-    scaled = normal.scale_rows_and_columns(1.0 / root)
-    move = -scaled.add_diagonal(damped).solve(slope / root) / root
-    far = jnp.max(jnp.abs(move) * order_one)
-    return move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300)), root

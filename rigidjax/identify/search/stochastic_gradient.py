@@ -1,7 +1,7 @@
 """Fit by stochastic gradient descent with optax, for more recordings than `fit` can use."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,11 +11,11 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from rigidjax import _checks
 from rigidjax.identify.data import stacking
-from rigidjax.identify.model.model import Model, require_numbers
+from rigidjax.identify.model.model import Model, checked_x
 from rigidjax.identify.model.terms import (
     Noise,
     all_errors,
-    half_sum_of_squares,
+    half_squares,
     prior_residuals,
     reading_residuals,
 )
@@ -63,10 +63,25 @@ class Descent(eqx.Module):
             optimiser, optax.GradientTransformation, "Descent", requirement=wanted
         )
         self.optimiser = optimiser
-        self.steps, self.batch = (
-            _checks.integer(steps, "steps", 1),
-            _checks.integer(batch, "batch", 1),
-        )
+        self.steps = _checks.integer(steps, "steps", 1)
+        self.batch = _checks.integer(batch, "batch", 1)
+
+
+class Descended(NamedTuple):
+    """Hold the result of a descent."""
+
+    x: Float[Array, " n"]
+    # False after an interrupt (Ctrl-C).
+    finished: bool
+
+
+class Steps(NamedTuple):
+    """Hold the result of some steps of a descent."""
+
+    x: Float[Array, " n"]
+    optimiser_state: Any
+    # The cost before each step.
+    costs: Float[Array, " steps"]
 
 
 def descend(
@@ -113,11 +128,11 @@ def descend(
     _checks.require_instance(
         descent, Descent, "descend", requirement="a Descent(optimiser, steps=…, batch=…)"
     )
-    x = model.start() if initial is None else require_numbers(model, initial)
+    x = model.start() if initial is None else checked_x(model, initial)
     random: Any = jax.random.key(0) if key is None else _checks.random_key(key)
     if progress is not None:
         _checks.require_function(progress, "progress", "of a line of text, such as print")
-    return descend_from(x, model, initial_noise(model), descent, random, progress)[0]
+    return descend_from(x, model, initial_noise(model), descent, random, progress).x
 
 
 def descend_from(
@@ -127,13 +142,11 @@ def descend_from(
     descent: Descent,
     key: PRNGKeyArray,
     progress: Callable[[str], Any] | None = None,
-) -> tuple[Float[Array, " n"], bool]:
-    """Return two things: the free numbers (n,) at the end of a descent; and whether the descent
-    ended without an interrupt (Ctrl-C).
+) -> Descended:
+    """Return the last parameters of a descent; the arguments are as for `descend`.
 
-    If a misfit becomes infinite or NaN, the first result is the free numbers before the `STRIDE`
-    steps in which this happens. **Arguments:** `start` (n,) the free numbers to begin with; `noise`
-    the noise of the sensors; all other arguments as for `descend`.
+    If a cost becomes infinite or NaN, they are those before the `STRIDE` steps in which this
+    happens.
     """
     if descent.batch > model.count:
         raise ValueError(
@@ -153,8 +166,8 @@ def descend_from(
             line = f"descent {done}/{descent.steps}: misfit {float(costs.mean()):.6g}"
             report_progress(progress, line)
     except KeyboardInterrupt:
-        return x, False
-    return x, True
+        return Descended(x, False)
+    return Descended(x, True)
 
 
 @eqx.filter_jit
@@ -165,21 +178,8 @@ def _descent_steps(
     noise: Noise,
     descent: Descent,
     keys: Array,
-) -> tuple[Float[Array, " n"], PyTree, Float[Array, " steps"]]:
-    """Return three things after several steps of stochastic gradient descent: the free numbers x
-    (n,); the state of the optimiser; and an array (steps,) with the misfit before each step.
-
-    Each step uses a batch, which is a few recordings drawn at random. The misfit of the batch is
-    scaled up to the number of all recordings, and the misfit of the priors is added.
-
-    - `x`: (n,) the free numbers before the first step.
-    - `optimiser_state`: the state of the optimiser before the first step.
-    - `model`: the readings and the free numbers.
-    - `noise`: for each sensor the standard deviations (R, k) of its noise, for R recordings and k
-      components of an error.
-    - `descent`: the optimiser, and the number of recordings in a batch.
-    - `keys`: (steps,) a random key for each step, which draws its recordings.
-    """
+) -> Steps:
+    """Return the result of a step for each of the `keys`, which draw the recordings of a batch."""
 
     def descent_step(carry: tuple, key: Array) -> tuple[tuple, Array]:
         x, optimiser_state = carry
@@ -193,42 +193,31 @@ def _descent_steps(
         return (x + move, optimiser_state), cost
 
     (x, optimiser_state), costs = jax.lax.scan(descent_step, (x, optimiser_state), keys)
-    return x, optimiser_state, costs
+    return Steps(x, optimiser_state, costs)
 
 
 def misfit_of(
     x: Float[Array, " n"], model: Model, noise: Noise, recording_indices: Array
 ) -> Float[Array, ""]:
-    """Return the misfit of some recordings (half the sum of their squared residuals), scaled up to
-    the number of all recordings, plus the misfit of the priors.
+    """Return the cost of some recordings, scaled up to the number of all, plus the cost of the
+    priors.
 
-    The mean of this sum over random batches is the misfit of the whole model.
-
-    - `x`: (n,) the free numbers of the `model`.
-    - `noise`: for each sensor the standard deviations (R, k) of its noise.
-    - `recording_indices`: the indices of the recordings.
+    The mean over random batches is the cost of the whole model.
     """
-    few, sizes = (
-        chosen_recordings(model, recording_indices),
-        stacking.pick_records(noise, recording_indices),
-    )
-    weights = jnp.ones_like(few.records.t)
-    residuals = reading_residuals(few, all_errors(few, x), sizes, weights)
+    few, sizes = chosen(model, recording_indices), stacking.pick(noise, recording_indices)
+    residuals = reading_residuals(few, all_errors(few, x), sizes, jnp.ones_like(few.records.t))
     scale = model.count / recording_indices.shape[0]
-    return half_sum_of_squares(residuals) * scale + half_sum_of_squares(prior_residuals(model, x))
+    return half_squares(residuals) * scale + half_squares(prior_residuals(model, x))
 
 
-def chosen_recordings(model: Model, recording_indices: Array) -> Model:
-    """Return the model with only the recordings of indices `recording_indices`, and with all free
-    numbers.
-
-    The indices may be traced by JAX; the recordings keep the masked readings that fill up shorter
-    recordings.
+def chosen(model: Model, recording_indices: Array) -> Model:
+    """Return the model with some of its recordings only, and all parameters; the indices may be
+    traced.
     """
     parts = lambda m: (m.records, m.reference, m.body_indices, m.index.places, m.index.start)  # noqa: E731
     return eqx.tree_at(
         parts,
         model,
-        stacking.pick_records(parts(model), recording_indices),
+        stacking.pick(parts(model), recording_indices),
         is_leaf=lambda node: node is None,
     )

@@ -49,68 +49,51 @@ class AttitudeSensor(ClockedSensor):
     mounting: Vec3 | None = eqx.field(converter=base.optional_array_field("mounting"), default=None)
 
     def error(self, motion: SensorInput, reading: Array) -> Vec3:
-        q = _mounted_attitude(motion.state.q, self.mounting)
+        q = _mounted(motion.state.q, self.mounting)
         return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
 
     def reading_of(self, motion: SensorInput, error: Vec3) -> Float[Array, "4"]:
         """Return the quaternion (4,) that this attitude sensor reads for a given `motion` if its
         error is the rotation vector `error` (3,), rad.
         """
-        q = _mounted_attitude(motion.state.q, self.mounting)
+        q = _mounted(motion.state.q, self.mounting)
         return quaternion.multiply(q, quaternion.exp(error))
 
     def readings(self, values: np.ndarray) -> np.ndarray:
         """Return the attitudes `values`, which are quaternions (T, 4) or rotation matrices (T, 3,
         3), as quaternions (T, 4), the form of the readings of this sensor.
         """
-        return _quaternions_of_matrices(values) if values.shape[1:] == (3, 3) else values
+        if values.shape[1:] != (3, 3):
+            return values
+        # The quaternion of a matrix with NaN is NaN.
+        finite = np.isfinite(values).all(axis=(1, 2))
+        filled = np.where(finite[:, None, None], values, np.eye(3))
+        off = np.abs(filled @ filled.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        wrong = (off > 1e-6) | (np.linalg.det(filled) < 0)
+        if wrong.any():
+            index = int(np.argmax(wrong))
+            raise ValueError(
+                f"AttitudeSensor: the matrix at index {index} is no rotation: R Rᵀ − 1 is "
+                f"{off[index]:.2g}, det = {np.linalg.det(filled[index]):.3g}"
+            )
+        out = np.asarray(jax.vmap(quaternion.from_matrix)(jnp.asarray(filled)))
+        return np.where(finite[:, None], out, np.nan)
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return two things: a mask (T,), true for each row of `values` that is not a unit
-        quaternion; and the reason in words.
+        """Return a mask (T,), true for each row of `values` that is not a unit quaternion, and the
+        reason in words.
         """
-        wanted = "wanted (w, x, y, z) with the scalar first"
-        return _differs_from_unit_length(
-            values
-        ), f"the quaternion at index {{index}} is not unit; {wanted}"
+        words = "is not unit; wanted (w, x, y, z) with the scalar first"
+        return _not_unit(values), f"the quaternion at index {{index}} {words}"
 
 
-def _quaternions_of_matrices(matrices: np.ndarray) -> np.ndarray:
-    """Return the unit quaternions (T, 4), scalar first, of rotation `matrices` (T, 3, 3).
-
-    The quaternion of a matrix with NaN is NaN. **Raises** `ValueError` for a matrix that is no
-    rotation.
-    """
-    finite = np.isfinite(matrices).all(axis=(1, 2))
-    filled = np.where(finite[:, None, None], matrices, np.eye(3))
-    off = np.abs(filled @ filled.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    wrong = (off > 1e-6) | (np.linalg.det(filled) < 0)
-    if wrong.any():
-        index = int(np.argmax(wrong))
-        raise ValueError(
-            f"AttitudeSensor: the matrix at index {index} is no rotation: R Rᵀ − 1 is "
-            f"{off[index]:.2g}, det = {np.linalg.det(filled[index]):.3g}"
-        )
-    out = np.asarray(jax.vmap(quaternion.from_matrix)(jnp.asarray(filled)))
-    return np.where(finite[:, None], out, np.nan)
-
-
-def _mounted_attitude(q: Array, mounting: Vec3 | None) -> Array:
-    """Return the attitude (4,) of the axes of a sensor that is mounted on a body of attitude q
-    (4,).
-
-    Both attitudes are quaternions to the world frame. The rotation vector `mounting` (3,), rad,
-    turns the body's axes into the sensor's axes. With `None` the sensor's axes are the body's axes.
-    """
+def _mounted(q: Array, mounting: Vec3 | None) -> Array:
+    """Return the attitude of the axes of a sensor mounted on a body of attitude q."""
     return q if mounting is None else quaternion.multiply(q, quaternion.exp(mounting))
 
 
 def _unit_vector(world: NumbersLike) -> Vec3:
-    """Return the unit vector (3,) along the direction `world` (3,), of any length, in the world
-    frame.
-
-    **Raises** `ValueError` for a length of zero.
-    """
+    """Return the unit vector along the direction `world`, after a check of its length."""
     vector = base.array_field("world")(world)
     length = jnp.sqrt(dot(vector, vector))
     words = "world: wanted a direction, got a vector of length zero"
@@ -148,7 +131,7 @@ class Direction(ClockedSensor):
     mounting: Vec3 | None = eqx.field(converter=base.optional_array_field("mounting"), default=None)
 
     def error(self, motion: SensorInput, reading: Array) -> Float[Array, "2"]:
-        predicted = self._predicted_direction(motion)
+        predicted = self._predicted(motion)
         # The axes orthogonal to the reading are data, so that no derivative passes through these
         # axes. Axes orthogonal to the prediction would jump as the motion changes.
         first, second = _orthogonal_pair(reading)
@@ -164,7 +147,7 @@ class Direction(ClockedSensor):
         The reason is the choice of axes: here `error` is taken along axes orthogonal to the
         prediction, but the method `error` uses axes orthogonal to the reading.
         """
-        predicted = self._predicted_direction(motion)
+        predicted = self._predicted(motion)
         first, second = _orthogonal_pair(predicted)
         # The length of `error` is the chord of the angle θ between prediction and reading: cos θ =
         # 1 − ½ |error|², sin θ = |error| cos ½θ.
@@ -172,40 +155,24 @@ class Direction(ClockedSensor):
         half = jnp.sqrt(1.0 - 0.25 * square)
         return (1.0 - 0.5 * square) * predicted + half * (error[0] * first + error[1] * second)
 
-    def _predicted_direction(self, motion: SensorInput) -> Vec3:
-        """Return the predicted reading of the sensor for a `motion`: the direction (3,) in the
-        sensor's axes.
-
-        The field `world` of the sensor is the known direction, a unit vector in the world frame.
-        The reading is this vector in the sensor's axes, which follow from the attitude of the body
-        and the mounting of the sensor.
-        """
-        return quaternion.rotate_inverse(
-            _mounted_attitude(motion.state.q, self.mounting), self.world
-        )
+    def _predicted(self, motion: SensorInput) -> Vec3:
+        """Return the direction in the axes of the sensor that it is predicted to read."""
+        return quaternion.rotate_inverse(_mounted(motion.state.q, self.mounting), self.world)
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return two things: a mask (T,), true for each row of `values` that is not a unit vector;
-        and the reason in words.
+        """Return a mask (T,), true for each row of `values` that is not a unit vector, and the
+        reason in words.
         """
-        return _differs_from_unit_length(
-            values
-        ), "the direction at index {index} is not of length 1"
+        return _not_unit(values), "the direction at index {index} is not of length 1"
 
 
-def _differs_from_unit_length(rows: np.ndarray) -> np.ndarray:
-    """Return a mask (T,), true where the length of a row of `rows` (T, k) differs from 1 by more
-    than 1e-6.
-
-    The rows are unit vectors or unit quaternions.
-    """
+def _not_unit(rows: np.ndarray) -> np.ndarray:
+    """Return a mask, true where the length of a row differs from 1 by more than 1e-6."""
     return np.abs(np.linalg.norm(rows, axis=1) - 1) > 1e-6
 
 
 def _orthogonal_pair(line: Vec3) -> tuple[Vec3, Vec3]:
-    """Return two unit vectors that are orthogonal to each other and to the direction `line`, a unit
-    vector.
-    """
+    """Return unit vectors that are orthogonal to each other and to the unit vector `line`."""
     least = jnp.eye(3, dtype=line.dtype)[jnp.argmin(jnp.abs(line))]
     first = cross(line, least)
     first = first / jnp.sqrt(dot(first, first))
@@ -321,9 +288,7 @@ class Velocity(ClockedSensor):
             arm = motion.lever(self.place)
             velocity = velocity + quaternion.rotate(state.q, cross(state.omega, arm))
         if self.mounting is not None:
-            velocity = quaternion.rotate_inverse(
-                _mounted_attitude(state.q, self.mounting), velocity
-            )
+            velocity = quaternion.rotate_inverse(_mounted(state.q, self.mounting), velocity)
         return reading - (velocity if self.bias is None else velocity + self.bias)
 
 
@@ -372,8 +337,8 @@ class Range(ClockedSensor):
         return (reading - predicted)[None]
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return two things: a mask (T,), true for each of the distances `values` that is below
-        zero; and the reason in words.
+        """Return a mask (T,), true for each of the distances `values` that is below zero, and the
+        reason in words.
 
         A sensor with a bias may read distances below zero, so that the mask is then false
         everywhere.

@@ -3,10 +3,11 @@
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, _show
@@ -75,8 +76,8 @@ class AbstractSensor(eqx.Module):
     - `offset`: the clock offset, s: the reading with the time stamp t was taken at t + offset.
     - `limit`: (k,) the full scale of each channel, in the unit of the error.
     - `lowpass`: a `LowPass`; it is allowed only if the error is reading minus prediction.
-    - `refusal(values)`: a method that returns two things for T rows of values: a mask (T,), true
-      for a row that cannot be a reading; and the reason in words.
+    - `refusal(values)`: a method that returns for T rows of values a mask (T,), true for a row that
+      cannot be a reading, and the reason in words.
     - `typical_rate(t, values)`: a method that returns the rough rate of the body, rad/s, from the
       unmasked readings; it is used if no other sensor gives the rate.
     - `reading_of(motion, error)`: a method that returns the reading whose error is `error`, for
@@ -109,12 +110,7 @@ class AbstractSensor(eqx.Module):
 
 
 def array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]:
-    """Return a converter, for `eqx.field`, that turns a value into an array of finite numbers of
-    this `shape`.
-
-    The numbers become an array so that a fit can change them; `name` is the name of the field for
-    error messages.
-    """
+    """Return a converter, for `eqx.field`, to an array of finite numbers of this `shape`."""
 
     def convert(value: NumbersLike) -> Array:
         if value is None:
@@ -125,20 +121,14 @@ def array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Arr
 
 
 def optional_array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array | None]:
-    """Return a converter, for `eqx.field`, that turns a value into an array of finite numbers of
-    this `shape`, and leaves `None` unchanged.
-
-    `name` is the name of the field for error messages.
-    """
+    """Return the converter of `array_field` that leaves `None` unchanged."""
     converted = array_field(name, shape)
     return lambda value: None if value is None else converted(value)
 
 
 def deviations_field(size: int = 3) -> Callable[[Any], Array | None]:
-    """Return a converter, for `eqx.field`, that turns one number or `size` numbers into standard
-    deviations (size,).
-
-    The converter leaves `None` unchanged.
+    """Return a converter, for `eqx.field`, to standard deviations (size,) that leaves `None`
+    unchanged.
     """
     return lambda value: positive_numbers(value, "noise", "a positive standard deviation", size)
 
@@ -146,11 +136,7 @@ def deviations_field(size: int = 3) -> Callable[[Any], Array | None]:
 def positive_numbers(
     value: NumbersLike | None, name: str, requirement: str, size: int
 ) -> Array | None:
-    """Return one number, or `size` numbers, as an array (size,) of positive numbers.
-
-    `None` stays `None`. **Raises** `ValueError` for a number that is not positive and for another
-    shape; `name` and `requirement` are words of the message.
-    """
+    """Return one number, or `size` numbers, as a checked array (size,); `None` stays `None`."""
     if value is None:
         return None
     numbers = _checks.numeric_array(value, name).astype(jnp.result_type(float))
@@ -162,19 +148,17 @@ def positive_numbers(
 
 
 class Jitter(eqx.Module):
-    """Hold the scatter of time stamps.
+    """Hold the scatter of time stamps."""
 
-    **Fields:** `deviation` the standard deviation of a time stamp, s; `estimated` whether the fit
-    estimates this deviation.
-    """
-
+    # The standard deviation of a time stamp, s.
     deviation: Scalar
+    # Whether a fit estimates the deviation.
     estimated: bool = eqx.field(static=True)
 
 
 def jitter_of(jitter: object) -> Jitter | None:
-    """Return the `Jitter` for a deviation of time stamps, a positive number of seconds, or for the
-    text `"estimated"`; `None` stays `None`.
+    """Return the `Jitter` of a positive number of seconds, or of `"estimated"`; `None` stays
+    `None`.
     """
     if jitter is None or isinstance(jitter, Jitter):
         return jitter
@@ -186,11 +170,37 @@ def jitter_of(jitter: object) -> Jitter | None:
     return Jitter(jnp.asarray(_checks.positive_float(jitter, "jitter", wanted)), False)
 
 
-class ClockedSensor(AbstractSensor):
-    """Define a sensor whose time stamps may have a constant error `offset` and a random error
-    `jitter`.
+class Extras(NamedTuple):
+    """Hold the optional members of a sensor, as `AbstractSensor` describes them, or `None`."""
 
-    The sensor reads a vector (3,), unless a subclass sets another shape.
+    offset: Scalar | None
+    jitter: Jitter | None
+    limit: Float[Array, "*records k"] | None
+    lowpass: Any
+    tolerance: Any
+    refusal: Callable[[np.ndarray], tuple[np.ndarray, str]] | None
+    typical_rate: Callable[[np.ndarray, np.ndarray], float] | None
+    reading_of: Callable[[SensorInput, Array], Array] | None
+    suspect: tuple[str, str, str] | None
+    # Convert the readings of the user to the form of this sensor.
+    readings: Callable[[np.ndarray], np.ndarray] | None
+    # Whether the noise holds only units of errors whose size is unknown.
+    nominal: bool | None
+
+
+def extras(sensor: AbstractSensor) -> Extras:
+    """Return the optional members of a sensor.
+
+    They are no members of `AbstractSensor`, whose value a field of a subclass without a default
+    would take for its default.
+    """
+    return Extras(*(getattr(sensor, name, None) for name in Extras._fields))
+
+
+class ClockedSensor(AbstractSensor):
+    """Define a sensor whose time stamps may have a constant error `offset` and a random `jitter`.
+
+    It reads a vector (3,), unless a subclass sets another shape.
     """
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)

@@ -1,7 +1,6 @@
 """Apply the low-pass filter that readings passed before they were logged."""
 
 import math
-from collections.abc import Callable
 from functools import partial
 from types import NoneType
 
@@ -9,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from rigidjax import _checks, _show
 from rigidjax._types import Scalar, ScalarLike
@@ -77,7 +76,21 @@ class LowPass(eqx.Module):
         t = _checks.array_of_shape(t, values.shape[:1], "t", hint="a time for each row of values")
         t = t.astype(values.dtype)
         if _checks.is_known((t, values)):
-            _require_in_range(np.asarray(t, float), np.asarray(values, float))
+            # The cubes of all numbers must be finite in float32, too.
+            times, size = np.asarray(t, float), np.abs(np.asarray(values, float))
+            if not size.max(initial=0.0) <= _LARGEST:
+                raise ValueError(
+                    f"values: wanted finite numbers up to {_LARGEST:g}, got NaN or a larger one"
+                )
+            if not np.abs(times).max(initial=0.0) <= _LARGEST:
+                raise ValueError(
+                    f"t: wanted finite times up to {_LARGEST:g} s, got NaN or a larger one"
+                )
+            if not (later := np.diff(times) > 1 / _LARGEST).all():
+                index = int(np.argmin(later)) + 1
+                raise ValueError(
+                    f"t: wanted increasing times; t[{index}] is not above t[{index - 1}]"
+                )
         if values.shape[0] < 2:
             return values
         w = 2 * math.pi * self.cutoff.astype(values.dtype)
@@ -89,65 +102,49 @@ class LowPass(eqx.Module):
         usual = jnp.nanmedian(jnp.where(is_padding, jnp.nan, intervals))
         intervals = jnp.where(is_padding, usual, intervals)
         is_hole = intervals > _HOLE * usual
-        before, after = _input_slopes_at_interval_ends(
-            intervals, jnp.diff(values, axis=0), is_hole, is_padding
-        )
+        before, after = _end_slopes(intervals, jnp.diff(values, axis=0), is_hole, is_padding)
         # On each interval u = u₀ + b s + c s² + d s³, where s is the time since the begin of the
         # interval.
         h = intervals[:, None]
         chord = jnp.diff(values, axis=0) / h
         c, d = (3 * chord - 2 * before - after) / h, (before + after - 2 * chord) / h**2
         ends = (before, 2 * c, 6 * d), (after, 2 * c + 6 * d * h, 6 * d)
-        particular = partial(_particular_solution, self.order, w)
+        particular = partial(_particular, self.order, w)
         y0, y1 = particular(values[:-1], ends[0]), particular(values[1:], ends[1])
         begin = y0[0]
         if intervals.size > 2:
-            first = particular(values[:1], _derivatives_at_first_sample(intervals, chord))[0]
+            first = particular(values[:1], _first_derivatives(intervals, chord))[0]
             begin = jnp.where(jnp.any(is_hole[:3]), begin, first)
-        return _filter_samples(
-            begin, y0, y1, partial(_propagator, self.order, w), intervals, is_hole
-        )
+
+        # The state of the filter is the output and, for order 2, ẏ/w: a transient, which decays,
+        # and the particular solution for the input. After a hole it starts without a transient.
+        def step(state: Array, row: tuple[Array, ...]) -> tuple[Array, Array]:
+            own0, own1, following, h, hole = row
+            after = own1 + (state - own0) @ _propagator(self.order, w, h).T
+            state = jnp.where(hole, following, after)
+            return state, state[:, 0]
+
+        following = jnp.concatenate([y0[1:], y1[-1:]])
+        _, rest = lax.scan(step, begin, (y0, y1, following, intervals, is_hole))
+        return jnp.concatenate([begin[None, :, 0], rest])
 
 
 def lowpass_of(lowpass: object) -> LowPass | None:
-    """Return `lowpass` if it is a `LowPass` or `None`; raise `TypeError` for anything else."""
+    """Return `lowpass` if it is a `LowPass` or `None`."""
     wanted = "LowPass(cutoff in Hz) or None"
     return _checks.require_instance(lowpass, (LowPass, NoneType), "lowpass", requirement=wanted)
 
 
-def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
-    """Raise `ValueError` for samples that a low-pass filter cannot use.
+def _end_slopes(
+    intervals: Float[Array, " n"],
+    changes: Float[Array, "n k"],
+    is_hole: Bool[Array, " n"],
+    is_padding: Bool[Array, " n"],
+) -> tuple[Float[Array, "n k"], Float[Array, "n k"]]:
+    """Return the time derivatives of a sampled input at the begin and at the end of each interval.
 
-    **Arguments:** `t` (T,) the times, s, which must increase; `values` (T, k) the samples. All
-    times and samples must be finite, and so small that their cubes do not overflow in float32.
-    """
-    if not np.isfinite(values).all() or np.abs(values).max(initial=0.0) > _LARGEST:
-        raise ValueError(
-            f"values: wanted finite numbers up to {_LARGEST:g}, got NaN or a larger one"
-        )
-    if not (np.isfinite(t).all() and np.abs(t).max(initial=0.0) <= _LARGEST):
-        raise ValueError(f"t: wanted finite times up to {_LARGEST:g} s, got NaN or a larger one")
-    if not (np.diff(t) > 1 / _LARGEST).all():
-        index = int(np.argmin(np.diff(t) > 1 / _LARGEST)) + 1
-        raise ValueError(f"t: wanted increasing times; t[{index}] is not above t[{index - 1}]")
-
-
-def _input_slopes_at_interval_ends(
-    intervals: Array, changes: Array, is_hole: Array, is_padding: Array
-) -> tuple[Array, Array]:
-    """Return two arrays (n, k): the time derivatives of a sampled input at the begin, and at the
-    end, of each of n intervals between samples.
-
-    Each derivative is the slope of the parabola through three neighbouring samples or, at a sample
-    next to a hole in the log, the slope of the straight line through the two samples of the
-    interval.
-
-    **Arguments:**
-
-    - `intervals`: (n,) the lengths of all intervals, s.
-    - `changes`: (n, k) the changes of the k channels of the input over the intervals.
-    - `is_hole`: (n,) true for an interval that is a hole in the log.
-    - `is_padding`: (n,) true for the padding after the last sample.
+    They are slopes of the parabola through three samples or, at a sample next to a hole, of the
+    line through the two samples of the interval.
     """
     h, chord = intervals[:, None], changes / intervals[:, None]
     apart = (is_hole[1:] | is_hole[:-1])[:, None]
@@ -160,17 +157,8 @@ def _input_slopes_at_interval_ends(
     return chord - begin, chord + end
 
 
-def _derivatives_at_first_sample(
-    intervals: Array, mean_slopes: Array
-) -> tuple[Array, Array, Array]:
-    """Return the first, second and third time derivative of a sampled input at its first sample.
-
-    The three arrays (1, k), for k channels, are the derivatives of the cubic through the first four
-    samples.
-
-    **Arguments:** `intervals` (n,) the lengths of the intervals between samples, s; `mean_slopes`
-    (n, k) the mean slope of the input in each interval.
-    """
+def _first_derivatives(intervals: Array, mean_slopes: Array) -> tuple[Array, Array, Array]:
+    """Return the first three derivatives of the cubic at the first of four samples."""
     a, b = intervals[0], intervals[0] + intervals[1]
     one = (mean_slopes[1] - mean_slopes[0]) / b
     two = ((mean_slopes[2] - mean_slopes[1]) / (intervals[1] + intervals[2]) - one) / (
@@ -180,22 +168,14 @@ def _derivatives_at_first_sample(
     return rate[None], 2 * (one - two * (a + b))[None], 6 * two[None]
 
 
-def _particular_solution(
+def _particular(
     order: int, w: Array, u: Array, du: tuple[ArrayLike, ArrayLike, ArrayLike]
 ) -> Array:
-    """Return the state of a low-pass filter on the particular solution for an input that is a cubic
-    in time.
+    """Return the state of the filter on the particular solution for a cubic input u with
+    derivatives du.
 
-    The state is the output y and, for a filter of order 2, ẏ/w, along a new last axis. The equation
-    is `ẏ = w(u − y)` for order 1 and `ÿ + √2 w ẏ + w² y = w² u` for order 2; its particular
-    solution is a cubic, too.
-
-    **Arguments:**
-
-    - `order`: the order of the filter, 1 or 2.
-    - `w`: the angular frequency of the filter, 2π times its cutoff, rad/s.
-    - `u`: (…) the value of the input at the time of the result.
-    - `du`: the first three time derivatives of the input at this time.
+    The state is the output y and, for order 2, ẏ/w along a new last axis; the solution is a cubic,
+    too.
     """
     # The solution y is a power series in the operator x = (d/dt)/w, applied to u. It is 1/(1 + x) =
     # 1 − x + x² − x³ … for order 1, and 1/(1 + √2 x + x²) = 1 − √2 x + x² + 0 x³ … for order 2. For
@@ -206,59 +186,10 @@ def _particular_solution(
     return jnp.stack([y, (du[0] - _ROOT * du[1] / w + du[2] / w**2) / w], axis=-1)
 
 
-def _propagator(order: int, w: Array, duration: Array) -> Array:
-    """Return the matrix (order, order) that maps a transient of a low-pass filter to the same
-    transient after a given duration.
-
-    The equation of the filter, with its input u and output y, is `ẏ = w(u − y)` for order 1 and
-    `ÿ + √2 w ẏ + w² y = w² u` for order 2. The transient is the difference of the filter's state
-    (y and, for order 2, ẏ/w) from the particular solution for its input.
-
-    **Arguments:** `order` the order of the filter, 1 or 2; `w` its angular frequency, 2π times its
-    cutoff, rad/s; `duration` the duration, s.
-    """
+def _propagator(order: int, w: Array, duration: Array) -> Float[Array, "order order"]:
+    """Return the matrix that maps a transient of the filter to that after a `duration`, s."""
     if order == 1:
         return jnp.exp(-w * duration)[None, None]
     a = w * duration / _ROOT
     c, s, e = jnp.cos(a), jnp.sin(a), jnp.exp(-a)
     return e * jnp.stack([jnp.stack([c + s, _ROOT * s]), jnp.stack([-_ROOT * s, c - s])])
-
-
-def _filter_samples(
-    start: Array,
-    solution_at_begin: Array,
-    solution_at_end: Array,
-    propagator: Callable[[Array], Array],
-    intervals: Array,
-    is_hole: Array,
-) -> Array:
-    """Return the output (n + 1, k) of a low-pass filter at all samples, by a scan over n intervals.
-
-    The state of the filter is the output y and, for order 2, ẏ/w, where w is the angular frequency
-    of the filter. It is the sum of a transient, which decays, and of the particular solution for
-    the input, which is a cubic in each interval between samples.
-
-    **Arguments:**
-
-    - `start`: (k, order) the state of the filter at the first sample, for k channels.
-    - `solution_at_begin`, `solution_at_end`: (n, k, order) the particular solutions at the begin
-      and at the end of each interval.
-    - `propagator`: a function of the length of an interval, s, that returns the matrix
-      (order, order) by which a transient decays.
-    - `intervals`: (n,) the lengths of all intervals, s.
-    - `is_hole`: (n,) true for an interval that is a hole in the log. At the end of such an
-      interval the state is set to the particular solution at the begin of the next interval,
-      without a transient.
-    """
-
-    def step(state: Array, row: tuple[Array, ...]) -> tuple[Array, Array]:
-        own0, own1, following, h, hole = row
-        after = own1 + (state - own0) @ propagator(h).T
-        state = jnp.where(hole, following, after)
-        return state, state[:, 0]
-
-    following = jnp.concatenate([solution_at_begin[1:], solution_at_end[-1:]])
-    _, rest = lax.scan(
-        step, start, (solution_at_begin, solution_at_end, following, intervals, is_hole)
-    )
-    return jnp.concatenate([start[None, :, 0], rest])

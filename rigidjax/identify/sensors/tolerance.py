@@ -59,7 +59,7 @@ class Tolerance(eqx.Module):
 
 
 def tolerance_of(tolerance: object) -> Tolerance | None:
-    """Return `tolerance` if it is a `Tolerance` or `None`; raise `TypeError` for anything else."""
+    """Return `tolerance` if it is a `Tolerance` or `None`."""
     wanted = "Tolerance(scale=…, cross_axis=…, bias=…, clock=…) or None"
     return _checks.require_instance(
         tolerance, (Tolerance, NoneType), "tolerance", requirement=wanted

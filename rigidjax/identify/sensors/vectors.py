@@ -19,9 +19,7 @@ from rigidjax.rotation.linalg3 import apply, cross
 class VectorSensor(ClockedSensor):
     """Define a sensor that reads a vector v in its own axes: `scale · S exp(−mounting) v + bias`.
 
-    Here `scale`, `mounting` and `bias` are fields of the sensor. The rotation exp(−mounting) turns
-    v from the body's axes to the sensor's axes; `mounting` is a rotation vector. The matrix S
-    follows from the field `skew` (see `Gyro`); it is the unit matrix for orthogonal axes.
+    S follows from the field `skew` (see `Gyro`).
     """
 
     noise: Vec3 | None = eqx.field(converter=base.deviations_field(), default=None)
@@ -37,15 +35,8 @@ class VectorSensor(ClockedSensor):
     lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
     tolerance: Tolerance | None = eqx.field(converter=tolerance_of, default=None)
 
-    def _reading_of_vector(self, vector: Vec3) -> Vec3:
-        """Return the predicted reading (3,) of a `vector` v (3,) in the body frame, in the unit of
-        v.
-
-        It is `scale · S exp(−mounting) v + bias`, with the fields of the sensor. The rotation
-        exp(−mounting) turns v to the axes of the sensor. The matrix S is
-        `[[1, a, b], [0, 1, c], [0, 0, 1]]` for the `skew` (a, b, c) of axes that are not
-        orthogonal. A field that is `None` has no effect.
-        """
+    def _read(self, vector: Vec3) -> Vec3:
+        """Return the predicted reading of a `vector` in the body frame."""
         reading = vector
         if self.mounting is not None:
             reading = quaternion.rotate(quaternion.exp(-self.mounting), reading)
@@ -116,7 +107,7 @@ class Gyro(VectorSensor):
             self.place = jnp.zeros(3)
 
     def error(self, motion: SensorInput, reading: Array) -> Vec3:
-        prediction = self._reading_of_vector(motion.state.omega)
+        prediction = self._read(motion.state.omega)
         if self.g_sensitivity is not None:
             assert self.place is not None
             force = specific_force(motion, self.place, self.gravity)
@@ -125,12 +116,11 @@ class Gyro(VectorSensor):
 
 
 def specific_force(motion: SensorInput, place: Vec3, gravity: Vec3 | None) -> Vec3:
-    """Return the specific force (3,) at a place of the body, m/s², body frame.
+    """Return the specific force at a place of the body, m/s², body frame: `Rᵀ(a − g) + dΩ/dt × r +
+    Ω × (Ω × r)`.
 
-    It is `Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)`. Here R is the rotation from body to world axes, Ω
-    the body rate, r the vector to the `place` from the reference point (the centre of mass, or the
-    pivot of a body on a pivot), a the acceleration of the reference point, and g the `gravity`. If
-    `gravity` is `None`, the result is only the terms with r.
+    Here a is the acceleration of the reference point of `SensorInput.lever`, and r the vector from
+    it to the `place`. Without `gravity` the result is only the terms with r.
     """
     state, rate = motion.state, motion.rate
     r = motion.lever(place)
@@ -175,7 +165,7 @@ class Accelerometer(VectorSensor):
     gravity: Vec3 | None = eqx.field(converter=base.optional_array_field("gravity"), default=None)
 
     def error(self, motion: SensorInput, reading: Array) -> Vec3:
-        return reading - self._reading_of_vector(specific_force(motion, self.place, self.gravity))
+        return reading - self._read(specific_force(motion, self.place, self.gravity))
 
 
 class Magnetometer(VectorSensor):
@@ -208,4 +198,4 @@ class Magnetometer(VectorSensor):
 
     def error(self, motion: SensorInput, reading: Array) -> Vec3:
         field = quaternion.rotate(quaternion.conjugate(motion.state.q), self.field)
-        return reading - self._reading_of_vector(field)
+        return reading - self._read(field)

@@ -15,9 +15,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from rigidjax.identify.model.free import TOLERANCES, Slot, leaf_and_entries
+from rigidjax.identify.model.free import TOLERANCES, Slot, split_path
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.terms import Noise, standardised_error_changes
+from rigidjax.identify.model.terms import Noise, scaled_slopes
 from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.identify.sensors.vectors import VectorSensor
 from rigidjax.identify.uncertainty.covariance import Linearisation
@@ -85,7 +85,7 @@ def compute_considered_errors(
         tolerance = getattr(sensor, "tolerance", None)
         for kind, member in MEMBERS.items():
             width = getattr(tolerance, kind, None)
-            some = [leaf_and_entries(one.path)[1] for one in slots_of_sensor(model, index, member)]
+            some = [split_path(one.path)[1] for one in slots_of_sensor(model, index, member)]
             if width is None or None in some:
                 continue
             # The tolerance of one sensor may differ between recordings. The largest tolerance is
@@ -108,7 +108,7 @@ def slots_of_sensor(model: Model, sensor_index: int, member: str) -> list[Slot]:
     """
 
     def names(slot: Slot) -> tuple[Any, ...]:
-        path, _ = leaf_and_entries(slot.path)
+        path, _ = split_path(slot.path)
         return tuple(getattr(key, "name", getattr(key, "idx", None)) for key in path)
 
     return [slot for slot in model.slots if names(slot) == ("sensors", sensor_index, member)]
@@ -143,9 +143,7 @@ def shifts_by_unit_errors(
     direction = _reading_changes_by_unit_errors(model, linear, sensor_index, error_kind)
     jitter_error = model.records.readings[sensor_index].jitter_error
     # Make NumPy arrays: single operations of JAX are slow outside of a compiled program.
-    scaled = np.asarray(
-        standardised_error_changes(direction, np.asarray(noise[sensor_index]), jitter_error)
-    )
+    scaled = np.asarray(scaled_slopes(direction, np.asarray(noise[sensor_index]), jitter_error))
     pulls = np.einsum(
         "rtkm,rt,rtkc->rmc",
         linear.slopes[sensor_index],

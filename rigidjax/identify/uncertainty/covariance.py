@@ -13,11 +13,11 @@ from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import (
     Blocks,
     Noise,
-    body_prior_and_pull_residuals,
-    jacobian_and_value,
+    joint_residuals,
     prior_weights,
     reading_weights,
-    residuals_and_jacobians,
+    residual_jacobians,
+    value_and_jacfwd,
     whiten,
 )
 
@@ -215,8 +215,8 @@ def _weighted_errors_and_derivatives(
       priors; and the derivatives (j, n) of these residuals.
     """
     errors, slopes = blocks
-    out, slopes = residuals_and_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
-    extra_slopes, extra = jacobian_and_value(lambda x: body_prior_and_pull_residuals(model, x), x)
+    out, slopes = residual_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
+    extra, extra_slopes = value_and_jacfwd(lambda x: joint_residuals(model, x), x)
     weights, prior = reading_weights(model, errors, noise), prior_weights(model)
     return (out, slopes, weights), model.index.places, (prior * x, prior, extra, extra_slopes)
 
@@ -235,7 +235,7 @@ def linearise(
     - `model`, `noise`: the model, and the standard deviations of the noise of its sensors.
     - `x`: (n,) the free numbers.
     - `blocks`: for each sensor the errors and the derivatives of the errors at x, as
-      `terms.errors_and_jacobians` returns them.
+      `terms.error_jacobians` returns them.
     - `thickened`: `None` if no body is flat (I1 + I2 = I3) at x. Otherwise two things: the free
       numbers of a slightly thicker body, at which the derivatives are computed; and the `blocks` at
       these numbers.
@@ -248,7 +248,7 @@ def linearise(
         thick = linearise(model, thickened[0], noise, thickened[1])
         slopes, others = thick.slopes, (*others[:-1], thick.extra_slopes)
     pairs = zip(model.records.readings, weights, strict=True)
-    mask = tuple(reading.usable_channel_mask & (weight > 0)[..., None] for reading, weight in pairs)
+    mask = tuple(reading.usable & (weight > 0)[..., None] for reading, weight in pairs)
     return Linearisation(raw, raw_slopes, errors, slopes, weights, mask, places, *others)
 
 

@@ -14,9 +14,9 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import inertia_from_second_moment
 from rigidjax.identify.model.charts import (
     AbstractBodyChart,
-    bodies_as_list,
+    body_list,
     chart_list,
-    numbers_of_each_body,
+    split_numbers,
 )
 from rigidjax.identify.model.model import Model
 
@@ -120,7 +120,7 @@ def thicken_flat_bodies(model: Model, x: Float[Array, " n"]) -> Float[Array, " n
     thick = list(map(_numbers_of_thicker_body, chart_list(model.chart), bodies_at(model, x)))
     if all(one is None for one in thick):
         return None
-    pairs = zip(numbers_of_each_body(model.chart, x[: model.index.bodies]), thick, strict=True)
+    pairs = zip(split_numbers(model.chart, x[: model.index.bodies]), thick, strict=True)
     vectors = [old if new is None else new for old, new in pairs]
     return jnp.concatenate([*vectors, x[model.index.bodies :]])
 
@@ -131,7 +131,7 @@ def bodies_at(model: Model, x: Float[Array, " n"]) -> list[Any]:
 
     A chart is the parametrisation of one body by free numbers.
     """
-    return bodies_as_list(model.unpack(x).body)
+    return body_list(model.unpack(x).body)
 
 
 def _numbers_of_thicker_body(
@@ -186,7 +186,7 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
     body whose moments are not free the result is 1.
     """
     out = []
-    bodies = bodies_as_list(model.bodies(x))
+    bodies = body_list(model.bodies(x))
     for chart, body in zip(chart_list(model.chart), bodies, strict=True):
         if not _is_bounded_by_flat_bodies(chart):
             out.append(jnp.ones((), x.dtype))

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax.identify.model.charts import AbstractBodyChart, Bodies, Ratios, bodies_as_list
-from rigidjax.identify.model.model import Model, values_of, with_first_times_only
-from rigidjax.identify.model.terms import jacobian_and_value
+from rigidjax.identify.model.charts import AbstractBodyChart, Bodies, Ratios, body_list
+from rigidjax.identify.model.model import Model, shortened, values_of
+from rigidjax.identify.model.terms import value_and_jacfwd
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
 
@@ -180,7 +180,7 @@ def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
     the initial body rates (rad/s), and the values of each `Free` (a number of a torque or sensor
     that the fit may move). A positive quantity is given by its logarithm.
     """
-    parts, bodies = [jnp.zeros(0, x.dtype)], bodies_as_list(model.bodies(x))
+    parts, bodies = [jnp.zeros(0, x.dtype)], body_list(model.bodies(x))
     for (_, chart), body in zip(name_suffixes_and_charts(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
     if reports_initial_states(model):
@@ -201,7 +201,7 @@ def quantities_and_derivatives(model: Model, x: Float[Array, " n"]) -> tuple[Arr
     Both arrays have further entries at the end for the flatness (I1 + I2 − I3) / I3 of each body. A
     positive quantity is given by its logarithm.
     """
-    return _compiled_quantities_and_derivatives(with_first_times_only(model), x)
+    return _compiled_quantities_and_derivatives(shortened(model), x)
 
 
 @eqx.filter_jit
@@ -218,7 +218,7 @@ def _compiled_quantities_and_derivatives(
     def value(x: Array) -> Array:
         return jnp.concatenate([quantity_vector(model, x), flat_limit.flatness(model, x)])
 
-    slope, values = jacobian_and_value(value, x)
+    values, slope = value_and_jacfwd(value, x)
     return values, slope
 
 

@@ -17,7 +17,7 @@ import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.answer.answers import Answer
 from rigidjax.identify.filtering.terms import cost_gradient_and_information
-from rigidjax.identify.model.terms import errors_and_jacobians
+from rigidjax.identify.model.terms import error_jacobians
 from rigidjax.identify.uncertainty.covariance import linearise
 
 # The places of the initial rate among the free numbers of `model`.
@@ -44,7 +44,7 @@ def fitted():
         model(), at, covariance, covariance, "", noises, (), 0.0, 1, 1.0, 1.0,
         jnp.ones(5), nothing, (), Answer("found"),
         Answer("explains the readings"), (),
-        linear=linearise(model(), at, noises, errors_and_jacobians(model(), at)),
+        linear=linearise(model(), at, noises, error_jacobians(model(), at)),
     )  # fmt: skip
 
 
