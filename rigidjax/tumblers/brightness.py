@@ -51,8 +51,8 @@ def ellipsoid(
     a = _checks.array_of_shape(semi_axes, (3,), "semi_axes", unit="m")
     a = _checks.require_positive(a, "semi_axes", "three positive lengths, m")
     s, o = (
-        unit_direction(sun, "sun").astype(a.dtype),
-        unit_direction(observer, "observer").astype(a.dtype),
+        unit_direction(v, name).astype(a.dtype)
+        for v, name in ((sun, "sun"), (observer, "observer"))
     )
     # The axes are scaled by a power of two, since their fourth powers could overflow.
     size = largest_binary_exponent(a)
