@@ -20,7 +20,7 @@ from rigidjax.exact.jacobi_duplication import (
     elliptic_functions,
     half_period,
 )
-from rigidjax.rotation.barrier import barrier, compiled_as_one_kernel
+from rigidjax.rotation.barrier import barrier, one_kernel
 
 
 class ClosedFormConstants(NamedTuple):
@@ -41,7 +41,7 @@ class ClosedFormConstants(NamedTuple):
     swapped: Float[Array, ""]  # whether axis 1 has the largest moment
 
 
-@compiled_as_one_kernel
+@one_kernel
 def closed_form_constants(moments: Triple, momentum: Triple) -> ClosedFormConstants:
     """Return the constants of a free motion in ascending principal moments, of which some may be
     equal.
@@ -127,7 +127,7 @@ class MomentumAndTurn(NamedTuple):
     turn: QuaternionEntries
 
 
-@compiled_as_one_kernel
+@one_kernel
 def momentum_and_turn(constants: ClosedFormConstants, t: Scalar) -> MomentumAndTurn:
     """Return the motion at the time t."""
     half_time = reduce_time(0.5 * t, constants.half.time, constants.modulus)

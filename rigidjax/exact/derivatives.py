@@ -61,7 +61,7 @@ from rigidjax.exact.principal_axes import (
     tensor_in_axes,
 )
 from rigidjax.exact.sigma_form import Differences
-from rigidjax.rotation.barrier import compiled_as_one_kernel
+from rigidjax.rotation.barrier import one_kernel
 from rigidjax.rotation.linalg3 import components
 
 # If the body turns by less than this angle, rad, from time 0 to t, the derivative of its rotation
@@ -168,7 +168,7 @@ class FreeMotionConstants(NamedTuple):
     closed_form: ClosedFormConstants
 
 
-@compiled_as_one_kernel
+@one_kernel
 def motion_constants(tensor: Mat3, omega: Vec3) -> FreeMotionConstants:
     """Return the principal axes of a body, and the constants of its free motion in these axes, from
     the tensor and the initial rate in the body frame.
@@ -231,7 +231,7 @@ def _at_each(function: Callable[[Scalar], PyTree[Array]], t: Float[Array, "*n"])
     return jax.lax.map(function, t) if t.size <= _LOOPED else jax.vmap(function)(t)
 
 
-@compiled_as_one_kernel
+@one_kernel
 def _rate_and_turn_at(constants: FreeMotionConstants, t: Scalar) -> RateAndTurn:
     """Return the rate and the turn of a free body at one time."""
     momentum, (w, *axis) = momentum_and_turn(constants.closed_form, t)
@@ -240,22 +240,17 @@ def _rate_and_turn_at(constants: FreeMotionConstants, t: Scalar) -> RateAndTurn:
     return RateAndTurn(rate, jnp.stack([w, *combine_columns(constants.axes, tuple(axis))]))
 
 
-class InAxes(NamedTuple):
-    """Hold the inertia and the momentum Π(0) of a body in principal axes."""
-
-    inertia: SymmetricEntries
-    momentum: Triple
-
-
-def _in_axes(tensor: Mat3, omega: Vec3, constants: FreeMotionConstants) -> InAxes:
+def _in_axes(
+    tensor: Mat3, omega: Vec3, constants: FreeMotionConstants
+) -> tuple[SymmetricEntries, Triple]:
     """Return the inertia and the momentum in principal axes, which derivatives hold fixed, as
     differentiable functions of the tensor and the rate.
     """
     moments = tensor_in_axes(tensor, constants.axes, constants.moments)
-    return InAxes(moments, matvec(moments, components_along(constants.axes, omega)))
+    return moments, matvec(moments, components_along(constants.axes, omega))
 
 
-@compiled_as_one_kernel
+@one_kernel
 def _rows_by_body(
     tensor_and_rate: Float[Array, "12"], constants: FreeMotionConstants
 ) -> Float[Array, "9 12"]:
@@ -290,7 +285,7 @@ class RateDerivatives(NamedTuple):
     theta: VectorDerivatives
 
 
-@compiled_as_one_kernel
+@one_kernel
 def _rate_rows(
     tensor: Mat3, omega: Vec3, constants: FreeMotionConstants, t: Scalar
 ) -> RateDerivatives:
@@ -328,7 +323,7 @@ class MotionAndDerivatives(NamedTuple):
 
 
 @jax.custom_jvp
-@compiled_as_one_kernel
+@one_kernel
 def motion_and_derivatives(
     inertia: SymmetricEntries, momentum: Triple, t: Scalar
 ) -> MotionAndDerivatives:
@@ -441,7 +436,7 @@ def ten_variables(inverse: Inverse, momentum: Triple, t: Scalar) -> Float[Array,
     return jnp.stack([d12, d23, k12, k13, k23, *momentum, inverse.k[2], t])
 
 
-@compiled_as_one_kernel
+@one_kernel
 def _turn_and_parts(
     constants: ClosedFormConstants, inertia: SymmetricEntries, momentum: Triple, t: Scalar
 ) -> tuple[MomentumAndTurn, MomentumParts]:

@@ -13,7 +13,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, ScalarLike, Vec3
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
+from rigidjax.body.scaling import binary_exponent, times_power_of_two
 from rigidjax.exact.derivatives import (
     FreeMotionConstants,
     motion_constants,
@@ -46,8 +46,8 @@ class FreeMotion(eqx.Module):
         # Divide the tensor and the body rate by powers of two, so that their largest entries are
         # near 1: this loses no digit, and no product below overflows or underflows for a huge or a
         # tiny body.
-        self.exponent = largest_binary_exponent(state0.omega)
-        self.tensor = times_power_of_two(tensor, -largest_binary_exponent(tensor))
+        self.exponent = binary_exponent(state0.omega)
+        self.tensor = times_power_of_two(tensor, -binary_exponent(tensor))
         self.omega = times_power_of_two(state0.omega, -self.exponent)
         self.setting = motion_constants(*jax.lax.stop_gradient((self.tensor, self.omega)))
         self.state0 = state0

@@ -1,7 +1,6 @@
 """Compute the two periods of a free body: of its body rates, and of its precession."""
 
 import math
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,7 @@ from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, Vec3, Vec3Like
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
-from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
+from rigidjax.body.scaling import binary_exponent, times_power_of_two
 from rigidjax.exact import sigma_form
 from rigidjax.exact.components3 import HALF, SymmetricEntries, Triple, matvec
 from rigidjax.exact.derivatives import inverted, motion_and_derivatives
@@ -46,7 +45,7 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> bool(abs(body_period(top, jnp.array([1.0, 0.5, 0.0])) - 4 * jnp.pi) < 1e-14)
     True
     """
-    return _checked_periods(inertia, omega0).body
+    return _checked_periods(inertia, omega0)[0]
 
 
 def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
@@ -72,18 +71,11 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> precession_period(top, jnp.array([1.0, 0.5, 0.0]))  # 2π I₂/|L|
     Array(8.88576588, dtype=float64)
     """
-    return _checked_periods(inertia, omega0).precession
+    return _checked_periods(inertia, omega0)[1]
 
 
-class Periods(NamedTuple):
-    """Hold the periods, s, that `body_period` and `precession_period` return."""
-
-    body: Scalar
-    precession: Scalar
-
-
-def _checked_periods(inertia: Inertia, omega0: Vec3Like) -> Periods:
-    """Return both periods after checks of the arguments."""
+def _checked_periods(inertia: Inertia, omega0: Vec3Like) -> tuple[Scalar, Scalar]:
+    """Return the body period and the precession period after checks of the arguments."""
     _checks.require_unbatched_instance(
         inertia, Inertia, "inertia", hint="of MassProperties pass .inertia"
     )
@@ -93,10 +85,10 @@ def _checked_periods(inertia: Inertia, omega0: Vec3Like) -> Periods:
 
 
 @jax.jit
-def _periods(tensor: Mat3, omega: Vec3) -> Periods:
-    """Return both periods, from one program."""
-    exponent = largest_binary_exponent(omega)
-    moments, axes = principal_axes(times_power_of_two(tensor, -largest_binary_exponent(tensor)))
+def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
+    """Return the body period and the precession period, s, from one program."""
+    exponent = binary_exponent(omega)
+    moments, axes = principal_axes(times_power_of_two(tensor, -binary_exponent(tensor)))
     momentum = matvec(moments, components_along(axes, times_power_of_two(omega, -exponent)))
     body, _, _ = inverted(moments, momentum)
     v = sigma_form.invariants(body, momentum)
@@ -117,7 +109,7 @@ def _periods(tensor: Mat3, omega: Vec3) -> Periods:
     middle = 2.0 * math.pi * moments[1] / jnp.where(still, 1.0, h)
     precession = jnp.where(endless, middle, 2.0 * math.pi * period / angle)
     period, precession = jnp.where(endless, jnp.inf, period), jnp.where(still, jnp.inf, precession)
-    return Periods(times_power_of_two(period, -exponent), times_power_of_two(precession, -exponent))
+    return times_power_of_two(period, -exponent), times_power_of_two(precession, -exponent)
 
 
 @jax.custom_jvp

@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 
 from rigidjax._types import Mat3, Scalar, Vec3
 from rigidjax.exact.components3 import SymmetricEntries, Triple
-from rigidjax.rotation.barrier import compiled_as_one_kernel, match_batch_axes
+from rigidjax.rotation.barrier import match_batch_axes, one_kernel
 
 # The number of sweeps of Jacobi's cyclic method for eigenvalues; one sweep is three rotations. The
 # method converges quadratically: four or five sweeps are enough for any symmetric 3×3 matrix, and
@@ -83,7 +83,7 @@ def combine_columns(axes: Mat3, components: Triple) -> Triple:
     )
 
 
-@compiled_as_one_kernel
+@one_kernel
 def _jacobi(matrix: Mat3) -> tuple[list[list[Scalar]], Triple]:
     """Return the matrix, as its three rows, whose columns are the principal axes of a symmetric
     tensor, and the ascending moments, by Jacobi's method.

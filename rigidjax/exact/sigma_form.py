@@ -224,7 +224,7 @@ class DivisorTerms(NamedTuple):
     less: Scalar
 
 
-def divisor_terms_of_step(
+def divisor_of_step(
     inverse_inertia: Differences, constants: Invariants, sigma_of_step: Sigma
 ) -> DivisorTerms:
     """Return the terms of W for a step whose sigma functions are given."""
@@ -289,7 +289,7 @@ def four_parts(
     n = iteration_limits(u.dtype).doublings + _MORE
     sigma = sigma_series(u * 2.0**-n, constants)
     sigma = jax.lax.fori_loop(0, n, lambda _, g: doubled_sigma(g, constants), sigma)
-    terms = barrier(divisor_terms_of_step(inverse_inertia, constants, sigma))
+    terms = barrier(divisor_of_step(inverse_inertia, constants, sigma))
     k12, k13, k23 = (hh * c for c in inverse_inertia[3:])
     b = (
         -constants.a2 * constants.a3 - k23 * k23,
