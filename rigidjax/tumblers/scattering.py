@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Numbers, Scalar, Vec3, Vec3Like
-from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
+from rigidjax.body.scaling import binary_exponent, times_power_of_two
 from rigidjax.rotation.linalg3 import apply, cofactors, cross, determinant, dot
 
 # For arguments below _SMALL the function `_artanh_excess` is computed by a
@@ -147,7 +147,7 @@ def unit_direction(value: Vec3Like | Numbers, name: str) -> Vec3:
     v = _checks.error_if(v, ~(jnp.abs(v) > 0).any(), words)
     # The vector is scaled by a power of two, since the square of a distance of 1e200 m would
     # overflow.
-    v = times_power_of_two(v, -largest_binary_exponent(v))
+    v = times_power_of_two(v, -binary_exponent(v))
     return v / jnp.sqrt(dot(v, v))
 
 
