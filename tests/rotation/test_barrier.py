@@ -13,7 +13,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax.rotation import barrier
-from rigidjax.rotation.barrier import one_kernel, match_batch_axes
+from rigidjax.rotation.barrier import match_batch_axes, one_kernel
 
 LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000"
 OLDER = "--xla_cpu_use_fusion_emitters=false"
