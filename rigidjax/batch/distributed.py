@@ -115,7 +115,7 @@ def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> Py
         sent = np.asarray(multihost_utils.process_allgather(jnp.asarray(filled)))
         return np.concatenate([part[:n] for part, n in zip(sent, counts, strict=True)])
 
-    return _combine_over_processes(rows_of_all, _copy_to_host(tree, "gather"), checkpoint)
+    return _combined(rows_of_all, _on_host(tree, "gather"), checkpoint)
 
 
 def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyTree:
@@ -135,7 +135,7 @@ def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyT
     [1.0, 1.0]
     """
     add = lambda leaf: multihost_utils.process_allgather(jnp.asarray(leaf)).sum(axis=0)  # noqa: E731
-    return _combine_over_processes(add, _copy_to_host(tree, "total"), checkpoint)
+    return _combined(add, _on_host(tree, "total"), checkpoint)
 
 
 def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
@@ -150,9 +150,7 @@ def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
     'share-0.npz'
     """
     folder = _checks.file_path(folder, "folder")
-    leaves = {
-        f"leaf{i}": leaf for i, leaf in enumerate(jax.tree.leaves(_copy_to_host(tree, "save")))
-    }
+    leaves = {f"leaf{i}": leaf for i, leaf in enumerate(jax.tree.leaves(_on_host(tree, "save")))}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"share-{jax.process_index()}.npz"
     handle, name = tempfile.mkstemp(dir=folder, suffix=".part")
@@ -208,11 +206,9 @@ def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
     return trees
 
 
-def _copy_to_host(tree: PyTree, caller: str) -> PyTree:
-    """Return a tree whose arrays are copied to host memory, as NumPy arrays.
-
-    Raise `TypeError` if an array is traced. The message begins with `caller`, the name of the
-    public function that the user called.
+def _on_host(tree: PyTree, caller: str) -> PyTree:
+    """Return a tree whose arrays are NumPy arrays in host memory; raise a `TypeError`, which begins
+    with the name of the `caller`, if one is traced.
     """
     if not _checks.is_known(tree):
         raise TypeError(
@@ -222,23 +218,16 @@ def _copy_to_host(tree: PyTree, caller: str) -> PyTree:
     return jax.tree.map(np.asarray, tree)
 
 
-def _combine_over_processes(
+def _combined(
     combine: Callable[[np.ndarray], np.ndarray | Array],
     tree: PyTree,
     checkpoint: str | os.PathLike[str] | None,
 ) -> PyTree:
-    """Return the arrays of a tree, joined or summed over all processes.
+    """Return the arrays of a tree, joined or summed over all processes by `combine`, which sends
+    one array.
 
-    **Arguments:**
-
-    - `combine`: a function that sends an array of this process to all processes, and returns the
-      joined rows, or the sum, of the arrays of all processes.
-    - `tree`: the arrays of this process. If there is one process only, `tree` is returned as it is.
-    - `checkpoint`: a folder to which `tree` is written before it is sent, so that it is not lost if
-      another process has ended; `None` writes nothing. If the folder cannot be written, a warning
-      says so, and `tree` is sent nevertheless.
-
-    Raise `RuntimeError` if sending fails, as it does if another process does not answer.
+    The tree is written to the folder `checkpoint`, if there is one, before it is sent, so that it
+    is not lost if another process has ended; a folder that cannot be written only makes a warning.
     """
     if checkpoint is not None:
         try:

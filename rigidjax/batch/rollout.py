@@ -1,7 +1,7 @@
 """Simulate many bodies with fixed steps, differentiably in forward and reverse mode."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar, overload
+from typing import Any, NamedTuple, TypeVar, overload
 
 import diffrax as dfx
 import jax
@@ -16,9 +16,9 @@ from rigidjax.batch.sharding import CompiledFunction, Devices, Division, divide_
 from rigidjax.batch.validation import (
     TorqueAxes,
     check_batch,
-    checked_inputs_of_bodies,
-    checked_step_size_and_number,
-    inertia_state_and_torque,
+    checked_samples,
+    checked_steps,
+    one_body,
 )
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -173,8 +173,8 @@ def rollout(
     Array(0.47942554, dtype=float64)
     """
     batch = check_batch(bodies, states0, torque, torque_axes)
-    h, count = checked_step_size_and_number(step_size, num_steps, batch.dtype)
-    samples = checked_inputs_of_bodies(inputs, torque, states0, count, h)
+    h, count = checked_steps(step_size, num_steps, batch.dtype)
+    samples = checked_samples(inputs, torque, states0, count, h)
     if reduce is None and initial is not None:
         raise ValueError(
             "rollout: initial is the first carried value of reduce, but no reduce was given"
@@ -188,55 +188,50 @@ def rollout(
         raise ValueError(f"save_every: wanted a divisor of num_steps = {count}, got {save_every!r}")
     start = jax.tree.map(jnp.asarray, initial)
     begin = _checks.checked_time(t0, "t0").astype(batch.dtype)
-    numbers = (batch.shared, (batch.per_body, samples), start, h, begin)
-    steps = solver, count, every, save_every is not None and reduce is None
+    numbers = Arrays(batch.shared, (batch.per_body, samples), start, h, begin)
+    steps = FixedSteps(solver, count, every, save_every is not None and reduce is None)
     division = divide_batch(chunk, devices, progress_meter, batch.dtype, batch.num_bodies)
     out = _compiled(steps, division, reduce, batch.constants, numbers)
     batch.require_valid_numbers()
     return out
 
 
-def _take_fixed_steps_of_bodies(
-    steps: tuple[Solver, int, int, bool],
-    division: Division,
-    reduce: Reduce | None,
-    constants: PyTree,
-    numbers: tuple[PyTree, ...],
+class FixedSteps(NamedTuple):
+    """Hold the steps of a rollout."""
+
+    solver: Solver
+    number: int
+    every: int  # the number of steps between two saved states, or two calls of `reduce`
+    keep: bool  # whether these states are returned, in place of the last ones
+
+
+class Arrays(NamedTuple):
+    """Hold the numbers of a rollout."""
+
+    shared: PyTree
+    per_body: tuple[PyTree, PyTree]  # of bodies, states and torque, and the inputs of the torque
+    initial: PyTree  # the first carried value of `reduce`
+    h: Array  # the step size, s
+    t0: Array  # s
+
+
+def _rollout(
+    steps: FixedSteps, division: Division, reduce: Reduce | None, constants: PyTree, numbers: Arrays
 ) -> PyTree:
-    """Take fixed steps of many bodies, and return what `rollout` returns.
-
-    **Returns** the last states if `reduce` is `None` and no states are saved; the saved states,
-    with their times along a second axis, if they are saved; with `reduce` a pair of the last states
-    and the last carried values. The first axis of every array is the bodies.
-
-    **Arguments:**
-
-    - `steps`: four things: the solver; the number of steps; the number of steps between two saved
-      states; and whether these states are saved (otherwise only the last states are returned).
-    - `division`: three things: the number of bodies that a device computes at a time; the mesh of
-      devices, or `None` for the default device; and the progress meter.
-    - `reduce`: `None`, or a function `(carried, t, state) → carried` of one body. It is called
-      whenever the number of steps between two saved states has been taken, even if only the last
-      states are returned.
-    - `constants`: what bodies, initial states and torque hold besides arrays.
-    - `numbers`: five things: the arrays that all bodies share; a pair of trees, the first with the
-      arrays of bodies, states and torque that have a row for each body, the second with the inputs
-      of the torque; the first carried value; the step size, s; and the time at which the first step
-      begins, s.
-    """
+    """Take fixed steps of many bodies, and return what `rollout` returns."""
     (solver, count, every, keep), (shared, per_body, initial, h, t0) = steps, numbers
 
     def step_body(numbers: PyTree, row: PyTree) -> PyTree:
         shared, initial, h, t0 = numbers
         own, inputs = row
-        body, state0, torque = inertia_state_and_torque(shared, own, constants)
+        body, state0, torque = one_body(shared, own, constants)
         state0 = with_own_states(
             body, state0, bind(torque, torque_inputs_at_start(torque, h, inputs)), t0
         )
         field = equations_of_motion(body, state0, torque)
         stepper = stepper_of(solver, field, state0, count)
 
-        def advance_to_next_saved_state(carry: PyTree, first: Array) -> tuple[PyTree, PyTree]:
+        def advance(carry: PyTree, first: Array) -> tuple[PyTree, PyTree]:
             # This function takes the steps from one saved state to the next one. They begin with
             # step number `first` of the run, counted from 0.
             y, carried = carry
@@ -248,11 +243,11 @@ def _take_fixed_steps_of_bodies(
 
         begin = (stepper.initial_numbers, initial)
         if every == count:
-            (y, carried), saved = advance_to_next_saved_state(begin, jnp.zeros((), jnp.int32))
+            (y, carried), saved = advance(begin, jnp.zeros((), jnp.int32))
             saved = jax.tree.map(lambda leaf: leaf[None], saved)
         else:
             firsts = jnp.arange(0, count, every, dtype=jnp.int32)
-            (y, carried), saved = lax.scan(advance_to_next_saved_state, begin, firsts)
+            (y, carried), saved = lax.scan(advance, begin, firsts)
         if reduce is not None:
             return stepper.state_of_numbers(y), carried
         return saved if keep else stepper.state_of_numbers(y)
@@ -265,4 +260,4 @@ def _take_fixed_steps_of_bodies(
     return map_bodies(step_body, (shared, initial, h, t0), per_body, division)
 
 
-_compiled = CompiledFunction(_take_fixed_steps_of_bodies)
+_compiled = CompiledFunction(_rollout)

@@ -51,39 +51,29 @@ def compiler_options() -> dict[str, Any]:
 
 
 class CompiledFunction:
-    """Call a function under `jit`, with the options of `compiler_options` where JAX takes them.
-
-    The options make the function faster on CPU. JAX takes them only at the outermost `jit`. If the
-    last argument of the function is traced, the call is within another `jit`, and no options are
-    given.
+    """Call a function under `jit`, with the options of `compiler_options` where JAX takes them: at
+    the outermost `jit`, that is, unless the last argument is traced.
     """
 
     def __init__(self, function: Callable[..., Any]):
         self.function = function
-        self._without_options = eqx.filter_jit(function)
+        self._plain = eqx.filter_jit(function)
 
     @functools.cached_property
-    def _jit_with_compiler_options(self) -> Callable[..., Any]:
-        """Return the function under `jit`, with the options of `compiler_options` if there are any.
-
-        On CPU they enable vectors of 512 bits; other backends have none, and get a plain `jit`.
-        """
+    def _with_options(self) -> Callable[..., Any]:
+        """Return the function under `jit`, with the options if there are any."""
         # The options are looked up at the first call of the function and not at import, because
         # `compiler_options` starts JAX's backend.
         options, jit = compiler_options(), cast(Any, eqx.filter_jit)
-        return jit(self.function, compiler_options=options) if options else self._without_options
+        return jit(self.function, compiler_options=options) if options else self._plain
 
     def __call__(self, *args: Any) -> Any:
         known = _checks.is_known(args[-1])
-        return (self._jit_with_compiler_options if known else self._without_options)(*args)
+        return (self._with_options if known else self._plain)(*args)
 
 
-def mesh_of_devices(devices: Devices) -> Mesh | None:
-    """Return a mesh of one axis over some devices, or `None` for the default device.
-
-    `devices` is `None` for the default device, `"all"` for all devices of this process, or a
-    sequence of devices. Raise `ValueError` for anything else, and for a device of another process.
-    """
+def mesh_of(devices: Devices) -> Mesh | None:
+    """Return a mesh of one axis over devices of this process, or `None` for the default device."""
     if devices is None:
         return None
     if devices == "all":
@@ -104,18 +94,11 @@ def mesh_of_devices(devices: Devices) -> Mesh | None:
 
 
 class Division(NamedTuple):
-    """Describe how the bodies of a batch are divided into chunks.
+    """Describe how the bodies of a batch are divided among devices and into chunks."""
 
-    **Fields:**
-
-    - `chunk`: the number of bodies that each device computes at a time.
-    - `mesh`: the devices, which exchange nothing, or `None` for the default device.
-    - `progress_meter`: a progress meter of diffrax, which is moved after each chunk.
-    """
-
-    chunk: int
-    mesh: Mesh | None
-    progress_meter: dfx.AbstractProgressMeter
+    chunk: int  # the number of bodies that each device computes at a time
+    mesh: Mesh | None  # the devices, which exchange nothing, or None for the default device
+    progress_meter: dfx.AbstractProgressMeter  # which is moved after each chunk
 
 
 def divide_batch(
@@ -125,19 +108,8 @@ def divide_batch(
     dtype: np.dtype,
     num_bodies: int,
 ) -> Division:
-    """Return a `Division`, which says how a batch of bodies is divided among devices and chunks.
-
-    A chunk is the bodies that a device computes at a time. The result also holds the progress
-    meter.
-
-    - `chunk`: the number of bodies that are computed at a time, or `None` for the default.
-    - `devices`: the devices that share the bodies, `"all"`, or `None` for the default device.
-    - `progress_meter`: a progress meter of diffrax, or `None`.
-    - `dtype`: the dtype of the numbers, on which the default size of a chunk depends.
-    - `num_bodies`: the number of bodies.
-
-    **Raises:** `ValueError` for a progress meter together with devices, and for a wrong `chunk` or
-    `devices`; `TypeError` for a progress meter that is not one of diffrax.
+    """Return how a batch is divided, for the arguments of `rollout` and the dtype of the numbers,
+    after checks.
     """
     if progress_meter is not None and devices is not None:
         raise ValueError(
@@ -150,15 +122,12 @@ def divide_batch(
             "progress_meter: wanted a diffrax.AbstractProgressMeter such as "
             f"diffrax.TextProgressMeter(), got {type(meter).__name__}"
         )
-    return Division(chunk_size(chunk, dtype, num_bodies), mesh_of_devices(devices), meter)
+    return Division(chunk_size(chunk, dtype, num_bodies), mesh_of(devices), meter)
 
 
 def chunk_size(chunk: int | None, dtype: np.dtype, num_bodies: int) -> int:
-    """Return the number of bodies that a device computes at a time, out of `num_bodies` bodies.
-
-    The result is `chunk`, or `num_bodies` if this is smaller. If `chunk` is `None`, the result is
-    on CPU the number of bodies whose numbers, of the given `dtype`, fill the cache; on other
-    backends it is `num_bodies`. Raise `ValueError` for a `chunk` that is not a positive integer.
+    """Return the number of bodies that a device computes at a time, at most all: `chunk`, or, for
+    `None`, on CPU as many as fill the cache.
     """
     if chunk is None:
         small = _ROW // np.dtype(dtype).itemsize
@@ -168,45 +137,38 @@ def chunk_size(chunk: int | None, dtype: np.dtype, num_bodies: int) -> int:
     return min(chunk, num_bodies)
 
 
-def bodies_per_device(division: Division, per_body: PyTree) -> int:
-    """Return the number of bodies that each device computes.
-
-    `division` has the devices; `per_body` are arrays with a leading axis of bodies.
-    """
+def share_of(division: Division, per_body: PyTree) -> int:
+    """Return the number of bodies that each device computes."""
     count = jax.tree.leaves(per_body)[0].shape[0]
     return -(-count // (1 if division.mesh is None else division.mesh.devices.size))
 
 
-def fit_chunk_to_memory(
+def fit_chunk(
     division: Division, function: Callable[[Any, Any], Any], shared: PyTree, per_body: PyTree
 ) -> Division:
-    """Return the `division` of a batch with chunks that fit the memory of a GPU, if all bodies of a
-    device would be computed at once.
+    """Return the division with chunks that fit the memory of a GPU, if all bodies of a device would
+    be computed at once, for the arguments of `map_bodies`.
 
     The memory is that of the record from which derivatives in reverse mode are computed. Its size
     for one body is found without running anything. On CPU, and for a few thousand bodies, the
     `division` is returned unchanged.
-
-    - `division`: how the batch is divided among devices and into chunks.
-    - `function`, `shared`, `per_body`: the arguments of `map_bodies`. The function must have
-      derivatives in reverse mode.
     """
-    share = bodies_per_device(division, per_body)
+    share = share_of(division, per_body)
     if platform() == "cpu" or share < _FEW or division.chunk < share:
         return division
     row = jax.tree.map(lambda a: a[0], per_body)
     record = jax.eval_shape(lambda *args: jax.vjp(function, *args)[1], shared, row)
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(record))
-    fitting = _SHARE * memory_of_device(division.mesh) / size
+    fitting = _SHARE * memory_of(division.mesh) / size
     if fitting >= share:
         return division
     # The length of a chunk is odd for the reason given in `map_bodies`.
     return division._replace(chunk=max(1, int(fitting) - 1 + int(fitting) % 2))
 
 
-def memory_of_device(mesh: Mesh | None) -> float:
-    """Return how many bytes of its memory JAX may use on a device of the `mesh` or, if that is
-    `None`, on the default device; infinity if JAX does not know this number.
+def memory_of(mesh: Mesh | None) -> float:
+    """Return how many bytes of its memory JAX may use on a device, or infinity if JAX does not
+    know.
     """
     default: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     chosen = default if isinstance(default, jax.Device) else jax.devices()[0]
@@ -220,21 +182,13 @@ def map_bodies(
     per_body: PyTree,
     division: Division,
 ) -> PyTree:
-    """Return `function(shared, row)` of every body, stacked along a new first axis.
-
-    **Arguments:**
-
-    - `function`: a function of one body, called with `shared` and with the row of the body.
-    - `shared`: the arrays that all bodies share.
-    - `per_body`: arrays with a leading axis of bodies, of which `row` is one row.
-    - `division`: three things: the number of bodies that a device computes at a time; the mesh of
-      devices, which exchange nothing, or `None` for the default device; and the progress meter,
-      which is moved after each chunk.
+    """Return `function(shared, row)` of every body, stacked along a new first axis, where `row` is
+    one row of the arrays `per_body`.
     """
     chunk, mesh, meter = division
     count = jax.tree.leaves(per_body)[0].shape[0]
     parts = 1 if mesh is None else mesh.devices.size
-    share = bodies_per_device(division, per_body)
+    share = share_of(division, per_body)
     chunk = min(chunk, share)
     if chunk == share and platform() != "cpu":
         # The length of the chunk is made odd: of an array of even length XLA gives each thread of a

@@ -19,17 +19,17 @@ from rigidjax.batch.sharding import (
     CompiledFunction,
     Devices,
     Division,
-    bodies_per_device,
     divide_batch,
-    fit_chunk_to_memory,
+    fit_chunk,
     map_bodies,
+    share_of,
 )
 from rigidjax.batch.validation import (
     BodyBatch,
     TorqueAxes,
     check_batch,
-    checked_step_size_and_number,
-    inertia_state_and_torque,
+    checked_steps,
+    one_body,
 )
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -80,9 +80,8 @@ class Batch(eqx.Module, Generic[State]):
     - `own`: a tuple of the states that torques have of their own, such as the speed of a wheel,
       with the leading axes (N, T); `None` if no torque has a state.
 
-    >>> bodies, omega = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0]))), jnp.ones((5, 3))
-    >>> rj.batch.simulate(bodies, rj.Spin(omega), [0.0, 1.0]).ys.omega.shape
-    (5, 2, 3)
+    >>> bodies, omega = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0]))), jnp.ones((5, 3)) >>>
+    rj.batch.simulate(bodies, rj.Spin(omega), [0.0, 1.0]).ys.omega.shape (5, 2, 3)
     """
 
     ts: Float[Array, " times"]
@@ -150,18 +149,13 @@ def simulate(
         options |= dict(save_every=every, t0=t0, devices=devices, progress_meter=progress_meter)
         ys: Any = rollout(bodies, states0, size, number, torque, **options)
         batch = check_batch(bodies, states0, torque, torque_axes)
-        h, count = checked_step_size_and_number(size, number, batch.dtype)
+        h, count = checked_steps(size, number, batch.dtype)
         ts = h * jnp.arange(every, count + 1, every).astype(h.dtype)
         ts = _checks.checked_time(t0, "t0").astype(h.dtype) + ts
         num_steps = jnp.full(batch.num_bodies, count, jnp.int32)
         own = ys.own if isinstance(ys, Coupled) else None
-        return Batch(
-            ts,
-            motion_of(ys),
-            _results_after_fixed_steps(batch._replace(checks=()), ys),
-            num_steps,
-            own,
-        )
+        result = _results(batch._replace(checks=()), ys)
+        return Batch(ts, motion_of(ys), result, num_steps, own)
     if inputs is not None:
         raise ValueError(
             "simulate: inputs are for Steps(size, number); with times give the torque "
@@ -183,40 +177,37 @@ def simulate(
     return out
 
 
-def _simulate_bodies(
+class Runs(NamedTuple):
+    """Hold the runs of many bodies, with the fields of a `Batch`."""
+
+    ys: PyTree
+    result: dfx.RESULTS
+    num_steps: Array
+    own: tuple[Any, ...] | None
+
+
+def _simulate(
     options: dict[str, Any],
     division: Division,
     constants: PyTree,
     numbers: tuple[PyTree, PyTree, Array],
-) -> tuple[PyTree, dfx.RESULTS, Array, tuple[Any, ...] | None]:
-    """Simulate many bodies, each by `rigidjax.simulate`, and return the results as four trees.
-
-    **Arguments:**
-
-    - `options`: keyword arguments of `rigidjax.simulate`, for every body.
-    - `division`: three things: the number of bodies that a device computes at a time; the mesh of
-      devices, or `None` for the default device; and the progress meter.
-    - `constants`: what bodies, initial states and torque hold besides arrays.
-    - `numbers`: three things: the arrays that all bodies share; the arrays with a row for each
-      body; and the times (T,), s, at which states are saved.
-
-    **Returns** four things, each with a leading axis of bodies: the states at the saved times; the
-    `diffrax.RESULTS` that say how each run ended; the numbers of steps; and the states that the
-    torques have of their own (such as a filtered signal), or `None`.
+) -> Runs:
+    """Simulate many bodies, each by `rigidjax.simulate` with these `options`; the `numbers` are the
+    arrays that all bodies share, those with a row for each body, and the times to save.
     """
     shared, per_body, ts = numbers
 
-    def simulate_body(shared_numbers: PyTree, row: PyTree) -> tuple[Any, ...]:
+    def simulate_body(shared_numbers: PyTree, row: PyTree) -> Runs:
         shared, ts = shared_numbers
-        body, state0, torque = inertia_state_and_torque(shared, row, constants)
+        body, state0, torque = one_body(shared, row, constants)
         sol = simulate_one(body, state0, ts, torque, throw=False, **options)
-        return sol.ys, sol.result, jnp.asarray(sol.stats["num_steps"], jnp.int32), sol.own
+        return Runs(sol.ys, sol.result, jnp.asarray(sol.stats["num_steps"], jnp.int32), sol.own)
 
     if options["solver"] is None:
         return map_bodies(simulate_body, (shared, ts), per_body, division)
     if options["adjoint"] is None:
-        division = fit_chunk_to_memory(division, simulate_body, (shared, ts), per_body)
-    if platform() != "cpu" and division.chunk < bodies_per_device(division, per_body):
+        division = fit_chunk(division, simulate_body, (shared, ts), per_body)
+    if platform() != "cpu" and division.chunk < share_of(division, per_body):
         # On a GPU the record of a body is large, because bodies are computed many at a time. With
         # `jax.checkpoint` the reverse pass computes each chunk once more, and keeps the record of
         # one chunk at a time.
@@ -225,38 +216,31 @@ def _simulate_bodies(
     def initial_speed(row: PyTree) -> Array:
         # The bodies are sorted by |Ω| + √|dΩ/dt| at the first time, in rad/s, where Ω is the body
         # rate: the larger this number is, the more steps a body needs.
-        body, state0, torque = inertia_state_and_torque(shared, row, constants)
+        body, state0, torque = one_body(shared, row, constants)
         y0 = with_own_states(body, state0, torque, ts[0])
         slope = motion_of(equations_of_motion(body, y0, torque)(ts[0], y0, None))
         rate, change = jnp.sum(state0.omega**2), jnp.sum(slope.omega**2)
         return lax.stop_gradient(jnp.sqrt(rate) + jnp.sqrt(jnp.sqrt(change)))
 
     parts = 1 if division.mesh is None else division.mesh.devices.size
-    order, inverse = sort_bodies_for_chunks(
-        jax.vmap(initial_speed)(per_body), division.chunk, parts
-    )
+    order, inverse = sorted_for_chunks(jax.vmap(initial_speed)(per_body), division.chunk, parts)
     rows = jax.tree.map(lambda a: a[order], per_body)
     out = map_bodies(simulate_body, (shared, ts), rows, division)
     return jax.tree.map(lambda a: a[inverse], out)
 
 
-_compiled = CompiledFunction(_simulate_bodies)
+_compiled = CompiledFunction(_simulate)
 
 
 @eqx.filter_jit
-def _results_after_fixed_steps(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
-    """Return how the run of each of N bodies under fixed steps ended, a `diffrax.RESULTS` (N,).
-
-    The result of a body is `nonfinite_input` if no real body can have its inertia, else `nonfinite`
-    if one of its saved states is not finite, else `successful`. `batch` holds the bodies and their
-    initial states; `ys` are the saved states, with a leading axis N.
+def _results(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
+    """Return how the run of each body under fixed steps ended: `nonfinite_input` for an impossible
+    inertia, else `nonfinite` if a saved state is not finite, else `successful`.
     """
 
     def status(row: PyTree, ys: PyTree) -> dfx.RESULTS:
         result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-        return result_or_nonfinite_input(
-            result, inertia_state_and_torque(batch.shared, row, batch.constants)[0]
-        )
+        return result_or_nonfinite_input(result, one_body(batch.shared, row, batch.constants)[0])
 
     return jax.vmap(status)(batch.per_body, ys)
 
@@ -267,24 +251,16 @@ def _results_after_fixed_steps(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
 _UNROLLED = 32
 
 
-def sort_bodies_for_chunks(key: Array, chunk: int, num_devices: int) -> tuple[Array, Array]:
-    """Sort bodies so that those that are computed together need similar numbers of steps.
+def sorted_for_chunks(key: Array, chunk: int, num_devices: int) -> tuple[Array, Array]:
+    """Return the order in which bodies that are computed together need similar numbers of steps
+    (its element i is the old index at the new place i), and its inverse; `key` is (N,), such as a
+    speed, and consecutive chunks go to the devices one after another.
 
-    A chunk is the bodies that a device computes together; all of them wait for the slowest. XLA
-    computes the bodies of a chunk in groups, so that the rounding of a body's results depends on
-    its place within the chunk. Each body therefore keeps its place within a chunk, whatever the
-    keys of other bodies are, and only its chunk is chosen by its key. If `chunk` is a multiple of
-    32, which is the size of a group, only the place within the group is kept.
-
-    **Arguments:**
-
-    - `key`: (N,) for each body the number by which it is sorted, such as its speed; NaN counts as
-      the largest number.
-    - `chunk`: the number of bodies of a chunk.
-    - `num_devices`: the number of devices, to which consecutive chunks go one after another.
-
-    **Returns** two permutations (N,): the order, whose element i is the old index of the body at
-    the new place i; and the inverse of the order.
+    All bodies of a chunk wait for the slowest. XLA computes the bodies of a chunk in groups, so
+    that the rounding of a body's results depends on its place within the chunk. Each body therefore
+    keeps its place within a chunk, whatever the keys of other bodies are, and only its chunk is
+    chosen by its key. If `chunk` is a multiple of 32, which is the size of a group, only the place
+    within the group is kept.
     """
     count = key.shape[0]
     chunk = min(chunk, -(-count // num_devices))

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
-from rigidjax.body.validation import index_of_first_impossible_inertia
+from rigidjax.body.validation import first_impossible_inertia
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import Torque
@@ -24,17 +24,19 @@ from rigidjax.solve import validation
 # The type of `torque_axes`, which says which arrays of a torque have a row for each body: 0 for
 # all, a function that selects the arrays, or a tree of 0 and `None`.
 TorqueAxes = int | Callable[[Any], Any] | PyTree
-# A check is a pair: the index of the first wrong body, or −1; and a function that raises the error
-# for this body.
-Check = tuple[Any, Callable[[int], None]]
+
+
+class Check(NamedTuple):
+    """Hold what a check of many bodies found."""
+
+    index: Any  # of the first wrong body, or −1
+    refuse: Callable[[int], None]  # raise the error for this body
 
 
 class BodyBatch(NamedTuple):
-    """Hold the bodies, initial states and torque of many runs, split into three trees.
-
-    The three trees are `shared`, `per_body` and `constants`. Each of them has the structure of the
-    tree `(bodies, states0, torque)`. Each leaf of this tree is in one of the three trees; the other
-    two have `None` in its place.
+    """Hold the bodies, initial states and torque of many runs, split into three trees of the
+    structure `(bodies, states0, torque)`: each leaf is in one, and the other two have `None` in its
+    place.
     """
 
     shared: PyTree  # the arrays that all bodies share
@@ -47,33 +49,30 @@ class BodyBatch(NamedTuple):
     checks: tuple[Check, ...] = ()
 
     def require_valid_numbers(self) -> None:
-        """Raise an error for the first body with an impossible inertia or a non-unit quaternion.
+        """Raise an error for the first body with a known impossible inertia or non-unit quaternion.
 
-        The bodies are those of this batch. Traced numbers are not checked. Call this function after
-        the computation has been started: the device then checks the bodies while the host works on,
-        and neither waits for the other.
+        Call this function after the computation has been started: the device then checks the bodies
+        while the host works on, and neither waits for the other.
         """
         for index, refuse in self.checks:
             if (i := int(index)) >= 0:
                 refuse(i)
 
 
-def inertia_state_and_torque(
-    shared: PyTree, row: PyTree, constants: PyTree
-) -> tuple[Inertia | MassProperties, Any, Torque | None]:
-    """Return the inertia, the initial state and the torque of one body of a batch.
+class OneBody(NamedTuple):
+    """Hold the parts of one run of a batch."""
 
-    **Arguments:**
+    body: Inertia | MassProperties
+    state0: Any  # NaN if it is invalid
+    torque: Torque | None
 
-    - `shared`, `constants`: the trees with these names of a `BodyBatch`: the arrays that all bodies
-      share, and the leaves that are no arrays.
-    - `row`: the row of this body in the tree `per_body` of the `BodyBatch`.
 
-    **Returns** three things: the `Inertia` or `MassProperties`; the state, which is NaN if it is
-    invalid; and the torque.
+def one_body(shared: PyTree, row: PyTree, constants: PyTree) -> OneBody:
+    """Return one body of a batch, from a row of the tree `per_body` and the other two trees of a
+    `BodyBatch`.
     """
     body, state0, torque = eqx.combine(shared, row, constants)
-    return body, project_to_group(validation.checked_start(state0, False)), torque
+    return OneBody(body, project_to_group(validation.checked_start(state0, False)), torque)
 
 
 def check_batch(
@@ -82,11 +81,10 @@ def check_batch(
     torque: Torque | None,
     torque_axes: TorqueAxes,
 ) -> BodyBatch:
-    """Check the bodies, initial states and torque of `rollout`, and return them as a `BodyBatch`.
+    """Check the arguments of `rollout`, and return them as a `BodyBatch`.
 
-    The arguments are those of `rollout` with the same names. Raise `TypeError` and `ValueError` for
-    wrong types and shapes. The numbers of few bodies are checked here, too; those of many bodies
-    are checked on the device, and `BodyBatch.require_valid_numbers` raises the error later.
+    The numbers of few bodies are checked here, too; those of many bodies are checked on the device,
+    and `BodyBatch.require_valid_numbers` raises the error later.
     """
     if not isinstance(states0, Spin | Attitude | Rigid):
         raise TypeError(
@@ -132,7 +130,7 @@ def check_batch(
     axes = (
         jax.tree.map(lambda _: own, arrays[0]),
         jax.tree.map(lambda _: True, arrays[1]),
-        _mask_of_arrays_with_body_rows(arrays[2], torque_axes, count),
+        _own_arrays(arrays[2], torque_axes, count),
     )
     per_body, shared = eqx.partition(arrays, axes)
     # The types are checked on one row of the arrays that have a row for each body. With an
@@ -152,24 +150,15 @@ def check_batch(
     return batch
 
 
-def checked_inputs_of_bodies(
+def checked_samples(
     inputs: Mapping[str, ArrayLike] | None,
     torque: Torque | None,
     states0: Spin | Attitude | Rigid,
     num_steps: int,
     step_size: Array,
 ) -> dict[str, Array] | None:
-    """Return the inputs of a torque as arrays (N, num_steps, *k) by name, after a check.
-
-    **Arguments:**
-
-    - `inputs`: arrays by the names of the torque's inputs, or `None`.
-    - `torque`: the torque, or `None`.
-    - `states0`: the initial states of the N bodies, whose precision the arrays get.
-    - `num_steps`, `step_size`: the number of steps, and the length of a step, s.
-
-    Raise `ValueError` for inputs that do not fit the torque, the bodies or the steps. The result is
-    `None` for a torque without inputs.
+    """Return the inputs of a torque as arrays (N, num_steps, *k) by name, or `None` if it has none,
+    after checks against the torque, the bodies and the steps.
     """
     for name, delay in delays_of(torque):
         if _checks.is_known((delay, step_size)):
@@ -193,19 +182,27 @@ def checked_inputs_of_bodies(
     return samples or None
 
 
-def _mask_of_arrays_with_body_rows(
-    torque: Torque | None, torque_axes: TorqueAxes, num_bodies: int
-) -> PyTree[bool]:
-    """Return which arrays of a torque have a row for each body of a batch, as a tree of booleans.
-
-    The tree has the structure of `torque`, except that one boolean may stand for all arrays of a
-    part of the torque. `torque_axes` says which arrays have such rows: it is a function that picks
-    these arrays from a torque, or a tree with 0 for them and `None` for arrays that all bodies
-    share. Raise `ValueError` if an array that is said to have such rows has not `num_bodies` of
-    them.
+def _own_arrays(torque: Torque | None, torque_axes: TorqueAxes, num_bodies: int) -> PyTree[bool]:
+    """Return which arrays of a torque have a row for each body, as a tree of booleans that may be a
+    prefix of the torque.
     """
     if callable(torque_axes) and not isinstance(torque_axes, eqx.Module):
-        prefix = _mask_of_selected_arrays(torque, torque_axes)
+        # The function selects one array, a tuple of arrays, or a member that holds arrays: call it
+        # on the torque with the numbers of its leaves in their place.
+        leaves, structure = jax.tree.flatten(torque)
+        numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
+        try:
+            picked = jax.tree.leaves(torque_axes(numbered))
+        except (AttributeError, IndexError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"torque_axes: the function selects a part that the torque does not have ({error})"
+            ) from None
+        if not picked or not all(type(index) is int for index in picked):
+            raise ValueError(
+                "torque_axes: wanted a function that picks arrays of the law, or parts of it, such "
+                f"as lambda law: law.parts[0], got {picked or 'none'}"
+            )
+        prefix = jax.tree.unflatten(structure, [i in picked for i in range(len(leaves))])
     else:
         for axis in jax.tree.leaves(torque_axes):
             if not isinstance(axis, int) or axis != 0:
@@ -227,38 +224,11 @@ def _mask_of_arrays_with_body_rows(
     return prefix
 
 
-def _mask_of_selected_arrays(torque: Torque | None, select: Callable[[Any], Any]) -> PyTree[bool]:
-    """Return which arrays of a torque a function selects, as a tree of booleans like the torque.
-
-    `select` is that function: `select(torque)` returns one array, a tuple of arrays, or a member of
-    the torque that holds arrays, all of which are then selected. Raise `ValueError` if it selects
-    no array.
-    """
-    leaves, structure = jax.tree.flatten(torque)
-    numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
-    try:
-        picked = jax.tree.leaves(select(numbered))
-    except (AttributeError, IndexError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"torque_axes: the function selects a part that the torque does not have ({error})"
-        ) from None
-    if not picked or not all(type(index) is int for index in picked):
-        raise ValueError(
-            "torque_axes: wanted a function that picks arrays of the law, or parts of it, such as "
-            f"lambda law: law.parts[0], got {picked or 'none'}"
-        )
-    return jax.tree.unflatten(structure, [i in picked for i in range(len(leaves))])
-
-
 def _check_inertia(
     bodies: Inertia | MassProperties,
 ) -> tuple[Inertia | MassProperties, list[Check]]:
-    """Return the bodies, and a check of whether each of them has an inertia that a mass can have.
-
-    **Returns** two things: the bodies; and a list with one check. The check is a pair: the index of
-    the first body whose inertia is impossible (−1 if there is none), and a function that raises the
-    error for the body whose index it is given. If the bodies are traced, nothing can be raised: the
-    list is empty, and a body with an impossible inertia is replaced by NaN.
+    """Return the bodies, with NaN for a traced impossible inertia, and, if they are known, a check
+    of their inertias.
     """
     tensor = tensor_of(bodies)
     if not _checks.is_known(tensor):
@@ -273,18 +243,17 @@ def _check_inertia(
         except ValueError as error:
             raise ValueError(f"bodies: {error}; this is body {i}") from None
 
-    return bodies, [(index_of_first_impossible_inertia(tensors), refuse)]
+    return bodies, [Check(first_impossible_inertia(tensors), refuse)]
 
 
 def _check_unit_quaternions(q: Array) -> list[Check]:
-    """Return the check that each of N quaternions `q` (N, 4) is a unit quaternion.
-
-    The check is a list with one pair: the index of the first body whose quaternion has another
-    length than 1 (−1 if there is none), and a function that raises the error for the body whose
-    index it is given. If `q` is traced, nothing can be raised, and the list is empty.
-    """
+    """Return a check of the quaternions, if they are known."""
     if not _checks.is_known(q):
         return []
+
+    def is_not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
+        length = xp.sqrt(xp.sum(xp.square(q), axis=-1))
+        return xp.abs(length - 1) > rotation_tolerance(q.dtype)
 
     def refuse(i: int) -> None:
         length = np.linalg.norm(np.asarray(q)[i])
@@ -293,27 +262,11 @@ def _check_unit_quaternions(q: Array) -> list[Check]:
             "normalise with rigidjax.quaternion.normalise, and mind that the scalar is first"
         )
 
-    return [(_checks.index_of_first_bad_row(_is_not_unit, q), refuse)]
+    return [Check(_checks.index_of_first_bad_row(is_not_unit, q), refuse)]
 
 
-def _is_not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
-    """Return for each quaternion of `q` (…, 4) whether its length differs from 1, as (…) booleans.
-
-    A difference of at most 1e-6 in float64, or 1e-3 in float32, is not counted. `xp` is the module
-    that computes: NumPy or `jax.numpy`.
-    """
-    return xp.abs(xp.sqrt(xp.sum(xp.square(q), axis=-1)) - 1) > rotation_tolerance(q.dtype)
-
-
-def checked_step_size_and_number(
-    step_size: ScalarLike, num_steps: int, dtype: np.dtype
-) -> tuple[Array, int]:
-    """Return the length of a step, s, and the number of steps, after a check of each.
-
-    `step_size` and `num_steps` are the arguments of `rollout`; `dtype` is the precision that the
-    length gets. Raise `ValueError` for a known length that is not positive and finite, and for a
-    number of steps below 1; raise `TypeError` for a number of steps that is not an integer.
-    """
+def checked_steps(step_size: ScalarLike, num_steps: int, dtype: np.dtype) -> tuple[Array, int]:
+    """Return the length of a step, s, and the number of steps, after checks."""
     h = _checks.array_of_shape(step_size, (), "step_size").astype(dtype)
     if _checks.is_known(h) and not 0 < float(h) < np.inf:
         raise ValueError(

@@ -44,8 +44,8 @@ def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> S
     >>> kinetic_energy(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array(3., dtype=float64)
     """
-    omega = _body_rate_of(state)
-    energy = 0.5 * dot(omega, apply(_checked_tensor(body), omega))
+    omega = _rate(state)
+    energy = 0.5 * dot(omega, apply(_tensor(body), omega))
     if isinstance(body, MassProperties) and isinstance(state, HasPose):
         energy = energy + 0.5 * body.mass * dot(state.v, state.v)
     return energy
@@ -72,7 +72,7 @@ def kinetic_energy_about(
     velocity = _checks.array_of_shape(velocity, (3,), "velocity")
     omega = _checks.array_of_shape(omega, (3,), "omega")
     about_origin = body.inertia_about(jnp.zeros_like(body.com)).tensor
-    swing = quaternion.rotate(validation.checked_attitude_quaternion(q), cross(omega, body.com))
+    swing = quaternion.rotate(validation.unit_attitude(q), cross(omega, body.com))
     return (
         0.5 * body.mass * dot(velocity, velocity)
         + body.mass * dot(velocity, swing)
@@ -108,7 +108,7 @@ def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) ->
     >>> angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array([1., 2., 3.], dtype=float64)
     """
-    return apply(_checked_tensor(body), _body_rate_of(state))
+    return apply(_tensor(body), _rate(state))
 
 
 def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude) -> Vec3:
@@ -177,19 +177,16 @@ def ellipsoid(
     return (jnp.sqrt(2.0 * size / moments) if kind == "energy" else size / moments), q
 
 
-def _body_rate_of(state: HasSpin | Vector) -> Vec3:
-    """Return the body rate Ω (3,), rad/s, of `state`: a state of motion, or Ω itself."""
+def _rate(state: HasSpin | Vector) -> Vec3:
+    """Return the body rate, rad/s, of a state of motion, or the rate itself."""
     return _checks.array_of_shape(
         state.omega if isinstance(state, HasSpin) else state, (3,), "omega"
     )
 
 
-def _checked_tensor(body: Inertia | MassProperties) -> Mat3:
-    """Return the inertia tensor (3, 3), kg m², of a body; of `MassProperties`, the one about the
-    centre of mass.
-
-    `body` is checked to be a single `Inertia` or `MassProperties` with a mass and moments that a
-    real body can have.
+def _tensor(body: Inertia | MassProperties) -> Mat3:
+    """Return the inertia tensor, kg m², of one possible body; of `MassProperties`, the one about
+    the centre of mass.
     """
     return tensor_of(
         validation.require_single_body(body, (Inertia, MassProperties), "body", hint=_HINT)

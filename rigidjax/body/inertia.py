@@ -29,11 +29,11 @@ from rigidjax.body import validation
 from rigidjax.body.principal_axes import eigensystem, principal
 from rigidjax.body.symmetric3 import (
     apply as apply,
-    inertia_from_second_moment,
     inverse as inverse,
     outer,
     product,
-    second_moment_from_inertia,
+    to_inertia,
+    to_second_moment,
 )
 from rigidjax.rotation import quaternion
 
@@ -109,14 +109,14 @@ class Inertia(eqx.Module):
         Array([1., 2., 3.], dtype=float64)
         """
         s = _checks.array_of_shape(second_moment, (3, 3), "second moment", unit="kg m²")
-        return Inertia(inertia_from_second_moment(validation.require_physical_second_moment(s)))
+        return Inertia(to_inertia(validation.require_second_moment(s)))
 
     @property
     def second_moment(self) -> Float[Array, "*batch 3 3"]:
         """Return the second moment 𝔖 = ∫ r rᵀ dm of this body, (3, 3), kg m², body frame, from its
         inertia tensor I: 𝔖 = ½ Tr(I) 1 − I (notes, eqs 76–78 solved).
         """
-        return second_moment_from_inertia(self.tensor)
+        return to_second_moment(self.tensor)
 
     @property
     def moments(self) -> Vec3:
@@ -145,13 +145,11 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 1.0, 1.0).shift([0.0, 0.0, 2.0], 3.0).moments
         Array([ 1., 13., 13.], dtype=float64)
         """
-        r, m = (
-            _checks.array_of_shape(r, (3,), "r", unit="m"),
-            _checks.array_of_shape(mass, (), "mass"),
-        )
+        r = _checks.array_of_shape(r, (3,), "r", unit="m")
+        m = _checks.array_of_shape(mass, (), "mass")
         if self.scale is not None:
             raise ValueError("shift: wanted an inertia in kg m², got one of arbitrary scale")
-        return Inertia(self.tensor + inertia_from_second_moment(m * outer(r, r)))
+        return Inertia(self.tensor + to_inertia(m * outer(r, r)))
 
     def rotate(self, q: Quaternion) -> "Inertia":
         """Return the inertia of the turned body, or of the body in other axes: `R(q) I R(q)ᵀ`.
@@ -163,7 +161,7 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 2.5).rotate([half, 0, 0, half]).tensor[0, 0]
         Array(2., dtype=float64)
         """
-        m = quaternion.to_matrix(validation.checked_attitude_quaternion(q))
+        m = quaternion.to_matrix(validation.unit_attitude(q))
         return Inertia(product(m, product(self.tensor, m.T)), self.scale)
 
     def require_invertible(self) -> "Inertia":
@@ -222,13 +220,13 @@ class MassProperties(eqx.Module):
         self.mass = mass if _checks.is_known(mass) else jnp.where(mass > 0, mass, jnp.nan)
         self.com = _checks.check_if_known(_checks.require_finite, com.astype(dtype), "com")
         self.second_moment = _checks.check_if_known(
-            validation.require_physical_second_moment, s.astype(dtype)
+            validation.require_second_moment, s.astype(dtype)
         )
 
     @property
     def inertia(self) -> Inertia:
         """Return the inertia of this body about its centre of mass, in body axes."""
-        return Inertia(inertia_from_second_moment(self.second_moment))
+        return Inertia(to_inertia(self.second_moment))
 
     def check(self) -> "MassProperties":
         """Return an equal body whose mass, centre of mass and second moment are checked, also under
@@ -238,7 +236,7 @@ class MassProperties(eqx.Module):
         return MassProperties(
             validation.require_physical_mass(self.mass),
             _checks.require_finite(self.com, "com"),
-            validation.require_physical_second_moment(self.second_moment),
+            validation.require_second_moment(self.second_moment),
         )
 
     def require_invertible(self) -> "MassProperties":
@@ -269,7 +267,7 @@ class MassProperties(eqx.Module):
         >>> body.inertia_about([0.0, 0, 0]).moments
         Array([2., 4., 4.], dtype=float64)
         """
-        return Inertia(inertia_from_second_moment(self.second_moment_about(point)))
+        return Inertia(to_inertia(self.second_moment_about(point)))
 
     def shift(self, r: Vector) -> "MassProperties":
         """Return the body shifted by `r` (3,), m, in its own axes: only its centre of mass changes.
@@ -289,7 +287,7 @@ class MassProperties(eqx.Module):
         >>> body.rotate([0.0, 0, 0, 1]).com
         Array([-1.,  0.,  0.], dtype=float64)
         """
-        m = quaternion.to_matrix(validation.checked_attitude_quaternion(q))
+        m = quaternion.to_matrix(validation.unit_attitude(q))
         second_moment = product(m, product(self.second_moment, m.T))
         return MassProperties(self.mass, apply(m, self.com), second_moment)
 
@@ -349,20 +347,14 @@ def with_tensor(body: OneBody, tensor: Mat3) -> OneBody:
     """
     if isinstance(body, Inertia):
         return Inertia(tensor)  # pyright: ignore[reportReturnType]
-    return eqx.tree_at(lambda b: b.second_moment, body, second_moment_from_inertia(tensor))
+    return eqx.tree_at(lambda b: b.second_moment, body, to_second_moment(tensor))
 
 
 def _add_mass(
     body: MassProperties, mass: Array, com: Array, second_moment: Array
 ) -> MassProperties:
-    """Return the body that consists of a given body and of an added mass. If `mass` and
-    `second_moment` are negative, mass is taken away from the given body instead.
-
-    - `body`: the given body
-    - `mass`: kg, the added mass
-    - `com`: (3,) m, the centre of mass of the added mass, in the frame of `body`
-    - `second_moment`: (3, 3) kg m², the second moment 𝔖 = ∫ r rᵀ dm of the added mass about its own
-      centre of mass
+    """Return the body with an added mass, whose second moment is about its own centre of mass; a
+    negative mass and second moment take mass away.
     """
     total = body.mass + mass
     d = com - body.com

@@ -4,6 +4,7 @@ import warnings
 import xml.etree.ElementTree as Tree
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import ArrayLike
@@ -42,8 +43,8 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     ValueError: missing.urdf: no such file
     """
     path = _checks.file_path(path)
-    root, nodes = _read_bodies_by_name(path)
-    read = _body_from_urdf if root.tag == "robot" else _body_from_mujoco
+    root, nodes = _read(path)
+    read = _from_urdf if root.tag == "robot" else _from_mujoco
     bodies: dict[str, MassProperties] = {}
     faults = []
     for name, node in nodes.items():
@@ -57,8 +58,14 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
         raise ValueError(faults[0])
     for words in [f"{fault}; this body is left out" for fault in faults]:
         warnings.warn(words, stacklevel=2)
-    for words in _mujoco_setting_warnings(root):
-        warnings.warn(f"{path}: {words}", stacklevel=2)
+    for compiler in root.iter("compiler"):
+        for key, unchanged in _UNCHANGED.items():
+            value = compiler.get(key)
+            if value is not None and not _equals_one_of(value, unchanged):
+                words = f'{key}="{value}": MuJoCo {_CHANGES[key]}; read as written'
+                warnings.warn(f"{path}: {words}", stacklevel=2)
+    if next(root.iter("include"), None) is not None:
+        warnings.warn(f"{path}: <include>: bodies in other files are not read", stacklevel=2)
     return bodies
 
 
@@ -79,30 +86,9 @@ _CHANGES = {
 }
 
 
-def _mujoco_setting_warnings(root: Tree.Element) -> list[str]:
-    """Return the texts of warnings about an XML file: one for each setting with which MuJoCo would
-    change the masses or inertias that are written in the file; and one if the file includes other
-    files.
-
-    - `root`: the root element of the file
-    """
-    words = []
-    for compiler in root.iter("compiler"):
-        for key, unchanged in _UNCHANGED.items():
-            value = compiler.get(key)
-            if value is not None and not _equals_one_of(value, unchanged):
-                words.append(f'{key}="{value}": MuJoCo {_CHANGES[key]}; read as written')
-    if next(root.iter("include"), None) is not None:
-        words.append("<include>: bodies in other files are not read")
-    return words
-
-
 def _equals_one_of(value: str, options: Sequence[str]) -> bool:
-    """Return whether an attribute in an XML file equals one of several texts. The texts are
-    compared as numbers if all of them are numbers: "0.0" equals "0".
-
-    - `value`: the text of the attribute
-    - `options`: the texts with which it is compared
+    """Return whether an attribute equals one of several texts, as numbers if all of them are
+    numbers: "0.0" equals "0".
     """
     try:
         return float(value) in map(float, options)
@@ -131,7 +117,7 @@ def write_inertials(
     )
     if not bodies:
         raise ValueError("bodies: wanted at least one name → MassProperties, got none")
-    root, nodes = _read_bodies_by_name(source)
+    root, nodes = _read(source)
     write = _write_to_urdf if root.tag == "robot" else _write_to_mujoco
     for name, body in bodies.items():
         _checks.require_unbatched_instance(body, MassProperties, f"bodies[{name!r}]")
@@ -145,10 +131,16 @@ def write_inertials(
     Tree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
 
-def _read_bodies_by_name(path: Path) -> tuple[Tree.Element, dict[str, Tree.Element]]:
-    """Read a robot description, and return two things: the root element of the XML file, `robot`
-    (URDF) or `mujoco`; and the element of each link or body, by its name. **Raises:** `ValueError`
-    for a file that is missing, of another format, or with two bodies of one name.
+class Description(NamedTuple):
+    """Hold the elements of a robot description."""
+
+    root: Tree.Element  # `robot` (URDF) or `mujoco`
+    nodes: dict[str, Tree.Element]  # the links or bodies by name
+
+
+def _read(path: Path) -> Description:
+    """Read a robot description, or raise a `ValueError` for a file that is missing, of another
+    format, or with two bodies of one name.
     """
     if not path.exists():
         raise ValueError(f"{path}: no such file")
@@ -164,14 +156,11 @@ def _read_bodies_by_name(path: Path) -> tuple[Tree.Element, dict[str, Tree.Eleme
     twice = [name for name in names if names.count(name) > 1]
     if twice:
         raise ValueError(f"{path}: two bodies are called {twice[0]!r}; wanted one name each")
-    return root, dict(zip(names, nodes, strict=True))
+    return Description(root, dict(zip(names, nodes, strict=True)))
 
 
-def _body_from_urdf(inertial: Tree.Element) -> MassProperties:
-    """Return the body that an `<inertial>` element of a URDF file describes, in the frame of its
-    link. **Raises:** `ValueError` for missing numbers, and for a mass or moments that no real body
-    can have.
-    """
+def _from_urdf(inertial: Tree.Element) -> MassProperties:
+    """Return the body of an `<inertial>` element of a URDF file, in the frame of its link."""
     origin, mass, inertia = (inertial.find(tag) for tag in ("origin", "mass", "inertia"))
     if mass is None or inertia is None:
         missing = "<mass>" if mass is None else "<inertia>"
@@ -182,17 +171,11 @@ def _body_from_urdf(inertial: Tree.Element) -> MassProperties:
     rotation = euler.to_matrix(_read_numbers(origin, "rpy", 3, [0.0] * 3), "xyz")
     diagonal = [_read_numbers(inertia, key, 1)[0] for key in _KEYS[:3]]
     others = [_read_numbers(inertia, key, 1, [0.0])[0] for key in _KEYS[3:]]
-    return _body_from_numbers(
-        _read_numbers(mass, "value", 1)[0], com, rotation, [*diagonal, *others]
-    )
+    return _body(_read_numbers(mass, "value", 1)[0], com, rotation, [*diagonal, *others])
 
 
-def _body_from_mujoco(inertial: Tree.Element) -> MassProperties:
-    """Return the body that an `<inertial>` element of a MuJoCo file describes, in the frame of the
-    `<body>` element around it. **Raises:** `ValueError` for missing numbers, for a mass or moments
-    that no real body can have, and for an orientation that is not given as a quaternion (`quat`),
-    but as Euler angles or axes.
-    """
+def _from_mujoco(inertial: Tree.Element) -> MassProperties:
+    """Return the body of an `<inertial>` element of a MuJoCo file, in the frame of its `<body>`."""
     other = [key for key in ("axisangle", "xyaxes", "zaxis", "euler") if key in inertial.attrib]
     if other:
         raise ValueError(f"its inertial is turned by {other[0]}; wanted quat")
@@ -202,24 +185,17 @@ def _body_from_mujoco(inertial: Tree.Element) -> MassProperties:
     else:
         six = [*_read_numbers(inertial, "diaginertia", 3), 0.0, 0.0, 0.0]
     com = _read_numbers(inertial, "pos", 3, [0.0] * 3)
-    return _body_from_numbers(
-        _read_numbers(inertial, "mass", 1)[0], com, quaternion.to_matrix(q), six
-    )
+    return _body(_read_numbers(inertial, "mass", 1)[0], com, quaternion.to_matrix(q), six)
 
 
-def _body_from_numbers(
+def _body(
     mass: float, com: np.ndarray, rotation: ArrayLike, inertia_entries: Sequence[float] | np.ndarray
 ) -> MassProperties:
-    """Return a body from the numbers of a robot description. **Raises:** `ValueError` for a mass
-    that is not positive, and for moments that no real body can have. If the moments break the
-    triangle inequality I1 + I2 ≥ I3 only by rounding (about 1e-6 of I3), they are corrected.
+    """Return a body from its mass, kg, centre of mass, m, rotation to the body frame, and inertia
+    entries xx, yy, zz, xy, xz, yz, kg m².
 
-    - `mass`: kg
-    - `com`: (3,) m, the centre of mass in the body frame
-    - `rotation`: (3, 3), the rotation matrix from the frame in which the inertia is given to the
-      body frame
-    - `inertia_entries`: six entries of the inertia tensor about the centre of mass, kg m²: xx, yy,
-      zz, xy, xz, yz
+    Moments that break the triangle inequality I1 + I2 ≥ I3 only by rounding (about 1e-6 of I3) are
+    corrected.
     """
     xx, yy, zz, xy, xz, yz = inertia_entries
     rotation = np.asarray(rotation, float)
@@ -240,14 +216,8 @@ def _body_from_numbers(
 def _read_numbers(
     element: Tree.Element | None, key: str, count: int, default: list[float] | None = None
 ) -> np.ndarray:
-    """Return the numbers (count,) in an attribute of an XML element. **Raises:** `ValueError` if
-    the attribute is missing and has no default, or does not consist of `count` finite numbers.
-
-    - `element`: the element, or `None` if it is missing
-    - `key`: the name of the attribute
-    - `count`: how many numbers are wanted
-    - `default`: the numbers that are returned if the attribute is missing, or `None` if a missing
-      attribute is an error
+    """Return the `count` finite numbers in an attribute of an element, or the `default` if there is
+    none.
     """
     text = None if element is None else element.get(key)
     if text is None:
@@ -263,29 +233,23 @@ def _read_numbers(
     return numbers
 
 
-def _numbers_as_text(numbers: ArrayLike | Numbers) -> str:
-    """Return the numbers as a text for an XML attribute, separated by spaces, with all their
-    digits.
-    """
+def _text(numbers: ArrayLike | Numbers) -> str:
+    """Return numbers with all their digits, separated by spaces."""
     return " ".join(repr(float(number)) for number in np.ravel(numbers))
 
 
 def _write_to_urdf(inertial: Tree.Element, body: MassProperties) -> None:
-    """Write the mass, centre of mass and inertia of `body` into `inertial`, an empty `<inertial>`
-    element of a URDF file.
-    """
+    """Write a body into an empty `<inertial>` element of a URDF file."""
     tensor = np.asarray(body.inertia.tensor)
-    Tree.SubElement(inertial, "origin", xyz=_numbers_as_text(body.com), rpy="0 0 0")
-    Tree.SubElement(inertial, "mass", value=_numbers_as_text(body.mass))
-    entries = {key: _numbers_as_text(tensor[at]) for key, at in zip(_KEYS, PAIRS, strict=True)}
+    Tree.SubElement(inertial, "origin", xyz=_text(body.com), rpy="0 0 0")
+    Tree.SubElement(inertial, "mass", value=_text(body.mass))
+    entries = {key: _text(tensor[at]) for key, at in zip(_KEYS, PAIRS, strict=True)}
     Tree.SubElement(inertial, "inertia", entries)
 
 
 def _write_to_mujoco(inertial: Tree.Element, body: MassProperties) -> None:
-    """Write the mass, centre of mass and inertia of `body` into `inertial`, an empty `<inertial>`
-    element of a MuJoCo file.
-    """
+    """Write a body into an empty `<inertial>` element of a MuJoCo file."""
     tensor = np.asarray(body.inertia.tensor)
-    inertial.set("mass", _numbers_as_text(body.mass))
-    inertial.set("pos", _numbers_as_text(body.com))
-    inertial.set("fullinertia", _numbers_as_text([tensor[at] for at in PAIRS]))
+    inertial.set("mass", _text(body.mass))
+    inertial.set("pos", _text(body.com))
+    inertial.set("fullinertia", _text([tensor[at] for at in PAIRS]))

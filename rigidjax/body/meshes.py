@@ -10,7 +10,7 @@ numbers that grow as the fifth power of the distance.
 
 import os
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -54,12 +54,12 @@ def mesh(
     _checks.check_if_known(_checks.require_positive, density, "density", "a positive number, kg/m³")
 
     centre = jax.lax.stop_gradient(corners.mean(axis=0))
-    six, (a, b, c) = _sixfold_volumes_and_corners(corners - centre[None, :], faces)
+    six, (a, b, c) = _tetrahedra(corners - centre[None, :], faces)
     com = (six[:, None] * (a + b + c)).sum(axis=0) / (4.0 * six.sum())
-    volume = _require_positive_volume(six.sum() / 6.0, corners, faces)
+    volume = _positive_volume(six.sum() / 6.0, corners, faces)
     # The second moments are summed about the centre of mass itself, so that no large term is
     # subtracted afterwards.
-    six, (a, b, c) = _sixfold_volumes_and_corners(corners - (centre + com)[None, :], faces)
+    six, (a, b, c) = _tetrahedra(corners - (centre + com)[None, :], faces)
     rows = (a, b, c, a + b + c)
     entries = ((six * sum(r[:, i] * r[:, j] for r in rows)).sum() / 120.0 for i, j in PAIRS)
     return MassProperties(density * volume, centre + com, density * from_components(*entries))
@@ -97,27 +97,22 @@ def mesh_file(
     return mesh(corners, np.asarray(surface.faces), density)
 
 
-def _sixfold_volumes_and_corners(
-    vertices: Float[Array, "n 3"], faces: Array
-) -> tuple[Float[Array, "m"], list[Array]]:
-    """Return two things about the m tetrahedra between the origin and each face of a triangle mesh:
-    six times their signed volumes (m,), in cubic metres; and a list of three arrays (m, 3), in
-    metres, with the first, second and third corner of each face.
+class Tetrahedra(NamedTuple):
+    """Hold the tetrahedra between the origin and the faces of a mesh."""
 
-    - `vertices`: (n, 3), in metres
-    - `faces`: (m, 3) integers, the three vertex numbers of each face
-    """
+    sixfold: Float[Array, "m"]  # six times the signed volumes, m³
+    corners: list[Array]  # the first, second and third corners (m, 3) of the faces
+
+
+def _tetrahedra(vertices: Float[Array, "n 3"], faces: Int[Array, "m 3"]) -> Tetrahedra:
+    """Return the tetrahedra of a mesh."""
     a, b, c = rows = [vertices[faces[:, k]] for k in range(3)]
-    return (a * jnp.cross(b, c)).sum(axis=1), rows
+    return Tetrahedra((a * jnp.cross(b, c)).sum(axis=1), rows)
 
 
-def _require_positive_volume(volume: Array, vertices: Array, faces: Array) -> Array:
-    """Return the `volume` of a closed triangle mesh, in cubic metres. **Raises:** `ValueError`
-    (`equinox` error under `jit`) if the volume is negative, that is, if the mesh is inside out, and
-    if the volume is zero to round-off.
-
-    - `vertices`: (n, 3), in metres
-    - `faces`: (m, 3) integers, the three vertex numbers of each face
+def _positive_volume(volume: Array, vertices: Array, faces: Array) -> Array:
+    """Return the volume of a mesh, m³, or raise an error if it is negative (the mesh is inside out)
+    or zero to round-off.
     """
     # The volume counts as zero if it is below the area of the mesh times a few units of round-off
     # of its longest extent: the mesh is then as thin as the last digit of its length.
@@ -133,13 +128,8 @@ def _require_positive_volume(volume: Array, vertices: Array, faces: Array) -> Ar
 
 
 def checked_faces(faces: Any, vertex_count: int) -> Array:
-    """Return the faces of a triangle mesh as an array (m, 3) of vertex numbers. **Raises:**
-    `ValueError` if the faces do not enclose a solid: for a number beyond the vertices, a face with
-    one vertex twice, an edge of one face only, and faces that disagree about which side is outside.
-    Faces that JAX traces are not checked.
-
-    - `faces`: (m, 3) integers, the three vertex numbers of each face
-    - `vertex_count`: the number of vertices of the mesh
+    """Return the faces of a mesh as an array of vertex numbers, or raise an error if they are known
+    and do not enclose a solid.
     """
     if not _checks.is_known(faces):
         return faces
@@ -190,7 +180,5 @@ def checked_faces(faces: Any, vertex_count: int) -> Array:
 
 
 def _python_integers(numbers: Iterable[Any]) -> tuple[int, ...]:
-    """Return the integers `numbers` as a tuple of Python integers, which messages show without a
-    dtype.
-    """
+    """Return integers as messages show them, without a dtype."""
     return tuple(int(k) for k in numbers)

@@ -19,7 +19,7 @@ from rigidjax._types import Mat3, Matrix, Numbers, Scalar, Vec3, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.principal_axes import eigensystem
 from rigidjax.body.symmetric3 import apply, from_components, product
-from rigidjax.body.validation import require_physical_moments, require_physical_second_moment
+from rigidjax.body.validation import require_physical_moments, require_second_moment
 from rigidjax.rotation.linalg3 import cross
 
 # A body counts as flat if its least principal second moment is below this fraction of the sum of
@@ -43,7 +43,7 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     hint = "for an Inertia use pack_second_moment(body.second_moment), or pack_shape"
     _checks.require_unbatched_instance(body, MassProperties, "body", hint=hint)
     alpha = _limit_exponent(0.5 * jnp.log(body.mass), jnp.expm1)
-    shape = _unconstrained_from_second_moment(body.second_moment / body.mass)
+    shape = _packed(body.second_moment / body.mass)
     return jnp.concatenate([alpha[None], shape, body.com])
 
 
@@ -60,7 +60,7 @@ def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     v = _checks.array_of_shape(vector, (10,), "vector")
     alpha = _limit_exponent(v[0])
     size = 3.0 * jnp.exp(2.0 * _limit_exponent(alpha + v[1]))
-    return MassProperties(jnp.exp(2.0 * alpha), v[7:10], size * _second_moment_from_shape(v[2:7]))
+    return MassProperties(jnp.exp(2.0 * alpha), v[7:10], size * _from_shape(v[2:7]))
 
 
 def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
@@ -73,9 +73,7 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
     >>> pack_second_moment(jnp.eye(3))
     Array([0., 0., 0., 0., 0., 0.], dtype=float64)
     """
-    return _unconstrained_from_second_moment(
-        _checks.array_of_shape(second_moment, (3, 3), "second_moment")
-    )
+    return _packed(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))
 
 
 def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
@@ -86,7 +84,7 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
     Array([1., 0., 0.], dtype=float64)
     """
     v = _checks.array_of_shape(vector, (6,), "vector")
-    return 3.0 * jnp.exp(2.0 * _limit_exponent(v[0])) * _second_moment_from_shape(v[1:])
+    return 3.0 * jnp.exp(2.0 * _limit_exponent(v[0])) * _from_shape(v[1:])
 
 
 def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
@@ -101,9 +99,7 @@ def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
     >>> pack_shape(jnp.diag(jnp.array([4.0, 4.0, 0.0])))  # a plate
     Array([0.5, 0.5, 0. , 0. , 0. ], dtype=float64)
     """
-    return _unconstrained_from_second_moment(
-        _checks.array_of_shape(second_moment, (3, 3), "second_moment")
-    )[1:]
+    return _packed(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))[1:]
 
 
 def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
@@ -113,7 +109,7 @@ def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
     >>> float(jnp.trace(unpack_shape(jnp.ones(5))))
     1.0
     """
-    return _second_moment_from_shape(_checks.array_of_shape(vector, (5,), "vector"))
+    return _from_shape(_checks.array_of_shape(vector, (5,), "vector"))
 
 
 def pack_moments(moments: Vector) -> Float[Array, "3"]:
@@ -129,7 +125,7 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
     """
     i = require_physical_moments(_checks.array_of_shape(moments, (3,), "moments"))
     s = 0.5 * jnp.stack([(i[1] - i[0]) + i[2], (i[2] - i[1]) + i[0], (i[0] - i[2]) + i[1]])
-    total = _require_positive_trace(s[0] + s[1] + s[2])
+    total = _positive_trace(s[0] + s[1] + s[2])
     root = jnp.sqrt(jnp.maximum(_divide_by_large(s, total), 0.0))
     size = _limit_exponent(0.5 * jnp.log(total / 3.0), jnp.expm1)
     return jnp.stack([size, *(3.0 * root[:2] / (root[0] + root[1] + root[2]) - 1.0)])
@@ -174,7 +170,7 @@ def curvature_rows_near_flat_body(
     """
     shape = _checks.array_of_shape(shape, (5,), "shape")
     misfit_gradient = _checks.array_of_shape(misfit_gradient, (5,), "misfit_gradient")
-    root = _second_moment_root_from_shape(shape)
+    root = _root(shape)
     # The eigenvector n is computed from the adjugate of A, the matrix `root`: for a flat body all
     # columns of the adjugate are along n. A fit needs n in every step, and the adjugate is cheaper
     # than eigenvectors.
@@ -204,14 +200,9 @@ def curvature_rows_near_flat_body(
     return size * jnp.stack([jnp.stack(row) for row in rows])
 
 
-def _second_moment_from_shape(shape: Float[Array, "5"]) -> Mat3:
-    """Return the second moment (3, 3) of a body, scaled to trace 1, from five unconstrained
-    numbers: (1 + V)²/Tr((1 + V)²). Here V is a symmetric matrix of trace zero, and 1 the unit
-    matrix.
-
-    - `shape`: (5,), the entries V₁₁, V₂₂, V₁₂, V₂₃, V₁₃
-    """
-    root = _second_moment_root_from_shape(shape)
+def _from_shape(shape: Float[Array, "5"]) -> Mat3:
+    """Return the second moment (1 + V)²/Tr((1 + V)²) that five numbers of `pack_shape` describe."""
+    root = _root(shape)
     # The root is scaled first: after a step of an optimiser that is much too long, squares of the
     # entries would overflow.
     root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
@@ -219,60 +210,43 @@ def _second_moment_from_shape(shape: Float[Array, "5"]) -> Mat3:
     return square / (square[0, 0] + square[1, 1] + square[2, 2])
 
 
-def _second_moment_root_from_shape(shape: Float[Array, "5"]) -> Mat3:
-    """Return the square root of the second moment of a body, scaled to trace 3: the symmetric
-    matrix 1 + V (3, 3), where 1 is the unit matrix.
-
-    - `shape`: (5,), the entries V₁₁, V₂₂, V₁₂, V₂₃, V₁₃ of the symmetric matrix V, whose trace is
-      zero
-    """
+def _root(shape: Float[Array, "5"]) -> Mat3:
+    """Return the root 1 + V of the second moment, scaled to trace 3."""
     d1, d2, s12, s23, s13 = shape
     return from_components(1.0 + d1, 1.0 + d2, 1.0 - d1 - d2, s12, s13, s23)
 
 
-def _unconstrained_from_second_moment(s: Mat3) -> Float[Array, "6"]:
-    """Return six unconstrained numbers that describe a second moment s: (ρ, V₁₁, V₂₂, V₁₂, V₂₃,
-    V₁₃) with s = 3 e^{2ρ} (1 + V)²/Tr((1 + V)²). Here V is a symmetric matrix of trace zero, and 1
-    the unit matrix. **Raises:** `ValueError` for a matrix that is zero, or that is not symmetric
-    and positive semi-definite.
-
-    - `s`: (3, 3), kg m² or any other unit, the second moment ∫ r rᵀ dm of a body
-    """
-    total = _require_positive_trace(s[0, 0] + s[1, 1] + s[2, 2])
-    root = _matrix_square_root(_divide_by_large(require_physical_second_moment(s), total))
+def _packed(s: Mat3) -> Float[Array, "6"]:
+    """Return the six numbers of `pack_second_moment`, in any unit."""
+    total = _positive_trace(s[0, 0] + s[1, 1] + s[2, 2])
+    root = _sqrt(_divide_by_large(require_second_moment(s), total))
     v = 3.0 * root / (root[0, 0] + root[1, 1] + root[2, 2]) - jnp.eye(3, dtype=s.dtype)
     size = _limit_exponent(0.5 * jnp.log(total / 3.0), jnp.expm1)
     return jnp.stack([size, v[0, 0], v[1, 1], v[0, 1], v[1, 2], v[0, 2]])
 
 
 @jax.custom_jvp
-def _matrix_square_root(s: Mat3) -> Mat3:
-    """Return the symmetric, positive semi-definite square root A (3, 3) of a second moment s: A
-    A = s. The derivative of A is finite also if eigenvalues of s are equal, where the eigenvectors
-    of s have no derivative.
-
-    - `s`: (3, 3), any unit
+def _sqrt(s: Mat3) -> Mat3:
+    """Return the positive semi-definite square root of a second moment; its derivative is finite
+    also if eigenvalues are equal.
     """
     values, axes = eigensystem(s)
     return product(axes * jnp.sqrt(jnp.maximum(values, 0.0))[None], axes.T)
 
 
-@_matrix_square_root.defjvp
-def _matrix_square_root_jvp(
-    primals: tuple[Mat3], tangents: tuple[PyTree, ...]
-) -> tuple[Mat3, Mat3]:
-    # For a change d𝔖 of the second moment 𝔖, the change dA of its root A solves A dA + dA A = d𝔖,
-    # nine linear equations. They are right also at equal moments, where the principal axes have no
-    # derivative.
-    root, one = _matrix_square_root(*primals), jnp.eye(3, dtype=primals[0].dtype)
+@_sqrt.defjvp
+def _sqrt_jvp(primals: tuple[Mat3], tangents: tuple[PyTree, ...]) -> tuple[Mat3, Mat3]:
+    # The tangent dA of the root A of 𝔖 solves A dA + dA A = d𝔖, nine linear equations, right also
+    # at equal moments, where the principal axes have no derivative.
+    root, one = _sqrt(*primals), jnp.eye(3, dtype=primals[0].dtype)
     sums = jnp.kron(root, one) + jnp.kron(one, root)
     change = 0.5 * (tangents[0] + tangents[0].T)
     return root, jnp.linalg.solve(sums, change.reshape(9)).reshape(3, 3)
 
 
-def _require_positive_trace(trace: Scalar) -> Scalar:
-    """Return the trace of a second moment. **Raises:** `ValueError` if it is not positive (the
-    second moment of a point is zero) or not finite.
+def _positive_trace(trace: Scalar) -> Scalar:
+    """Return the trace of a second moment, or raise an error if it is not positive (that of a point
+    is zero) or not finite.
     """
     words = (
         "pack: wanted a second moment with a positive trace, got zero (a point has no shape), a "
@@ -282,8 +256,7 @@ def _require_positive_trace(trace: Scalar) -> Scalar:
 
 
 def _divide_by_large(numerator: Array, denominator: Scalar) -> Array:
-    """Return the quotient `numerator / denominator`, correct also for a large denominator: both are
-    multiplied by ¼ before the division.
+    """Return the quotient, correct also for a large denominator.
 
     XLA multiplies by the reciprocal of the denominator. In float32 the reciprocal of the second
     moment of the Earth would be zero without the factor ¼.
@@ -292,13 +265,8 @@ def _divide_by_large(numerator: Array, denominator: Scalar) -> Array:
 
 
 def _limit_exponent(exponent: Array, map_excess: Callable[[Array], Array] = jnp.log1p) -> Array:
-    """Return an exponent x, changed only beyond a limit (330 in float64, 31 in float32), so that
-    `exp(2 * x)` does not overflow. If |x| exceeds the limit, the result is the limit plus
-    `map_excess`(|x| − limit), with the sign of x.
-
-    - `exponent`: x, any array
-    - `map_excess`: `log1p`, with which the result grows only logarithmically beyond the limit; or
-      its inverse function `expm1`, which restores x from such a result
+    """Return an exponent x, changed only beyond a limit of |x|, so that `exp(2 * x)` does not
+    overflow: there `map_excess`, log1p or its inverse expm1, maps what exceeds the limit.
     """
     limit = 31.0 if exponent.dtype == jnp.float32 else 330.0
     beyond = jnp.maximum(jnp.abs(exponent) - limit, 0.0)

@@ -102,27 +102,21 @@ def quadrature(
     dtype = jnp.result_type(float)
     cube, weight = jnp.asarray(cube, dtype), jnp.asarray(weight, dtype)
 
-    def mass_density_and_position(u: Float[Array, "3"]) -> tuple[Array, Float[Array, "3"]]:
-        """Return two things for a point `u` (3,) of the unit cube. The first is the mass of the
-        body per unit of volume of the cube, kg: the density at the position r(u), times |det
-        ∂r/∂u|. The second is the position r(u) (3,), in metres, in the body frame.
-        """
+    def element(u: Float[Array, "3"]) -> tuple[Array, Float[Array, "3"]]:
+        # Return the mass per unit of volume of the cube, kg, and the position r(u), m.
         r = _checks.array_of_shape(place(u), (3,), "place(u)")
         volume = determinant(jax.jacfwd(place)(u))
         return _checks.array_of_shape(density(r), (), "density(r)") * jnp.abs(volume), r
 
-    per_volume, positions = jax.vmap(mass_density_and_position)(cube)
+    per_volume, positions = jax.vmap(element)(cube)
     _checks.check_if_known(_checks.require_finite, positions, "place(u)")
     _checks.check_if_known(_checks.require_finite, per_volume, "density(r) |∂r/∂u|")
     return sum_masses(per_volume * weight, positions)
 
 
 def sum_masses(masses: Float[Array, "n"], positions: Float[Array, "n 3"]) -> MassProperties:
-    """Return the body made of n point masses. The masses and positions are not checked; the mass
-    and second moment of the whole body are checked.
-
-    - `masses`: (n,) kg
-    - `positions`: (n, 3) m, body frame
+    """Return the body made of point masses, kg, at positions, m, which are not checked; the mass
+    and second moment of the whole body are.
     """
     # Positions are measured from the first point: measured from a distant origin, they would make
     # the sums lose digits.

@@ -5,7 +5,7 @@ and for every symmetric top, and in JAX also for distinct moments above 1e16 kg 
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -16,7 +16,7 @@ from jaxtyping import Array, PyTree
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3
 from rigidjax.body import validation
-from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
+from rigidjax.body.scaling import binary_exponent, times_power_of_two
 from rigidjax.body.symmetric3 import product
 
 # Two moments are treated as equal if they differ by less than this many units of round-off of the
@@ -61,19 +61,20 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
     >>> moments, q
     (Array([1., 2., 3.], dtype=float64), Array([1., 0., 0., 0.], dtype=float64))
     """
-    moments, axes = eigensystem(
-        validation.require_symmetric_or_nan(
-            _checks.array_of_shape(tensor, (3, 3), "tensor"), "tensor"
-        )
-    )
-    return moments, _quaternion_of_small_turn(axes)
+    a = _checks.array_of_shape(tensor, (3, 3), "tensor")
+    moments, m = eigensystem(validation.require_symmetric_or_nan(a, "tensor"))
+    # The turn is at most 120°, so that one formula for the quaternion is enough.
+    w = 0.5 * jnp.sqrt(1.0 + m[0, 0] + m[1, 1] + m[2, 2])
+    f = 0.25 / w
+    x, y, z = f * (m[2, 1] - m[1, 2]), f * (m[0, 2] - m[2, 0]), f * (m[1, 0] - m[0, 1])
+    return moments, jnp.stack([w, x, y, z])
 
 
 @jax.custom_jvp
 @jax.jit
 def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
-    """Return two things about a symmetric matrix `a` (3, 3), any unit: the eigenvalues (3,),
-    ascending; and a right-handed matrix (3, 3) with the unit eigenvectors as columns.
+    """Return the ascending eigenvalues of a symmetric matrix, and a right-handed matrix with the
+    unit eigenvectors as columns.
 
     The method is cyclic Jacobi rotations (Golub and Van Loan 2013, section 8.5). In a batch it is
     eight times as fast as LAPACK's `eigh`, and it is accurate for the small moment of a slender
@@ -81,7 +82,7 @@ def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
     """
     # The matrix is scaled to entries near 1, so that no square overflows; a power of two costs no
     # digit.
-    exponent = largest_binary_exponent(a)
+    exponent = binary_exponent(a)
     b = times_power_of_two(0.5 * (a + a.T), -exponent)
     one, nil = jnp.ones((), a.dtype), jnp.zeros((), a.dtype)
     start = (
@@ -89,24 +90,31 @@ def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
         (b[1, 2], b[0, 2], b[0, 1]),  # the entry opposite each diagonal one
         ((one, nil, nil), (nil, one, nil), (nil, nil, one)),
     )
-    values, _, axes = jax.lax.fori_loop(0, _SWEEPS, _jacobi_sweep, start)
-    values, axes = _sort_eigenvalues(values, axes)
-    return times_power_of_two(jnp.stack(values), exponent), _reverse_axes_towards_identity(axes)
+    values, _, axes = map(list, jax.lax.fori_loop(0, _SWEEPS, _jacobi_sweep, start))
+    for i, j in ((0, 1), (1, 2), (0, 1)):
+        # Exchange two eigenvalues that do not ascend, and their axes, of which one is reversed, so
+        # that the three stay right-handed.
+        a, b, wrong = values[i], values[j], values[i] > values[j]
+        values[i], values[j] = jnp.where(wrong, b, a), jnp.where(wrong, a, b)
+        pairs = list(zip(axes[i], axes[j], strict=True))
+        axes[i] = tuple(jnp.where(wrong, q, p) for p, q in pairs)
+        axes[j] = tuple(jnp.where(wrong, -p, q) for p, q in pairs)
+    # Four choices of the signs are right-handed. The matrix with the largest trace turns by the
+    # smallest angle.
+    d0, d1, d2 = axes[0][0], axes[1][1], axes[2][2]
+    traces = jnp.stack([d0 + d1 + d2, d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1])
+    signs = jnp.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], traces.dtype)
+    columns = jnp.stack([jnp.stack(axis) for axis in axes], axis=1)
+    columns = columns * signs[jnp.argmax(traces)][None]
+    return times_power_of_two(jnp.stack(values), exponent), columns
 
 
 @eigensystem.defjvp
 def _eigensystem_jvp(
     primals: tuple[Mat3], tangents: tuple[PyTree, ...]
 ) -> tuple[tuple[Vec3, Mat3], tuple[Vec3, Mat3]]:
-    """Return two pairs: the eigenvalues (3,) and eigenvectors (3, 3), as columns, of a symmetric
-    matrix A; and their changes for a change dA of the matrix. By this rule JAX differentiates
-    `eigensystem`.
-
-    - `primals`: a tuple of one item, A (3, 3)
-    - `tangents`: a tuple of one item, dA (3, 3)
-
-    The changes are finite also if eigenvalues are equal: two eigenvectors with equal eigenvalues
-    are not turned towards each other.
+    """Return the eigensystem and its tangent, which is finite also if eigenvalues are equal: their
+    eigenvectors are not turned towards each other.
     """
     (a,), (da,) = primals, tangents
     values, axes = eigensystem(a)
@@ -119,13 +127,8 @@ def _eigensystem_jvp(
 
 
 def _jacobi_sweep(_: Array | int, state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-    """Apply three Jacobi rotations to a symmetric 3×3 matrix, and return the new matrix and axes in
-    the form of `state`. Each rotation makes one entry off the diagonal zero.
-
-    - `_`: the number of the sweep, which the loop passes and which is not used
-    - `state`: three triples: the diagonal entries; the entries (2, 3), (1, 3) and (1, 2) off the
-      diagonal; and the axes, which are the columns of the rotation so far, each as a triple of
-      scalars
+    """Apply three Jacobi rotations, of which each makes one entry off the diagonal zero, to the
+    diagonal, the entries (2, 3), (1, 3) and (1, 2), and the axes.
     """
     values, opposite, axes = map(list, state)
     for k in range(3):
@@ -142,50 +145,6 @@ def _jacobi_sweep(_: Array | int, state: tuple[Any, Any, Any]) -> tuple[Any, Any
         axes[i] = tuple(c * p - s * q for p, q in pairs)
         axes[j] = tuple(s * p + c * q for p, q in pairs)
     return tuple(values), tuple(opposite), tuple(axes)
-
-
-def _sort_eigenvalues(
-    values: Sequence[Scalar], axes: Sequence[tuple[Scalar, ...]]
-) -> tuple[list[Scalar], list[tuple[Scalar, ...]]]:
-    """Return two lists, sorted by ascending eigenvalue: the three eigenvalues; and the three
-    eigenvectors. If two eigenvectors are exchanged, one of them is reversed, so that the three stay
-    right-handed.
-
-    - `values`: three scalars, the eigenvalues
-    - `axes`: three triples of scalars, the eigenvectors
-    """
-    values, axes = list(values), list(axes)
-    for i, j in ((0, 1), (1, 2), (0, 1)):
-        a, b, wrong = values[i], values[j], values[i] > values[j]
-        values[i], values[j] = jnp.where(wrong, b, a), jnp.where(wrong, a, b)
-        pairs = list(zip(axes[i], axes[j], strict=True))
-        axes[i] = tuple(jnp.where(wrong, q, p) for p, q in pairs)
-        axes[j] = tuple(jnp.where(wrong, -p, q) for p, q in pairs)
-    return values, axes
-
-
-def _reverse_axes_towards_identity(axes: Sequence[tuple[Scalar, ...]]) -> Mat3:
-    """Return the rotation matrix (3, 3) with three orthonormal `axes` as columns; two of the axes,
-    or none, are reversed, so that the rotation turns by the smallest angle.
-
-    Four choices of the signs are right-handed. The matrix with the largest trace turns by the
-    smallest angle.
-
-    - `axes`: three triples of scalars, right-handed
-    """
-    d0, d1, d2 = axes[0][0], axes[1][1], axes[2][2]
-    traces = jnp.stack([d0 + d1 + d2, d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1])
-    signs = jnp.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], traces.dtype)
-    return jnp.stack([jnp.stack(axis) for axis in axes], axis=1) * signs[jnp.argmax(traces)][None]
-
-
-def _quaternion_of_small_turn(m: Mat3) -> Quat:
-    """Return the unit quaternion (w, x, y, z) of a rotation matrix m (3, 3) whose trace is not
-    negative, that is, of a turn by at most 120°; one formula is then enough.
-    """
-    w = 0.5 * jnp.sqrt(1.0 + m[0, 0] + m[1, 1] + m[2, 2])
-    f = 0.25 / w
-    return jnp.stack([w, f * (m[2, 1] - m[1, 2]), f * (m[0, 2] - m[2, 0]), f * (m[1, 0] - m[0, 1])])
 
 
 def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> Mat3:
@@ -213,45 +172,30 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     # The unit is a power of two near the largest entry, so that no product leaves the range of the
     # dtype. The exponent is reduced by one, because the power of two above the largest number of
     # the dtype is infinite.
-    unit = times_power_of_two(jnp.ones((), a.dtype), largest_binary_exponent(a) - 1)
+    unit = times_power_of_two(jnp.ones((), a.dtype), binary_exponent(a) - 1)
     a = 0.5 * (a + a.T) / unit
 
-    def function_of_scaled_eigenvalue(scaled: Scalar) -> Scalar:
-        """Return f(λ), where f is the user's function of one eigenvalue λ of the matrix.
-
-        - `scaled`: λ divided by the number `unit`, a power of two by which the whole matrix was
-          divided
-        """
+    def of_scaled(scaled: Scalar) -> Scalar:
         return _checks.array_of_shape(function(unit * scaled), (), "function(λ)", hint="one number")
 
     values, axes = eigensystem(jax.lax.stop_gradient(a))
     change = product(axes.T, product(a - jax.lax.stop_gradient(a), axes))
     close = _CLOSE * jnp.max(jnp.abs(values))
     x, y = values[np.array(_PAIRS)].T
-    first = jax.vmap(lambda x, y: _divided_difference(function_of_scaled_eigenvalue, x, y, close))(
-        x, y
-    )[_PAIR]
+    first = jax.vmap(lambda x, y: _divided_difference(of_scaled, x, y, close))(x, y)[_PAIR]
     x, y, z = values[np.array(_TRIPLES)].T
-    second = jax.vmap(
-        lambda x, y, z: _second_divided_difference(function_of_scaled_eigenvalue, x, y, z, close)
-    )(x, y, z)[_TRIPLE]
+    second = jax.vmap(lambda x, y, z: _second_difference(of_scaled, x, y, z, close))
+    second = second(x, y, z)[_TRIPLE]
     bent = second * change[:, :, None] * change[None, :, :]
-    inner = (
-        jnp.diag(jax.vmap(function_of_scaled_eigenvalue)(values))
-        + first * change
-        + bent.sum(axis=1)
-    )
+    inner = jnp.diag(jax.vmap(of_scaled)(values)) + first * change + bent.sum(axis=1)
     return product(axes, product(inner, axes.T))
 
 
 def _divided_difference(
     f: Callable[[Scalar], Scalar], x: Scalar, y: Scalar, close: Scalar
 ) -> Scalar:
-    """Return the divided difference f[x, y] = (f(y) − f(x))/(y − x) of a smooth function f of one
-    number, for x ≤ y.
-
-    If y − x is at most the length `close`, the quotient would lose digits: the result is then the
-    mean of f' between x and y (Hermite–Genocchi), by quadrature.
+    """Return f[x, y] = (f(y) − f(x))/(y − x) for x ≤ y, or, where y − x is at most `close` and the
+    quotient would lose digits, the mean of f' by quadrature (Hermite–Genocchi).
     """
     near = y - x <= close
     end = jnp.where(near, y, x)
@@ -260,14 +204,11 @@ def _divided_difference(
     return jnp.where(near, mean, (f(y) - f(x)) / jnp.where(near, 1.0, y - x))
 
 
-def _second_divided_difference(
+def _second_difference(
     f: Callable[[Scalar], Scalar], x: Scalar, y: Scalar, z: Scalar, close: Scalar
 ) -> Scalar:
-    """Return the second divided difference f[x, y, z] = (f[y, z] − f[x, y])/(z − x) of a smooth
-    function f of one number, for x ≤ y ≤ z, with f[x, y] = (f(y) − f(x))/(y − x).
-
-    If z − x is at most the length `close`, the quotient would lose digits: the result is then the
-    integral of f'' over all weighted means of x, y and z (Hermite–Genocchi), by quadrature.
+    """Return f[x, y, z] = (f[y, z] − f[x, y])/(z − x) for x ≤ y ≤ z, or, where z − x is at most
+    `close`, the integral of f'' over all weighted means by quadrature (Hermite–Genocchi).
     """
     near = z - x <= close
     middle, end = jnp.where(near, y, x), jnp.where(near, z, x)
@@ -278,7 +219,5 @@ def _second_divided_difference(
         jnp.asarray(u, x.dtype), jnp.asarray(v, x.dtype)
     )
     mean = (jnp.asarray(weight, x.dtype) * bend).sum()
-    quotient = (
-        _divided_difference(f, y, z, close) - _divided_difference(f, x, y, close)
-    ) / jnp.where(near, 1.0, z - x)
-    return jnp.where(near, mean, quotient)
+    rise = _divided_difference(f, y, z, close) - _divided_difference(f, x, y, close)
+    return jnp.where(near, mean, rise / jnp.where(near, 1.0, z - x))

@@ -10,30 +10,27 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 
-def largest_binary_exponent(x: Float[Array, "..."]) -> Int[Array, ""]:
-    """Return the binary exponent of the largest entry of an array `x`: the integer n with 2ⁿ⁻¹ ≤
-    max |x| < 2ⁿ, or 0 if all entries are zero. In derivatives n is constant.
+def binary_exponent(x: Float[Array, "..."]) -> Int[Array, ""]:
+    """Return the integer n with 2ⁿ⁻¹ ≤ max |x| < 2ⁿ, or 0 if all entries are zero; in derivatives
+    it is constant.
     """
     return jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(x))))[1]
 
 
 def times_power_of_two(x: Float[Array, "..."], n: Int[Array, ""]) -> Float[Array, "..."]:
-    """Return the array `x` times 2ⁿ, for an integer n with |n| ≤ 2044 (float32: 252). The product
-    and its derivatives are exact if the product is a normal number.
+    """Return x 2ⁿ for an integer n with |n| ≤ 2044 (float32: 252), exact if the product is a normal
+    number.
     """
     half = n // 2
     # 2ⁿ itself may overflow: `x` is multiplied by two smaller powers, one after the other. Without
-    # the barrier XLA, where it knows n, would first multiply the two powers.
-    both = _power_of_two(half, x.dtype), _power_of_two(n - half, x.dtype)
+    # the barrier XLA, where it knows n, would first multiply the two powers. The powers are made
+    # from their bits, because `jnp.ldexp` would give XLA fifty operations to compile.
+    info = jnp.finfo(x.dtype)
+    both = tuple(
+        jax.lax.bitcast_convert_type(
+            (k.astype(f"int{info.bits}") + (info.maxexp - 1)) << info.nmant, x.dtype
+        )
+        for k in (half, n - half)
+    )
     first, second = jax.lax.optimization_barrier(both)
     return x * first * second
-
-
-def _power_of_two(n: Int[Array, ""], dtype: jnp.dtype) -> Float[Array, ""]:
-    """Return the number 2ⁿ of the given `dtype`, for an integer n for which 2ⁿ is a normal number.
-    The number is made from its bits, because `jnp.ldexp` would give XLA fifty operations to
-    compile.
-    """
-    info = jnp.finfo(dtype)
-    bits = (n.astype(f"int{info.bits}") + (info.maxexp - 1)) << info.nmant
-    return jax.lax.bitcast_convert_type(bits, dtype)

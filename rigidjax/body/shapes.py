@@ -180,13 +180,7 @@ def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProper
 
 
 def _checked_lengths(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
-    """Return lengths, m, as an array of the given `shape`. **Raises:** `ValueError` for a length
-    that is below zero or NaN, unless JAX traces the lengths.
-
-    - `value`: one number or several
-    - `shape`: () for one length, or (n,) for n lengths
-    - `name`: the name of the argument, for messages
-    """
+    """Return lengths, m, as an array, or raise an error if one is known and below zero or NaN."""
     lengths = _checks.finite_array(value, shape, name, unit="m")
     return _checks.check_if_known(
         _checks.require_positive, lengths, name, "lengths ≥ 0 (m)", allow_zero=True
@@ -196,11 +190,8 @@ def _checked_lengths(value: NumbersLike, shape: tuple[int, ...], name: str) -> A
 def _checked_radii(
     inner: ScalarLike, outer: ScalarLike, names: tuple[str, str] = ("inner", "outer")
 ) -> tuple[Array, Array]:
-    """Return two radii, m, as scalar arrays: the inner and the outer. **Raises:** `ValueError` for
-    a radius below zero and for an inner radius above the outer, unless JAX traces the radii.
-
-    - `inner`, `outer`: the two radii, m
-    - `names`: the names of these two arguments, for messages
+    """Return the inner and the outer radius, m, or raise an error if they are known and negative or
+    in the wrong order.
     """
     r, R = _checked_lengths(inner, (), names[0]), _checked_lengths(outer, (), names[1])
     if _checks.is_known((r, R)):
@@ -211,19 +202,13 @@ def _checked_radii(
 
 
 def _axisymmetric_diagonal(transverse: Array, axial: Array) -> Float[Array, "3"]:
-    """Return the diagonal (3,) of a matrix that is symmetric about the z axis: `transverse` for x
-    and y, `axial` for z.
-    """
+    """Return the diagonal of a matrix that is symmetric about the z axis."""
     return jnp.stack([transverse, transverse, axial])
 
 
 def _body_at_centre(mass: ScalarLike, second_moments_per_mass: Float[Array, "3"]) -> MassProperties:
-    """Return the body with its centre of mass at the origin and its principal axes along x, y and
-    z.
-
-    - `mass`: kg
-    - `second_moments_per_mass`: (3,) m², the principal second moments ∫ x² dm, ∫ y² dm, ∫ z² dm,
-      divided by the mass
+    """Return the body with its centre of mass at the origin and the principal second moments ∫ x²
+    dm, ∫ y² dm, ∫ z² dm, given divided by the mass, m².
     """
     m = _checks.array_of_shape(mass, (), "mass")
     com = jnp.zeros_like(second_moments_per_mass)

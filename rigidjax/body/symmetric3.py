@@ -16,11 +16,11 @@ from rigidjax.rotation.linalg3 import (
 
 @jax.custom_jvp
 def inverse(a: Mat3) -> Mat3:
-    """Return the inverse of a symmetric 3×3 matrix with trace > 0, by cofactors.
+    """Return the inverse of a symmetric matrix with trace > 0, by cofactors; it is infinite if an
+    eigenvalue is zero.
 
     The matrix is divided by its trace first, so that the products of entries such as 1e-20 or 1e37
-    kg m² neither underflow nor overflow. If an eigenvalue is zero, the result is infinite;
-    `Inertia.require_invertible` raises an error for such an inertia tensor.
+    kg m² neither underflow nor overflow.
     """
     # All entries come from one `lax.split`: an entry taken by an index would be compiled as a
     # kernel of its own.
@@ -32,12 +32,7 @@ def inverse(a: Mat3) -> Mat3:
 
 @inverse.defjvp
 def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[PyTree, ...]) -> tuple[Mat3, Mat3]:
-    """Return the inverse (3, 3) of a symmetric matrix A, and its change −A⁻¹ dA A⁻¹ for a change dA
-    of the matrix. By this rule JAX differentiates `inverse`.
-
-    - `primals`: a tuple of one item, A (3, 3)
-    - `tangents`: a tuple of one item, dA (3, 3)
-    """
+    """Return the inverse and its tangent −A⁻¹ dA A⁻¹."""
     (a,), (da,) = primals, tangents
     out = inverse(a)
     scale = a[0, 0] + a[1, 1] + a[2, 2]
@@ -56,47 +51,35 @@ def from_components(
     xz: Float[ArrayLike, ""],
     yz: Float[ArrayLike, ""],
 ) -> Mat3:
-    """Return the symmetric matrix (3, 3) of six scalars: the diagonal entries first, then the
-    entries xy, xz, yz.
-    """
+    """Return the symmetric matrix of six entries."""
     return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
 
 
 def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
-    """Return the matrix a bᵀ (3, 3), with the entries a_i b_j, of two vectors (3,)."""
+    """Return the matrix a bᵀ."""
     return a[:, None] * b[None, :]
 
 
-# `inertia_from_second_moment` is compiled as one program: outside of `jit`, JAX would otherwise
+# `to_inertia` is compiled as one program: outside of `jit`, JAX would otherwise
 # compile each of its operations as a program of its own.
 @jax.jit
-def inertia_from_second_moment(
+def to_inertia(
     second_moment: Float[Array, "*batch 3 3"],
 ) -> Float[Array, "*batch 3 3"]:
-    """Return the inertia tensor `Tr(𝔖) 1 − 𝔖` (..., 3, 3) of a second moment 𝔖 (notes, eqs 76–78),
-    in the unit of 𝔖. The diagonal is computed as 𝔖22 + 𝔖33, …, so that no digit cancels.
-
-    - `second_moment`: 𝔖 (..., 3, 3), symmetric
+    """Return the inertia tensor `Tr(𝔖) 1 − 𝔖` (notes, eqs 76–78), whose diagonal is computed as 𝔖22
+    + 𝔖33, …, so that no digit cancels.
     """
     x, y, z = second_moment[..., 0, 0], second_moment[..., 1, 1], second_moment[..., 2, 2]
-    return _negative_with_new_diagonal(second_moment, jnp.stack([y + z, z + x, x + y], axis=-1))
+    return _negative(second_moment, jnp.stack([y + z, z + x, x + y], axis=-1))
 
 
-def second_moment_from_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Return the second moment `½ Tr(I) 1 − I` (..., 3, 3) of an inertia tensor I, in the unit of I
-    (notes, eqs 76–78 solved).
-
-    - `tensor`: I (..., 3, 3), symmetric
-    """
+def to_second_moment(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+    """Return the second moment `½ Tr(I) 1 − I` of an inertia tensor (notes, eqs 76–78 solved)."""
     x, y, z = tensor[..., 0, 0], tensor[..., 1, 1], tensor[..., 2, 2]
-    return _negative_with_new_diagonal(
-        tensor, 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1)
-    )
+    return _negative(tensor, 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1))
 
 
-def _negative_with_new_diagonal(a: Array, diagonal: Array) -> Array:
-    """Return −A for matrices A = `a` (..., 3, 3), but with the entries of `diagonal` (..., 3) on
-    the diagonal.
-    """
+def _negative(a: Array, diagonal: Array) -> Array:
+    """Return −A, but with the given entries on the diagonal."""
     eye = jnp.broadcast_to(jnp.eye(3, dtype=bool), a.shape)
     return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)

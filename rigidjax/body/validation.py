@@ -6,7 +6,7 @@ units of round-off are tolerated: plates, rods and points lie on the boundary an
 """
 
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,23 +26,21 @@ _FORGIVEN = 64.0
 
 
 def require_physical_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return the mass (...), kg. **Raises:** `ValueError` (`equinox` error under `jit`) if it is
-    not positive and finite.
-    """
+    """Return the mass, or raise an error if it is not positive and finite."""
     return _checks.require_positive(mass, "mass", "a positive mass (kg)")
 
 
 def require_physical_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Return the inertia tensor (..., 3, 3), kg m². **Raises:** `ValueError` (`equinox` error under
-    `jit`) if it is not finite or not symmetric, or if no real body has its principal moments.
+    """Return the inertia tensor, kg m², or raise an error if it is not finite or symmetric, or if
+    no real body has its principal moments.
     """
     tensor = _require_symmetric(_checks.require_finite(tensor, "inertia tensor"), "inertia tensor")
-    return _require_triangle_inequality(tensor, _eigenvalues(tensor))
+    return _require_triangle(tensor, _eigenvalues(tensor))
 
 
 def require_physical_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Return the principal moments (3,), kg m², which may be in any order. **Raises:** `ValueError`
-    (`equinox` error under `jit`) if no real body has these moments.
+    """Return the principal moments, kg m², in any order, or raise an error if no real body has
+    them.
     """
     if not _checks.is_known(moments) and _checks.is_known(plain := lax.stop_gradient(moments)):
         # The numbers are known, and are traced only to be differentiated: check them once by NumPy,
@@ -51,21 +49,19 @@ def require_physical_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
         return moments
     moments = _checks.require_finite(moments, "principal moments")
     xp = np if _checks.is_known(moments) else jnp
-    return _require_triangle_inequality(moments, xp.sort(_constant_for_checks(moments)))
+    return _require_triangle(moments, xp.sort(_constant(moments)))
 
 
-def require_physical_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Return the second moment s = ∫ r rᵀ dm (..., 3, 3), kg m². **Raises:** `ValueError`
-    (`equinox` error under `jit`) if it is not symmetric and positive semi-definite.
+def require_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+    """Return the second moment ∫ r rᵀ dm, kg m², or raise an error if it is not symmetric and
+    positive semi-definite.
     """
     s = _require_symmetric(_checks.require_finite(s, "second moment"), "second moment")
     least, largest = (e := _eigenvalues(s))[..., 0], e[..., 2]
-    got = (
-        f", got principal second moments {_moments_as_text(e)} kg m²" if _checks.is_known(s) else ""
-    )
+    got = f", got principal second moments {_text(e)} kg m²" if _checks.is_known(s) else ""
     return _checks.error_if(
         s,
-        (least < -_relative_round_off_tolerance(s) * largest).any() | (largest < 0).any(),
+        (least < -_slack(s) * largest).any() | (largest < 0).any(),
         "second moment 𝔖 = ∫ r rᵀ dm: wanted a positive semi-definite matrix (mass is not "
         f"negative){got}; is this an inertia tensor I? then use from_tensor (I = Tr(𝔖) 1 − 𝔖)",
     )
@@ -79,13 +75,12 @@ def require_single_body(
     requirement: str = "",
     hint: str = "",
 ) -> Any:
-    """Return `value` if it is one body (not a batch) of one of the classes `kinds`, and if a real
-    body can have its mass and inertia.
+    """Return `value` if it is one body of one of the classes `kinds`, of a mass and inertia that a
+    real body can have.
 
-    Numbers that no real body has raise `ValueError` if they are known, and become NaN if JAX traces
-    them. A moment may be zero: a function that divides by the moments calls
-    `require_physical_body`. The texts `name` (of the argument), `requirement` (what was wanted) and
-    `hint` (a likely cause) are for messages.
+    Impossible numbers raise an error if they are known, and become NaN if they are traced. A moment
+    may be zero: a function that divides by the moments calls `require_physical_body`. The other
+    texts are for messages.
     """
     body = _checks.require_unbatched_instance(
         value, kinds, name, requirement=requirement, hint=hint
@@ -98,13 +93,12 @@ def require_single_body(
 
 
 def require_symmetric_or_nan(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
-    """Return the matrix `a` (3, 3) if it is symmetric to round-off. **Raises:** `ValueError` if it
-    is not, unless JAX traces it; a traced matrix that is not symmetric becomes NaN. The text `name`
-    names the matrix in the message.
+    """Return the matrix if it is symmetric to round-off; else raise an error if it is known, and
+    return NaN if it is traced.
     """
     if _checks.is_known(a):
         return _require_symmetric(a, name)
-    return jnp.where(_largest_asymmetry_and_flag(a)[1], jnp.nan, a)
+    return jnp.where(_asymmetry(a)[1], jnp.nan, a)
 
 
 def require_physical_body(
@@ -115,29 +109,23 @@ def require_physical_body(
     *,
     allow_zero_moment: bool = False,
 ) -> Any:
-    """Return `body` if a real body can have the inertia `tensor` and the `mass`, and if no
-    principal moment is zero.
+    """Return `body` (any tree) if a real body can have the inertia `tensor` and the `mass`, kg, and
+    if no principal moment is zero or zero is allowed.
 
-    If not, `ValueError` is raised for known numbers. For traced numbers an error of `equinox` is
-    raised if `throw` is true; else every number of the body becomes NaN.
-
-    - `body`: any tree of arrays, which is returned
-    - `tensor`: (..., 3, 3) kg m², body frame
-    - `mass`: (...) kg, or `None`
-    - `throw`: whether wrong traced numbers raise an error
-    - `allow_zero_moment`: whether a moment may be zero, as that of a rod about its axis
+    If not, an error is raised for known numbers, and for traced ones if `throw` is true; else every
+    number of the body becomes NaN.
     """
     tensor = _checks.numeric_array(tensor, "inertia tensor")
     is_known = _checks.is_known((tensor, mass))
     if not is_known and _checks.is_known(plain := lax.stop_gradient((tensor, mass))):
         # The numbers are known, and are traced only to be differentiated: check them once by NumPy,
         # instead of by thirty compiled programs.
-        faults = _zero_impossible_asymmetric_flags(np, plain[0], allow_zero_moment)
+        faults = _faults(np, plain[0], allow_zero_moment)
         if not any(f.any() for f in faults) and (mass is None or (np.asarray(plain[1]) > 0).all()):
             return body
     xp = np if is_known else jnp
-    light = xp.asarray(False) if mass is None else ~(_constant_for_checks(mass) > 0)
-    flat, broken, skew = _zero_impossible_asymmetric_flags(
+    light = xp.asarray(False) if mass is None else ~(_constant(mass) > 0)
+    flat, broken, skew = _faults(
         xp, tensor if is_known else lax.stop_gradient(tensor), allow_zero_moment
     )
     bad = light | flat | broken | skew
@@ -146,9 +134,7 @@ def require_physical_body(
             if mass is not None:
                 require_physical_mass(mass)
             require_physical_inertia(tensor)
-            _checks.error_if(
-                body, True, f"{_FLAT} {_moments_as_text(_eigenvalues(tensor))} kg m²{_THIN}"
-            )
+            _checks.error_if(body, True, f"{_FLAT} {_text(_eigenvalues(tensor))} kg m²{_THIN}")
         return body
     if not throw:
         nan = lambda a: jnp.where(bad.reshape(bad.shape + (1,) * (a.ndim - bad.ndim)), jnp.nan, a)  # noqa: E731
@@ -158,29 +144,21 @@ def require_physical_body(
     return eqx.branched_error_if(body, bad.any(), jnp.where(light.any(), 0, which), words)
 
 
-def index_of_first_impossible_inertia(
+def first_impossible_inertia(
     tensors: Float[Array, "n 3 3"],
 ) -> Array | np.ndarray:
-    """Return the index of the first of n matrices that cannot be the inertia tensor of a body, or
-    that has a principal moment of zero. The index is a scalar, and −1 if there is no such matrix.
+    """Return the index of the first of n known inertia tensors that no body can have, or that has a
+    moment of zero; −1 if there is none.
 
     A matrix with a NaN is skipped, since one such body must not stop a batch: the simulation of the
     batch gives this body the result `nonfinite_input`, and computes the other bodies.
-
-    - `tensors`: (n, 3, 3) inertia tensors, kg m², that are not traced.
     """
-    return _checks.index_of_first_bad_row(_are_impossible_inertias, tensors)
 
+    def impossible(xp: ModuleType, tensors: Array | np.ndarray) -> Array | np.ndarray:
+        flat, broken, skew = _faults(xp, tensors, allow_zero_moment=False)
+        return (flat | broken | skew) & ~xp.isnan(xp.asarray(tensors)).any(axis=(-1, -2))
 
-def _are_impossible_inertias(xp: ModuleType, tensors: Array | np.ndarray) -> Array | np.ndarray:
-    """Return booleans (...), one for each matrix: true if the matrix cannot be the inertia tensor
-    of a body, or if it has a principal moment of zero; false if it has an entry NaN.
-
-    - `xp`: the module that computes, `numpy` or `jax.numpy`
-    - `tensors`: (..., 3, 3) kg m², the matrices
-    """
-    flat, broken, skew = _zero_impossible_asymmetric_flags(xp, tensors, allow_zero_moment=False)
-    return (flat | broken | skew) & ~xp.isnan(xp.asarray(tensors)).any(axis=(-1, -2))
+    return _checks.index_of_first_bad_row(impossible, tensors)
 
 
 _MASS = "mass: wanted a positive mass (kg), got zero, a negative one or NaN"
@@ -198,21 +176,21 @@ _THIN = (
 )
 
 
-def _zero_impossible_asymmetric_flags(
-    xp: ModuleType, tensor: Array | np.ndarray, allow_zero_moment: bool
-) -> tuple[Any, Any, Any]:
-    """Return three booleans (...) for each inertia tensor: whether a principal moment is zero or
-    NaN; whether no real body can have its principal moments; and whether the tensor is not
-    symmetric.
+class Faults(NamedTuple):
+    """Hold what is wrong with inertia tensors, a boolean for each."""
 
-    The second value comes from the minors (subdeterminants) of the second moment 𝔖 = ½ Tr(I) 1 − I
-    divided by the trace of I: a real body has an 𝔖 that is positive semi-definite.
+    flat: Any  # a principal moment is zero or NaN
+    broken: Any  # no real body can have the principal moments
+    skew: Any  # the tensor is not symmetric
 
-    - `xp`: the module that computes, `numpy` or `jax.numpy`
-    - `tensor`: (..., 3, 3) kg m², the inertia tensors
-    - `allow_zero_moment`: whether a moment may be zero; if true, the first boolean is always false
+
+def _faults(xp: ModuleType, tensor: Array | np.ndarray, allow_zero_moment: bool) -> Faults:
+    """Return the faults of inertia tensors; none is flat if `allow_zero_moment` is true.
+
+    Moments that no body can have show in the minors (subdeterminants) of the second moment 𝔖 = ½
+    Tr(I) 1 − I divided by the trace of I: a real body has an 𝔖 that is positive semi-definite.
     """
-    slack = _relative_round_off_tolerance(tensor)
+    slack = _slack(tensor)
     # The nine entries are split by one operation, because nine slices would take NumPy ten times as
     # long.
     nine = xp.moveaxis(xp.asarray(tensor).reshape(*tensor.shape[:-2], 9), -1, 0)
@@ -237,43 +215,37 @@ def _zero_impossible_asymmetric_flags(
         # the entries are not divided by the trace, so that the minors mean nothing.
         broken = broken | (some & (minor < -slack))
     if allow_zero_moment:
-        return broken & False, broken, skew
+        return Faults(broken & False, broken, skew)
     # The least moment is the determinant divided by the product of the two larger moments. This
     # product is between 1/9 and 1/4 of the squared trace, which is 1 here; 1/8 is taken for every
     # body.
     determinant = xx * (yy * zz - squares[2]) - yy * squares[1] - zz * squares[0] + product
-    return ~some | ~(determinant > 0.125 * slack), broken, skew
+    return Faults(~some | ~(determinant > 0.125 * slack), broken, skew)
 
 
 def is_physical_inertia(tensor: Float[Array, "*batch 3 3"]) -> Bool[Array, "*batch"]:
-    """Return whether a real body can have the inertia `tensor` (..., 3, 3), kg m², and none of its
-    principal moments is zero.
+    """Return whether a real body can have the inertia tensor, kg m², and none of its moments is
+    zero.
     """
-    flat, broken, skew = _zero_impossible_asymmetric_flags(
-        jnp, lax.stop_gradient(tensor), allow_zero_moment=False
-    )
+    flat, broken, skew = _faults(jnp, lax.stop_gradient(tensor), allow_zero_moment=False)
     return ~(flat | broken | skew)
 
 
-def checked_attitude_quaternion(q: Quaternion) -> Quat:
-    """Return a unit quaternion (w, x, y, z), scaled to length 1. **Raises:** `ValueError` for a
-    quaternion, not traced by JAX, that is not finite or whose length differs from 1 by more than
-    1e-6 (float32: 1e-3).
+def unit_attitude(q: Quaternion) -> Quat:
+    """Return a unit quaternion, scaled to length 1, or raise an error if it is known and not finite
+    or not of unit length.
     """
     q = _checks.finite_array(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
     return quaternion.normalise(require_near_unit(q, "q", rotation_tolerance(q.dtype)))
 
 
-def _require_triangle_inequality(value: Array, moments: Array | np.ndarray) -> Array:
-    """Return `value`. **Raises:** `ValueError` (`equinox` error under `jit`) if a principal moment
-    is negative, or if the moments break the triangle inequality I1 + I2 ≥ I3.
-
-    - `value`: the array to return: an inertia tensor (..., 3, 3) or principal moments, kg m²
-    - `moments`: (..., 3) kg m², its principal moments in ascending order
+def _require_triangle(value: Array, moments: Array | np.ndarray) -> Array:
+    """Return `value`, or raise an error if its ascending principal moments, kg m², are negative or
+    break the triangle inequality.
     """
     m1, m2, m3 = moments[..., 0], moments[..., 1], moments[..., 2]
-    moments_text = f" {_moments_as_text(moments)} kg m²" if _checks.is_known(value) else ""
-    slack = _relative_round_off_tolerance(value) * abs(m3)
+    moments_text = f" {_text(moments)} kg m²" if _checks.is_known(value) else ""
+    slack = _slack(value) * abs(m3)
     value = _checks.error_if(
         value,
         (m1 < -slack).any() | (m3 < 0).any(),
@@ -291,44 +263,32 @@ def _require_triangle_inequality(value: Array, moments: Array | np.ndarray) -> A
     )
 
 
-def _largest_asymmetry_and_flag(a: Array) -> tuple[Any, Any]:
-    """Return two things about matrices A = `a` (..., 3, 3), any unit: the largest entry of |A −
-    Aᵀ| of each matrix, (...); and one boolean, whether this entry exceeds round-off in any matrix.
-    """
-    difference = abs(_constant_for_checks(a) - _constant_for_checks(a).swapaxes(-1, -2)).max(
-        axis=(-1, -2)
-    )
-    return difference, (
-        difference
-        > _relative_round_off_tolerance(a) * abs(_constant_for_checks(a)).max(axis=(-1, -2))
-    ).any()
+def _asymmetry(a: Array) -> tuple[Any, Any]:
+    """Return the largest entry of |A − Aᵀ| of each matrix, and whether any exceeds round-off."""
+    fixed = _constant(a)
+    difference = abs(fixed - fixed.swapaxes(-1, -2)).max(axis=(-1, -2))
+    largest = abs(fixed).max(axis=(-1, -2))
+    return difference, (difference > _slack(a) * largest).any()
 
 
 def _require_symmetric(a: Array, name: str) -> Array:
-    """Return the matrices `a` (..., 3, 3). **Raises:** `ValueError` (`equinox` error under `jit`)
-    if they are not symmetric to round-off; the text `name` names the matrices in the message.
-    """
-    difference, bad = _largest_asymmetry_and_flag(a)
-    difference_text = (
-        f" (largest difference {float(difference.max()):.3g})" if _checks.is_known(a) else ""
-    )
-    return _checks.error_if(
-        a,
-        bad,
-        f"{name}{_SKEW}{difference_text}{_CAUSE}",
-    )
+    """Return the matrices, or raise an error if they are not symmetric to round-off."""
+    difference, bad = _asymmetry(a)
+    known = _checks.is_known(a)
+    text = f" (largest difference {float(difference.max()):.3g})" if known else ""
+    return _checks.error_if(a, bad, f"{name}{_SKEW}{text}{_CAUSE}")
 
 
-def _constant_for_checks(a: Array) -> Array | np.ndarray:
-    """Return the array `a` as a constant, whose derivatives are zero: as an array of JAX if JAX
-    traces it, else as an array of NumPy, with which a check takes only microseconds.
+def _constant(a: Array) -> Array | np.ndarray:
+    """Return an array as a constant, of NumPy if it is known, with which a check takes only
+    microseconds.
     """
     return np.asarray(a) if _checks.is_known(a) else lax.stop_gradient(a)
 
 
 def _eigenvalues(a: Array) -> Array | np.ndarray:
-    """Return the eigenvalues (..., 3), ascending, of symmetric matrices `a` (..., 3, 3), as
-    constants whose derivatives are zero. NumPy computes them unless JAX traces the matrices.
+    """Return the ascending eigenvalues of symmetric matrices as constants, by NumPy if they are
+    known.
     """
     if _checks.is_known(a):
         return np.linalg.eigvalsh(np.asarray(a))
@@ -337,18 +297,13 @@ def _eigenvalues(a: Array) -> Array | np.ndarray:
     return jnp.linalg.eigvalsh(lax.stop_gradient(a) / scale) * scale[..., 0]
 
 
-def _relative_round_off_tolerance(a: Array | np.ndarray) -> float:
-    """Return the relative error that a check tolerates in an array `a`: 64 times the unit of
-    round-off of its dtype.
-    """
+def _slack(a: Array | np.ndarray) -> float:
+    """Return the relative error that a check tolerates in an array."""
     return float(_FORGIVEN * jnp.finfo(a.dtype).eps)
 
 
-def _moments_as_text(moments: Array | np.ndarray) -> str:
-    """Return principal moments as a text for messages, such as "(1, 2, 3)".
-
-    - `moments`: (3,) kg m², or (n, 3) for n bodies, of which the first three are shown
-    """
+def _text(moments: Array | np.ndarray) -> str:
+    """Return principal moments, of at most three bodies, as a text such as "(1, 2, 3)"."""
     return "; ".join(
         "(" + ", ".join(f"{float(x):.6g}" for x in row) + ")"
         for row in np.asarray(moments).reshape(-1, 3)[:3]

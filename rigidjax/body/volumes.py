@@ -56,11 +56,8 @@ def cylinder(radius: ScalarLike, height: ScalarLike) -> Scalar:
     >>> round(float(cylinder(1.0, 1.0)), 12)
     3.14159265359
     """
-    r, h = (
-        _checks.array_of_shape(radius, (), "radius"),
-        _checks.array_of_shape(height, (), "height"),
-    )
-    return jnp.pi * r * r * h
+    r = _checks.array_of_shape(radius, (), "radius")
+    return jnp.pi * r * r * _checks.array_of_shape(height, (), "height")
 
 
 def hollow_cylinder(inner: ScalarLike, outer: ScalarLike, height: ScalarLike) -> Scalar:

@@ -85,22 +85,12 @@ class Moon(eqx.Module):
         if not (days[0] < days[1] and 10 <= days[0] and high <= _BLOCKS):
             raise ValueError(f"Moon: wanted years in order in 1900 to 2199, got {first}, {last}")
 
-        def read_chebyshev_table(name: str, days_per_interval: int) -> np.ndarray:
-            """Return the Chebyshev coefficients of one table of the ephemeris, for the years from
-            `first` to `last` and at least ten days before and after these years.
-
-            The result is an array (N, 3, k) with k coefficients of three functions on each of N
-            intervals.
-
-            - `name`: the name of the table in the file names of DE421, such as `moon`.
-            - `days_per_interval`: the length of an interval of the result, days; longer intervals
-              are divided.
-            """
+        def table(name: str, days: int) -> np.ndarray:
+            # Return the coefficients (N, 3, k) of three functions on each of N intervals of so many
+            # days; longer intervals of the file are divided.
             rows = np.load(Path(spec.origin or "").parent / f"jpl-{name}.npy", mmap_mode="r")
             a_block = len(rows) // _BLOCKS
-            return _subdivide_chebyshev_intervals(
-                rows[low * a_block : high * a_block], _BLOCK // a_block // days_per_interval
-            )
+            return _subdivided(rows[low * a_block : high * a_block], _BLOCK // a_block // days)
 
         numbers = np.load(Path(spec.origin).parent / "constants.npy")
         self.constants = {name.decode(): float(value) for name, value in numbers}
@@ -108,14 +98,12 @@ class Moon(eqx.Module):
         # and Moon; and the Sun. `share` is the Earth's part of the mass of Earth and Moon: the Moon
         # is at `middle + share * moon`.
         share = self.constants["EMRAT"] / (1 + self.constants["EMRAT"])
-        moon, middle, sun = (
-            1e3 * read_chebyshev_table(name, 4) for name in ("moon", "earthmoon", "sun")
-        )
+        moon, middle, sun = (1e3 * table(name, 4) for name in ("moon", "earthmoon", "sun"))
         sun = np.pad(sun, ((0, 0), (0, 0), (0, moon.shape[2] - sun.shape[2])))
         start = (_BLOCK * low - days[0]) * DAY
         self.earth = Chebyshev(start, 4 * DAY, -moon)
         self.sun = Chebyshev(start, 4 * DAY, sun - middle - share * moon)
-        self.angles = Chebyshev(start, 8 * DAY, read_chebyshev_table("librations", 8))
+        self.angles = Chebyshev(start, 8 * DAY, table("librations", 8))
         self.first = first
 
     def attitude(self, t: ScalarLike) -> Attitude:
@@ -180,8 +168,13 @@ class Moon(eqx.Module):
             # Earth's axis away from it by 0.1° in 20 years.
             few, radius = -0.5 * c["J2E"] * self._mu_earth, 1e3 * c["AE"]
             earths = [(self._mu_earth - 2 * few, 0.0), (few, radius), (few, -radius)]
+
+        def moved(z: float) -> Chebyshev:
+            shifted = self.earth.coefficients.at[:, 2, 0].add(z)
+            return eqx.tree_at(lambda t: t.coefficients, self.earth, shifted)
+
         law: Any = Sum(
-            *(GravityGradient(mu, _shift_along_z(self.earth, z), rows) for mu, z in earths),
+            *(GravityGradient(mu, moved(z), rows) for mu, z in earths),
             GravityGradient(c["GMS"] * self._si_per_au3_day2, self.sun),
         )
         if core:
@@ -189,9 +182,17 @@ class Moon(eqx.Module):
             friction = c["KVC"] / DAY * self.body().tensor[2, 2]
             law = _LiquidCore(rate, self._core_inertia.tensor, friction, law)
             if self.first != EPOCH:
-                law = eqx.tree_at(
-                    lambda core: core.state0, law, _core_angular_velocity_at(law, self.first)
-                )
+                if rate.dtype != jnp.float64:
+                    raise ValueError(
+                        "torque: wanted float64 for a core that is integrated from EPOCH to "
+                        f"{self.first}, got {rate.dtype}; set jax.config.update("
+                        "'jax_enable_x64', True)"
+                    )
+                between = Moon(min(self.first, EPOCH), max(self.first, EPOCH))
+                ends = [365.25 * DAY * (at - between.first) for at in (EPOCH, self.first)]
+                field = _CoreAcceleration(law, between)
+                rate = _core_velocity(field, rate, jnp.array(ends))
+                law = eqx.tree_at(lambda core: core.state0, law, rate)
         if tide:
             response, turn = c["K2M"] * self._radius**5 / _G, 2 * np.pi / (27.321661 * DAY)
             bulge = Tide(response, c["TAUM"] * DAY, self._mu_earth, self.earth, turn)
@@ -236,12 +237,9 @@ class Moon(eqx.Module):
 
 
 class _BetaGammaChart(AbstractBodyChart):
-    """Describe the inertia of the Moon by two free numbers, 1000 log(β/β*) and 1000 log(γ/γ*), for
-    a fit.
-
-    Here β = (C − A)/B and γ = (B − A)/C for the principal moments A ≤ B ≤ C, and β*, γ* are the
-    values of DE421. **Fields:** `moon` the ephemeris, which has the constants of DE421; `core`
-    whether the inertia is that of the mantle alone, without a liquid core.
+    """Describe the inertia of the Moon (of the mantle alone, with a `core`) by the parameters 1000
+    log(β/β*) and 1000 log(γ/γ*), where β = (C − A)/B and γ = (B − A)/C for the principal moments A
+    ≤ B ≤ C, and β*, γ* are the values of DE421.
     """
 
     size: ClassVar[int] = 2
@@ -250,11 +248,11 @@ class _BetaGammaChart(AbstractBodyChart):
     core: bool = eqx.field(static=True)
 
     def body(self, vector: Array) -> Inertia:
-        beta, gamma = jnp.exp(1e-3 * vector + self._log_beta_gamma_of_de421)
+        beta, gamma = jnp.exp(1e-3 * vector + self._published)
         return self.moon.body(beta, gamma, core=self.core)
 
     def vector(self, body: Inertia) -> Array:
-        return 1e3 * (self.logs(body) - self._log_beta_gamma_of_de421)
+        return 1e3 * (self.logs(body) - self._published)
 
     def logs(self, body: Inertia) -> Array:
         tensor = body.tensor + self.moon._core_inertia.tensor if self.core else body.tensor
@@ -262,33 +260,24 @@ class _BetaGammaChart(AbstractBodyChart):
         return jnp.log(jnp.stack([(c - a) / b, (b - a) / c]))
 
     @property
-    def _log_beta_gamma_of_de421(self) -> Float[Array, "2"]:
+    def _published(self) -> Float[Array, "2"]:
         """Return the logarithms (2,) of the values β* and γ* that DE421 gives for β and γ."""
         return jnp.log(jnp.array([self.moon.constants[name] for name in ("LBET", "LGAM")]))
 
 
 class _LiquidCore(eqx.Module):
-    """Describe the torque on the mantle of the Moon from gravity and from a liquid core inside the
-    mantle.
+    """Describe the torque on the mantle of the Moon from gravity on the whole Moon and from a
+    liquid core, by friction at the boundary and by the flattening of the boundary.
 
-    The core acts on the mantle by friction at the boundary and by the flattening of the boundary.
-    The state of this torque, `own` in its methods, is the angular velocity of the core (3,), rad/s,
-    mantle frame. **Fields:**
-
-    - `state0`: (3,) the initial angular velocity of the core, in rad/s, mantle frame.
-    - `tensor`: (3, 3) the inertia of the core, in kg m².
-    - `friction`: the torque of friction divided by the difference of the angular velocities of core
-      and mantle, in N m s.
-    - `gravity`: the torque of Earth and Sun on the whole Moon.
-
-    Source: Folkner and others 2014 (DE430), section III; Williams and others 2001, Lunar rotational
-    dissipation in solid body and molten core, JGR 106:27933.
+    The state of this torque, `own` in its methods, is the angular velocity of the core, rad/s,
+    mantle frame. Source: Folkner and others 2014 (DE430), section III; Williams and others 2001,
+    Lunar rotational dissipation in solid body and molten core, JGR 106:27933.
     """
 
     feels: ClassVar[type] = HasAttitude
-    state0: Array
-    tensor: Array
-    friction: Array
+    state0: Float[Array, "3"]
+    tensor: Float[Array, "3 3"]  # the inertia of the core, kg m²
+    friction: Array  # torque over the difference of the angular velocities, N m s
     gravity: Sum
 
     def on_mantle(self, state: HasAttitude, own: Array) -> Array:
@@ -307,12 +296,8 @@ class _LiquidCore(eqx.Module):
 
 
 class _CoreAcceleration(eqx.Module):
-    """Evaluate the time derivative (3,), rad/s², of the core's angular velocity, while the mantle
-    moves as in the ephemeris.
-
-    An object of this class is a function (t, own, args) of the time t, s, and of the angular
-    velocity `own` (3,), rad/s, mantle frame. **Fields:** `core` the torque of the core; `moon` the
-    ephemeris.
+    """Evaluate the time derivative, rad/s², of the core's angular velocity as a vector field, while
+    the mantle moves as in the ephemeris.
     """
 
     core: _LiquidCore
@@ -322,36 +307,12 @@ class _CoreAcceleration(eqx.Module):
         return self.core.rate(t, own, self.moon.attitude(t), self.moon.body(core=True))
 
 
-def _core_angular_velocity_at(core: _LiquidCore, year: float) -> Float[Array, "3"]:
-    """Return the angular velocity (3,) of the Moon's liquid core at a given `year`, rad/s, mantle
-    frame.
-
-    It is integrated from `core.state0` at `EPOCH`, while the mantle moves as in the ephemeris.
-    `core` is the torque of the core; `year` is a Julian year, such as 1990.5.
-    """
-    if core.state0.dtype != jnp.float64:
-        raise ValueError(
-            f"torque: wanted float64 for a core that is integrated from EPOCH to {year}, got "
-            f"{core.state0.dtype}; set jax.config.update('jax_enable_x64', True)"
-        )
-    between = Moon(min(year, EPOCH), max(year, EPOCH))
-    begin, end = (365.25 * DAY * (at - between.first) for at in (EPOCH, year))
-    return _integrate_core_velocity(
-        _CoreAcceleration(core, between), core.state0, jnp.array([begin, end])
-    )
-
-
 @eqx.filter_jit
-def _integrate_core_velocity(
+def _core_velocity(
     field: _CoreAcceleration, initial_velocity: Array, ends: Float[Array, "2"]
 ) -> Float[Array, "3"]:
-    """Return the angular velocity (3,) of the Moon's liquid core at the end of an integration,
-    rad/s, mantle frame.
-
-    - `field`: the time derivative of the angular velocity, with the mantle as in the ephemeris.
-    - `initial_velocity`: (3,) the angular velocity at the time at which the integration begins.
-    - `ends`: (2,) the time at which the integration begins and the time at which it ends, s; the
-      second may be earlier than the first.
+    """Return the angular velocity of the core at the second of two times, s, which may be the
+    earlier one.
     """
     steps = dfx.PIDController(rtol=1e-12, atol=1e-12 * jnp.max(jnp.abs(initial_velocity)))
     first = jnp.sign(ends[1] - ends[0]) * jnp.minimum(DAY, jnp.abs(ends[1] - ends[0]))
@@ -362,22 +323,11 @@ def _integrate_core_velocity(
     return solution.ys[0]  # pyright: ignore[reportOptionalSubscript]
 
 
-def _shift_along_z(positions: Chebyshev, z: float) -> Chebyshev:
-    """Return the Chebyshev table `positions` with the length `z`, m, added to the third component
-    of each position (3,), m.
-    """
-    moved = positions.coefficients.at[:, 2, 0].add(z)
-    return eqx.tree_at(lambda t: t.coefficients, positions, moved)
-
-
-def _subdivide_chebyshev_intervals(coefficients: np.ndarray, parts: int) -> np.ndarray:
-    """Return the Chebyshev coefficients of given functions on shorter intervals: each interval is
-    divided into equal parts.
-
-    - `coefficients`: (intervals, k, terms) the coefficients of k functions on each interval, where
-      `terms` is the number of coefficients of a function.
-    - `parts`: the number of parts of each interval; the result has the shape (intervals · parts, k,
-      terms).
+def _subdivided(
+    coefficients: Float[np.ndarray, "intervals k terms"], parts: int
+) -> Float[np.ndarray, "parts k terms"]:
+    """Return the Chebyshev coefficients of given functions on intervals divided into equal
+    parts.
     """
     count, k, terms = coefficients.shape
     if parts == 1:

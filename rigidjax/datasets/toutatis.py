@@ -73,18 +73,15 @@ def recording() -> Recording:
     angles = jnp.asarray(np.radians([row[1:4] for row in OBSERVATIONS]))
     # The matrix of the published angles maps ecliptic to body coordinates. The same three angles in
     # the order of eq 31 of the notes give the transpose of this matrix, body → ecliptic.
-    attitudes = _quaternions_of_angles(angles)
+    attitudes = _attitudes(angles)
     rates = np.radians([row[4:7] for row in OBSERVATIONS]) / DAY
     sensor = AttitudeSensor(np.radians(ATTITUDE_NOISE_DEG))
     gyro = Gyro(np.radians(RATE_NOISE_DEG_A_DAY) / DAY)
     return Recording(t, (sensor, attitudes), (gyro, rates))
 
 
-@jax.jit
-@jax.vmap
-def _quaternions_of_angles(angles: Float[Array, "3"]) -> Float[Array, "4"]:
-    """Return the attitudes (T, 4) with the Euler angles (T, 3) φ, θ, ψ, rad, of T observations."""
-    return euler.to_quaternion(angles, sequence="ZXZ")
+# Compiled once, for all calls of `recording`.
+_attitudes = jax.jit(jax.vmap(lambda angles: euler.to_quaternion(angles, sequence="ZXZ")))
 
 
 def model() -> Model:
@@ -99,10 +96,9 @@ def model() -> Model:
 
 
 @jax.jit
-def _log_periods_and_momentum_direction(body: Inertia, state: Attitude) -> Float[Array, "4"]:
-    """Return four numbers of a free `body` with the initial `state`: the logarithms of the rotation
-    period and the precession period, days; and the longitude and latitude, rad, of the angular
-    momentum in world axes.
+def _periods_and_direction(body: Inertia, state: Attitude) -> Float[Array, "4"]:
+    """Return the logarithms of the rotation and the precession period, days, and the longitude and
+    latitude, rad, of the angular momentum in world axes.
     """
     turning = exact.body_period(body, state.omega)
     precessing = exact.precession_period(body, state.omega)
@@ -120,7 +116,7 @@ def rows(fit: Fit) -> list[Row]:
     the ecliptic longitude and latitude (J2000) of the angular momentum, degrees.
     """
     value_low_high = value_and_interval_of(
-        fit, lambda point: _log_periods_and_momentum_direction(point.body, point.state0)
+        fit, lambda point: _periods_and_direction(point.body, point.state0)
     )
     names = ("rotation about the long axis", "precession of the long axis")
     # The interval of a quantity that the data do not determine may end at infinity.

@@ -15,12 +15,12 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
-from rigidjax.elliptic.arguments import Real, RealOrArray, Tangent, to_common_dtype
+from rigidjax.elliptic.arguments import Real, RealOrArray, Tangent, common
 from rigidjax.elliptic.carlson_r import (
-    largest_argument_or_one,
+    largest_or_one,
     nan_where_negative,
     r_integral,
-    r_integral_derivative,
+    r_tangent,
 )
 
 # The number of duplication steps. Each step brings the three arguments of a Carlson integral closer
@@ -41,7 +41,7 @@ def rf(x: Real, y: Real, z: Real) -> RealOrArray:
     >>> float(rf(4.0, 4.0, 4.0))
     0.5
     """
-    return _rf_by_duplication(to_common_dtype(x=x, y=y, z=z))
+    return _rf(common(x=x, y=y, z=z))
 
 
 def rd(x: Real, y: Real, z: Real) -> RealOrArray:
@@ -56,7 +56,7 @@ def rd(x: Real, y: Real, z: Real) -> RealOrArray:
     >>> float(rd(4.0, 4.0, 4.0))
     0.125
     """
-    return _rd_by_duplication(to_common_dtype(x=x, y=y, z=z))
+    return _rd(common(x=x, y=y, z=z))
 
 
 def rj_(x: Real, y: Real, z: Real, p: Real) -> RealOrArray:
@@ -73,7 +73,7 @@ def rj_(x: Real, y: Real, z: Real, p: Real) -> RealOrArray:
     >>> round(float(rj_(4.0, 4.0, 4.0, 4.0)), 14)
     0.125
     """
-    return 1.5 * r_integral((0.5, 0.5, 0.5, 1.0), to_common_dtype(x=x, y=y, z=z, p=p))
+    return 1.5 * r_integral((0.5, 0.5, 0.5, 1.0), common(x=x, y=y, z=z, p=p))
 
 
 def rc(x: Real, y: Real) -> RealOrArray:
@@ -86,27 +86,20 @@ def rc(x: Real, y: Real) -> RealOrArray:
     >>> float(rc(4.0, 4.0))
     0.5
     """
-    x, y = to_common_dtype(x=x, y=y)
+    x, y = common(x=x, y=y)
     below = y < 0
     length = jnp.where(below, x - y, 1)
     # For y > 0 the factor is 1. Take the root of 1, not of x, in this case: for x = 0 the infinite
     # derivative of √x would make the gradient NaN, although `where` discards the root.
     factor = jnp.sqrt(jnp.where(below, x / length, 1))
     positive = jnp.where(below, -y, y)
-    return factor * _rf_by_duplication((jnp.where(below, x - y, x), positive, positive))
+    return factor * _rf((jnp.where(below, x - y, x), positive, positive))
 
 
 @jax.custom_jvp
-def _rf_by_duplication(arguments: tuple[Array, ...]) -> Array:
-    """Return Carlson's integral of the first kind, R_F(x, y, z) = ½ ∫₀^∞
-    dt/√((t + x)(t + y)(t + z)), by duplication (DLMF 19.36.1).
-
-    - `arguments`: x, y and z, three arrays of one shape and dtype, ≥ 0, of which at most one is 0.
-
-    If two or three of the arguments are 0, the result is infinite; if an argument is negative, the
-    result is NaN.
-    """
-    scale = largest_argument_or_one(arguments)
+def _rf(arguments: tuple[Array, ...]) -> Array:
+    """Return R_F of three arrays of one shape and dtype by duplication (DLMF 19.36.1)."""
+    scale = largest_or_one(arguments)
     x, y, z = (a / scale for a in arguments)
     for _ in range(_STEPS[np.dtype(x.dtype)]):
         step = _duplication_shift(x, y, z)
@@ -119,41 +112,26 @@ def _rf_by_duplication(arguments: tuple[Array, ...]) -> Array:
     # differences X, Y, Z from the mean, by the symmetric functions e2 and e3 (DLMF 19.36.1).
     series = 1 - e2 / 10 + e3 / 14 + e2**2 / 24 - 3 * e2 * e3 / 44
     series = series - 5 * e2**3 / 208 + 3 * e3**2 / 104 + e2**2 * e3 / 16
-    return _with_infinity_and_nan_outside_domain(series / jnp.sqrt(mean * scale), arguments)
+    return _in_domain(series / jnp.sqrt(mean * scale), arguments)
 
 
-@partial(_rf_by_duplication.defjvp, symbolic_zeros=True)
-def _rf_by_duplication_jvp(
+@partial(_rf.defjvp, symbolic_zeros=True)
+def _rf_jvp(
     primals: tuple[tuple[Array, ...]], tangents: tuple[tuple[Tangent, ...]]
 ) -> tuple[Array, Array]:
-    """Return Carlson's integral R_F(x, y, z) and its tangent (its change for a change of the
-    arguments), from ∂R_F/∂z = −R_D(x, y, z)/6 and the same formula with x or y in the place of z
-    (DLMF 19.18.1). By this rule JAX differentiates R_F.
-
-    - `primals`: a tuple of one item, the three arguments x, y, z.
-    - `tangents`: a tuple of one item, the three changes of the arguments; a change that is known to
-      be zero is a `SymbolicZero`.
-    """
+    """Return R_F and its tangent, by ∂R_F/∂z = −R_D(x, y, z)/6 (DLMF 19.18.1)."""
     (a,), (directions,) = primals, tangents
     tangent = jnp.zeros_like(a[0])
     for i, direction in enumerate(directions):
         if not isinstance(direction, SymbolicZero):
-            tangent = tangent - _rd_by_duplication((*a[:i], *a[i + 1 :], a[i])) * direction / 6
-    return _rf_by_duplication(a), tangent
+            tangent = tangent - _rd((*a[:i], *a[i + 1 :], a[i])) * direction / 6
+    return _rf(a), tangent
 
 
 @jax.custom_jvp
-def _rd_by_duplication(arguments: tuple[Array, ...]) -> Array:
-    """Return Carlson's integral of the second kind, R_D(x, y, z) = (3/2) ∫₀^∞ dt/((t + z)
-    √((t + x)(t + y)(t + z))), by duplication (DLMF 19.36.2).
-
-    - `arguments`: x, y and z, three arrays of one shape and dtype, ≥ 0; z > 0, and at most one of x
-      and y is 0.
-
-    If z = 0 or x = y = 0, the result is infinite; if one of the three is negative, the result is
-    NaN.
-    """
-    scale = largest_argument_or_one(arguments)
+def _rd(arguments: tuple[Array, ...]) -> Array:
+    """Return R_D of three arrays of one shape and dtype by duplication (DLMF 19.36.2)."""
+    scale = largest_or_one(arguments)
     x, y, z = (a / scale for a in arguments)
     total, weight = jnp.zeros_like(x), 3.0
     for _ in range(_STEPS[np.dtype(x.dtype)]):
@@ -175,42 +153,32 @@ def _rd_by_duplication(arguments: tuple[Array, ...]) -> Array:
     series = series + 45 * e2**2 * e3 / 272 - 9 * (e3 * e4 + e2 * e5) / 68
     value = total + weight / 3 * series / (mean * jnp.sqrt(mean))
     value = jnp.where(arguments[2] == 0, jnp.inf, value)
-    return _with_infinity_and_nan_outside_domain(value / scale / jnp.sqrt(scale), arguments)
+    return _in_domain(value / scale / jnp.sqrt(scale), arguments)
 
 
-@partial(_rd_by_duplication.defjvp, symbolic_zeros=True)
-def _rd_by_duplication_jvp(
+@partial(_rd.defjvp, symbolic_zeros=True)
+def _rd_jvp(
     primals: tuple[tuple[Array, ...]], tangents: tuple[tuple[Tangent, ...]]
 ) -> tuple[Array, Array]:
-    """Return Carlson's integral R_D(x, y, z) and its tangent (its change for a change of the
-    arguments). With R_D = (3/2) ∫₀^∞ (t + x)^{−1/2} (t + y)^{−1/2} (t + z)^{−3/2} dt, the tangent
-    is a sum of integrals of this kind, in each of which the power of one factor is lower by 1. By
-    this rule JAX differentiates R_D.
-
-    - `primals`: a tuple of one item, the three arguments x, y, z.
-    - `tangents`: a tuple of one item, the three changes of the arguments; a change that is known to
-      be zero is a `SymbolicZero`.
-    """
+    """Return R_D and its tangent."""
+    # With R_D = (3/2) ∫₀^∞ (t + x)^{−1/2} (t + y)^{−1/2} (t + z)^{−3/2} dt, the tangent is a sum of
+    # integrals of this kind, in each of which the power of one factor is lower by 1.
     (arguments,), (directions,) = primals, tangents
-    return _rd_by_duplication(arguments), 1.5 * r_integral_derivative(
-        (0.5, 0.5, 1.5), arguments, directions
-    )
+    tangent = r_tangent((0.5, 0.5, 1.5), arguments, directions)
+    return _rd(arguments), 1.5 * tangent
 
 
 def _duplication_shift(x: Array, y: Array, z: Array) -> Array:
-    """Return λ = √x√y + √x√z + √y√z, by which the duplication theorem for Carlson's integrals
-    shifts the arguments x, y, z ≥ 0, arrays of one shape (DLMF 19.26.18).
+    """Return λ = √x√y + √x√z + √y√z, by which the duplication theorem shifts its arguments (DLMF
+    19.26.18).
     """
     a, b, c = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
     return a * b + b * c + c * a
 
 
-def _with_infinity_and_nan_outside_domain(value: Array, arguments: tuple[Array, ...]) -> Array:
-    """Return the value of a Carlson integral, with infinity in place of it where two or three of
-    the arguments are 0, and NaN where an argument is negative or NaN.
-
-    - `value`: the array of values, computed without regard to these cases.
-    - `arguments`: the three arguments of the integral, arrays of the shape of `value`.
+def _in_domain(value: Array, arguments: tuple[Array, ...]) -> Array:
+    """Return the value of a Carlson integral, infinite where two or three arguments are 0, and NaN
+    where one is negative or NaN.
     """
     x, y, z = (a == 0 for a in arguments)
     return nan_where_negative(jnp.where((x & y) | (y & z) | (z & x), jnp.inf, value), arguments)

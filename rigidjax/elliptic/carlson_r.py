@@ -34,16 +34,14 @@ _UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def r_integral(powers: tuple[float, ...], arguments: tuple[RealOrArray, ...]) -> RealOrArray:
-    """Return ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt, where aᵢ are the `arguments` and bᵢ the `powers`.
-
-    - `powers`: numbers bᵢ, multiples of ½, with a sum above 1.
-    - `arguments`: arrays aᵢ ≥ 0 of one shape and dtype, one for each power.
+    """Return ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt, with the `arguments` aᵢ ≥ 0, of one shape and dtype, and the
+    `powers` bᵢ, multiples of ½ with a sum above 1.
 
     The result is infinite if the integral diverges at t = 0, and NaN for a negative argument. It is
     accurate to round-off if the ratios of the aᵢ are up to 1e35; for ratios of 1e60 it is accurate
     to 1e-13.
     """
-    scale = largest_argument_or_one(arguments)
+    scale = largest_or_one(arguments)
     dtype = np.dtype(arguments[0].dtype)
     unit = _UNIT[dtype]
     scaled = [a / scale * unit for a in arguments]
@@ -79,31 +77,17 @@ def _r_integral_jvp(
     primals: tuple[tuple[Array, ...]],
     tangents: tuple[tuple[Tangent, ...]],
 ) -> tuple[Array, Array]:
-    """Return the integral H = ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt and its tangent (its change for a change of
-    the arguments aᵢ). By this rule JAX differentiates `r_integral`. The derivative ∂H/∂aᵢ is
-    −bᵢ H⁺, where H⁺ is the integral H with bᵢ + 1 in place of bᵢ.
-
-    - `powers`: the numbers bᵢ, multiples of ½.
-    - `primals`: a tuple of one item, the arguments aᵢ, arrays of one shape.
-    - `tangents`: a tuple of one item, the changes of the aᵢ; a change that is known to be zero is a
-      `SymbolicZero`.
-    """
+    """Return the integral H and its tangent, by ∂H/∂aᵢ = −bᵢ H(b + eᵢ; a)."""
     (arguments,), (directions,) = primals, tangents
-    return r_integral(powers, arguments), r_integral_derivative(powers, arguments, directions)
+    return r_integral(powers, arguments), r_tangent(powers, arguments, directions)
 
 
-def r_integral_derivative(
+def r_tangent(
     powers: tuple[float, ...],
     arguments: tuple[Array, ...],
     directions: tuple[Tangent, ...],
 ) -> Array:
-    """Return the derivative of the integral ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt along a change of its
-    arguments aᵢ.
-
-    - `powers`: the exponents bᵢ.
-    - `arguments`: the arguments aᵢ, arrays of one shape.
-    - `directions`: the changes of the aᵢ; a `SymbolicZero` is a change that is known to be zero.
-    """
+    """Return the tangent of `r_integral` for the tangents `directions` of its arguments."""
     tangent = jnp.zeros_like(arguments[0])
     for i, direction in enumerate(directions):
         if powers[i] and not isinstance(direction, SymbolicZero):
@@ -113,15 +97,13 @@ def r_integral_derivative(
 
 
 def nan_where_negative(value: Array, arguments: tuple[Array, ...]) -> Array:
-    """Return `value`, but NaN where one of the `arguments`, arrays of the shape of `value`, is
-    negative or NaN.
-    """
+    """Return `value`, but NaN where an argument is negative or NaN."""
     good = functools.reduce(jnp.logical_and, (a >= 0 for a in arguments))
     return jnp.where(good, value, jnp.nan)
 
 
-def largest_argument_or_one(arguments: tuple[Array, ...]) -> Array:
-    """Return the largest of the `arguments` (arrays of one shape), or 1 where all are 0.
+def largest_or_one(arguments: tuple[Array, ...]) -> Array:
+    """Return the largest of the arguments, or 1 where all are 0.
 
     The integrals of Carlson are homogeneous: if the arguments are divided by this number, no square
     overflows.
@@ -131,14 +113,7 @@ def largest_argument_or_one(arguments: tuple[Array, ...]) -> Array:
 
 
 def _divide_by_power(value: Array, base: Array, power: float) -> Array:
-    """Return `value` / `base`^`power`.
-
-    - `value`, `base`: two arrays.
-    - `power`: a multiple of ½, of either sign.
-
-    The power is taken as repeated factors: 1/`base` if `power` is a whole number, else 1/√`base`.
-    If `power` is negative, the factors are `base` and √`base`.
-    """
+    """Return `value` / `base`^`power` for a multiple of ½, by repeated factors."""
     whole = math.floor(power)
     if power > whole:
         factor = jax.lax.rsqrt(base)

@@ -16,6 +16,7 @@ sum of hyperbolic functions, one for each half period (`jacobi_near_one.py`).
 
 import math
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,13 +28,15 @@ from rigidjax.elliptic.arguments import (
     Real,
     RealOrArray,
     Tangent,
-    number_and_complement,
-    to_common_dtype,
-    value_differentiated_by_complement,
+    by_complement,
+    common,
+    with_complement,
 )
 from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, sncndn_near_one
 from rigidjax.elliptic.legendre import agm_iterates, complete_integral, incomplete_integral
 from rigidjax.rotation.stumpff import power_of_minus_one, split_half_turns
+
+SnCnDn = tuple[Array, Array, Array]
 
 # If cn and dn are below this number, the integral of sd² = (sn/dn)², from which the derivatives
 # with respect to m follow, is 1/dn² times a function of the ratio of cn and dn. The relative error
@@ -60,8 +63,8 @@ def sncndn(
     >>> [round(float(x), 12) for x in sncndn(1.0, 0.5)]
     [0.803001824896, 0.595976567672, 0.823161001632]
     """
-    u, m, m1 = to_common_dtype(u=u, **number_and_complement("m", m, m1))
-    s, c, d, _ = _sncndn_and_half_turns(u, value_differentiated_by_complement(m, m1), m1)
+    u, m, m1 = common(u=u, **with_complement("m", m, m1))
+    s, c, d, _ = _functions(u, by_complement(m, m1), m1)
     return s, c, d
 
 
@@ -75,23 +78,25 @@ def am(u: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     >>> round(float(am(1.0, 0.5)), 12)
     0.932315079884
     """
-    u, m, m1 = to_common_dtype(u=u, **number_and_complement("m", m, m1))
-    s, c, _, turns = _sncndn_and_half_turns(u, value_differentiated_by_complement(m, m1), m1)
+    u, m, m1 = common(u=u, **with_complement("m", m, m1))
+    s, c, _, turns = _functions(u, by_complement(m, m1), m1)
     sign = power_of_minus_one(turns)
     return jnp.arctan2(sign * s, sign * c) + math.pi * turns
 
 
-def _sncndn_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array, Array]:
-    """Return four arrays: Jacobi's elliptic functions sn(u|m), cn(u|m) and dn(u|m) for any real
-    parameter m; and the whole number n of half turns in the amplitude φ (the angle with sin φ = sn
-    and cos φ = cn), so that φ − nπ lies between −π/2 and π/2.
-
-    - `u`: the argument.
-    - `m`: the parameter, the square of the modulus.
-    - `m1`: 1 − m.
-
-    For m > 1, where the amplitude oscillates about 0, n is 0.
+class Functions(NamedTuple):
+    """Hold Jacobi's functions for any real parameter, and the whole number n of half turns in the
+    amplitude φ, so that φ − nπ lies between −π/2 and π/2; n is 0 for m > 1.
     """
+
+    sn: Array
+    cn: Array
+    dn: Array
+    half_turns: Array
+
+
+def _functions(u: Array, m: Array, m1: Array) -> Functions:
+    """Return Jacobi's functions for any real parameter."""
     # By DLMF 22.17.2–4, a parameter m > 1 is replaced by 1/m and u by u√m; cn and dn change places.
     above = m1 < 0
     divisor = jnp.where(above, m, 1)
@@ -100,22 +105,18 @@ def _sncndn_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Array, Array,
     inner_m = jnp.where(above, 1, m) / divisor
     inner_m1 = jnp.where(above, -m1, m1) / divisor
 
-    s, c, d = _sncndn_for_m_up_to_one(v, inner_m, inner_m1)
-    turns = _reduce_to_half_period(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
-    return (s / root, jnp.where(above, d, c), jnp.where(above, c, d), jnp.where(above, 0, turns))
+    s, c, d = _sncndn(v, inner_m, inner_m1)
+    turns = _reduced(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
+    c, d = jnp.where(above, d, c), jnp.where(above, c, d)
+    return Functions(s / root, c, d, jnp.where(above, 0, turns))
 
 
 @jax.custom_jvp
-def _sncndn_for_m_up_to_one(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
-    """Return Jacobi's elliptic functions sn(u|m), cn(u|m) and dn(u|m) for a parameter m ≤ 1, three
-    arrays.
-
-    - `u`: the argument.
-    - `m`: the parameter, the square of the modulus; it must equal 1 − m1. Derivatives are taken
-      with respect to u and m1 alone.
-    - `m1`: 1 − m.
+def _sncndn(u: Array, m: Array, m1: Array) -> SnCnDn:
+    """Return sn, cn and dn for a parameter m ≤ 1 that equals 1 − m1; derivatives are taken with
+    respect to u and m1 alone.
     """
-    turns, angle, rows = _reduce_to_half_period(u, m1)
+    turns, angle, rows = _reduced(u, m1)
     sign = power_of_minus_one(turns)
     theta = jnp.abs(angle)
     # Bulirsch's recursion squares the cotangent of the angle, which must not overflow if u is near
@@ -148,59 +149,39 @@ def _sncndn_for_m_up_to_one(u: Array, m: Array, m1: Array) -> tuple[Array, Array
     return s, c, d
 
 
-@partial(_sncndn_for_m_up_to_one.defjvp, symbolic_zeros=True)
-def _sncndn_for_m_up_to_one_jvp(
+@partial(_sncndn.defjvp, symbolic_zeros=True)
+def _sncndn_jvp(
     primals: tuple[Array, Array, Array], tangents: tuple[Tangent, Tangent, Tangent]
-) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
-    """Return two triples: Jacobi's elliptic functions sn, cn and dn; and their tangents (their
-    changes) for changes of the argument u and of 1 − m, where m is the parameter. By this rule JAX
-    differentiates the three functions.
-
-    - `primals`: u, m and 1 − m.
-    - `tangents`: the changes of these three; the change of m is not used, because m is determined
-      by 1 − m. A change that is known to be zero is a `SymbolicZero`.
-    """
+) -> tuple[SnCnDn, SnCnDn]:
+    """Return sn, cn and dn and their tangents for tangents of u and m1."""
     (u, m, m1), (du, _, dm1) = primals, tangents
-    s, c, d = _sncndn_for_m_up_to_one(u, m, m1)
+    s, c, d = _sncndn(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
         # The derivatives with respect to u are DLMF 22.13.1–3.
         ds, dc, dd = c * d * du, -s * d * du, -m * s * c * du
     if not isinstance(dm1, SymbolicZero):
-        sm, cm, dm = _derivatives_by_m(u, m, m1)
+        sm, cm, dm = _by_m(u, m, m1)
         ds, dc, dd = ds - sm * dm1, dc - cm * dm1, dd - dm * dm1
     return (s, c, d), (ds, dc, dd)
 
 
 @jax.custom_jvp
-def _derivatives_by_m(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
-    """Return the derivatives of Jacobi's functions sn(u|m), cn(u|m) and dn(u|m) with respect to the
-    parameter m at a fixed argument u, three arrays.
-
-    - `u`: the argument.
-    - `m`: the parameter, the square of the modulus, ≤ 1; it must equal 1 − m1.
-    - `m1`: 1 − m.
-    """
-    return _derivatives_by_m_from_integral(u, m, m1)
+def _by_m(u: Array, m: Array, m1: Array) -> SnCnDn:
+    """Return the derivatives of sn, cn and dn by the parameter m at a fixed u."""
+    return _by_m_integral(u, m, m1)
 
 
-@partial(_derivatives_by_m.defjvp, symbolic_zeros=True)
-def _derivatives_by_m_jvp(
+@partial(_by_m.defjvp, symbolic_zeros=True)
+def _by_m_jvp(
     primals: tuple[Array, Array, Array], tangents: tuple[Tangent, Tangent, Tangent]
-) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
-    """Return two triples: the derivatives of Jacobi's functions sn, cn and dn with respect to the
-    parameter m; and the tangents (the changes) of these derivatives for changes of the argument u
-    and of 1 − m. By this rule JAX takes second derivatives of the three functions.
-
-    - `primals`: u, m and 1 − m.
-    - `tangents`: the changes of these three; the change of m is not used, because m is determined
-      by 1 − m. A change that is known to be zero is a `SymbolicZero`.
-    """
+) -> tuple[SnCnDn, SnCnDn]:
+    """Return the derivatives by m and their tangents, by which JAX takes second derivatives."""
     (u, m, m1), (du, _, dm1) = primals, tangents
-    sm, cm, dm = slopes = _derivatives_by_m(u, m, m1)
+    sm, cm, dm = slopes = _by_m(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
-        s, c, d = _sncndn_for_m_up_to_one(u, m, m1)
+        s, c, d = _sncndn(u, m, m1)
         ds, dc = (cm * d + c * dm) * du, -(sm * d + s * dm) * du
         dd = -(s * c + m * (sm * c + s * cm)) * du
     if not isinstance(dm1, SymbolicZero):
@@ -210,32 +191,23 @@ def _derivatives_by_m_jvp(
         near = (m1 < LARGEST_M1) & (jnp.abs(u) > 1)
         middle, one = jnp.full_like(m1, 0.5), jnp.ones_like(m1)
         far_m, far_m1 = jnp.where(near, middle, m), jnp.where(near, middle, m1)
-        _, far = jax.jvp(partial(_derivatives_by_m_from_integral, u), (far_m, far_m1), (one, -one))
+        _, far = jax.jvp(partial(_by_m_integral, u), (far_m, far_m1), (one, -one))
         near_m = jnp.where(near, m, 1 - LARGEST_M1)
         near_m1 = jnp.where(near, m1, LARGEST_M1)
 
-        def first_derivatives(a: Array, b: Array) -> tuple[Array, Array, Array]:
-            return jax.jvp(partial(sncndn_near_one, u), (a, b), (one, -one))[1]
-
-        _, close = jax.jvp(first_derivatives, (near_m, near_m1), (one, -one))
+        first = lambda a, b: jax.jvp(partial(sncndn_near_one, u), (a, b), (one, -one))[1]  # noqa: E731
+        _, close = jax.jvp(first, (near_m, near_m1), (one, -one))
         ss, cc, d2 = (jnp.where(near, a, b) for a, b in zip(close, far, strict=True))
         ds, dc, dd = ds - ss * dm1, dc - cc * dm1, dd - d2 * dm1
     return slopes, (ds, dc, dd)
 
 
-def _derivatives_by_m_from_integral(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
-    """Return the derivatives of Jacobi's functions sn(u|m), cn(u|m) and dn(u|m) with respect to the
-    parameter m at a fixed argument u, three arrays.
-
-    - `u`: the argument.
-    - `m`, `m1`: the parameter m ≤ 1 (the square of the modulus), and 1 − m.
-
-    They follow from ∂φ/∂m = X dn for the amplitude φ (the angle with sin φ = sn and cos φ = cn),
-    where X = −½ ∫₀^u sd²(v) dv and sd = sn/dn. Carlson's integral R_D gives X, after a whole number
-    of half periods is subtracted from u.
+def _by_m_integral(u: Array, m: Array, m1: Array) -> SnCnDn:
+    """Return the derivatives by m from ∂φ/∂m = X dn, with X of the head of this module from
+    Carlson's R_D, after whole half periods are subtracted from u.
     """
-    s, c, d = _sncndn_for_m_up_to_one(u, m, m1)
-    turns = _reduce_to_half_period(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
+    s, c, d = _sncndn(u, m, m1)
+    turns = _reduced(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = power_of_minus_one(turns)
     # The integral X grows as 1/dn² and must not overflow. If cn and dn are tiny, X is 1/dn² times a
     # function of their ratio alone, with a relative error of the square of `_FLOOR`. Therefore
@@ -249,16 +221,18 @@ def _derivatives_by_m_from_integral(u: Array, m: Array, m1: Array) -> tuple[Arra
     return c * d * x, -s * d * x * up, -(0.5 * s * s / d + m * s * c * x) * up
 
 
-def _reduce_to_half_period(u: Array, m1: Array) -> tuple[Array, Array, list[tuple[Array, Array]]]:
-    """Return three things about the argument u of Jacobi's functions of parameter m, written as
-    u = 2Kn + r with |r| ≤ K, where 2K is the half period: the whole number n; the angle πr/(2K),
-    rad; and the list of pairs of arithmetic and geometric means that starts from 1 and √m1 and ends
-    at their common limit π/(2K).
-
-    - `u`: the argument.
-    - `m1`: 1 − m. For m1 = 0 the half period is infinite, n is 0, and the other two results mean
-      nothing.
+class HalfPeriods(NamedTuple):
+    """Hold an argument u = 2Kn + r with |r| ≤ K, where 2K is the half period; for m1 = 0 this is
+    infinite, n is 0, and the other fields mean nothing.
     """
+
+    whole: Array  # n
+    angle: Array  # πr/(2K), rad
+    means: list[tuple[Array, Array]]  # the arithmetic and geometric means from (1, √m1) to π/(2K)
+
+
+def _reduced(u: Array, m1: Array) -> HalfPeriods:
+    """Return the argument less whole half periods."""
     rows = agm_iterates(jnp.where(m1 == 0, 1, m1))
     turns, angle = split_half_turns(u * rows[-1][0])
-    return jnp.where(m1 == 0, 0, turns), angle, rows
+    return HalfPeriods(jnp.where(m1 == 0, 0, turns), angle, rows)

@@ -33,13 +33,8 @@ _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 def sncndn_near_one(
     u: RealOrArray, m: RealOrArray, m1: RealOrArray
 ) -> tuple[RealOrArray, RealOrArray, RealOrArray]:
-    """Return Jacobi's functions sn, cn and dn for 0 ≤ m1 ≤ 0.1, with an absolute error of about the
-    machine epsilon.
-
-    - `u`: the argument.
-    - `m`: the parameter 1 − m1. The tangents of m (its changes in a derivative) must be minus the
-      tangents of m1.
-    - `m1`: 1 − m.
+    """Return sn, cn and dn for 0 ≤ m1 ≤ 0.1, with an absolute error of about the machine epsilon;
+    the tangent of m must be minus that of m1.
     """
     root = jnp.sqrt(m)
     fourth = jnp.sqrt(root)
@@ -79,14 +74,10 @@ def sncndn_near_one(
 
 @jax.custom_jvp
 def _power_times_exp(base: Array, exponent: Array, power: Array) -> Array:
-    """Return p^n e^y, with exact derivatives with respect to p and y.
+    """Return p^n e^y for a whole number n, with exact derivatives by p and y.
 
-    - `base`: p > 0.
-    - `exponent`: y.
-    - `power`: n, a whole number.
-
-    For n = 1 the second derivative with respect to p is exactly 0; if JAX differentiated
-    e^(y + n ln p) instead, an error of round-off would be left.
+    For n = 1 the second derivative with respect to p is exactly 0; if JAX differentiated e^(y + n
+    ln p) instead, an error of round-off would be left.
     """
     return jnp.exp(exponent + jnp.where(power == 0, 0, power * jnp.log(base)))
 
@@ -95,12 +86,7 @@ def _power_times_exp(base: Array, exponent: Array, power: Array) -> Array:
 def _power_times_exp_jvp(
     primals: tuple[Array, Array, Array], tangents: tuple[PyTree, ...]
 ) -> tuple[Array, Array]:
-    """Return p^n e^y and its tangent (its change) for changes of p and y: the rule by which JAX
-    differentiates `_power_times_exp`.
-
-    - `primals`: p > 0, y and the whole number n.
-    - `tangents`: the changes of these three; the change of n is not used.
-    """
+    """Return p^n e^y and its tangent."""
     (p, y, n), (dp, dy, _) = primals, tangents
     value = _power_times_exp(p, y, n)
     slope = jnp.where(n == 0, 0, n * _power_times_exp(p, y, n - 1))

@@ -23,8 +23,8 @@ from rigidjax.elliptic.arguments import (
     Real,
     RealOrArray,
     Tangent,
-    number_and_complement,
-    to_common_dtype,
+    common,
+    with_complement,
 )
 from rigidjax.elliptic.carlson import rd, rf
 from rigidjax.elliptic.carlson_r import r_integral
@@ -50,7 +50,7 @@ def ellipk(m: Real, m1: Real | None = None) -> RealOrArray:
     >>> round(float(ellipk(1.0, 1e-30)), 12)
     35.925070756031
     """
-    _, m1 = to_common_dtype(**number_and_complement("m", m, m1))
+    _, m1 = common(**with_complement("m", m, m1))
     return _complete_first_kind(m1)
 
 
@@ -64,7 +64,7 @@ def ellipe(m: Real, m1: Real | None = None) -> RealOrArray:
     >>> float(ellipe(1.0))
     1.0
     """
-    _, m1 = to_common_dtype(**number_and_complement("m", m, m1))
+    _, m1 = common(**with_complement("m", m, m1))
     return complete_integral((0, -1, 0), m1)
 
 
@@ -84,9 +84,7 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
     >>> round(float(ellippi(0.5, 0.5)), 12)
     2.701287762095
     """
-    _, n1, _, m1 = to_common_dtype(
-        **number_and_complement("n", n, n1), **number_and_complement("m", m, m1)
-    )
+    _, n1, _, m1 = common(**with_complement("n", n, n1), **with_complement("m", m, m1))
     return complete_integral((0, 0, 1), m1, n1)
 
 
@@ -102,8 +100,8 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     >>> round(float(ellipf(1.0, 0.5)), 12)
     1.083216772845
     """
-    phi, _, m1 = to_common_dtype(phi=phi, **number_and_complement("m", m, m1))
-    return _integral_at_any_amplitude((0, 0, 0), phi, m1)
+    phi, _, m1 = common(phi=phi, **with_complement("m", m, m1))
+    return _at_amplitude((0, 0, 0), phi, m1)
 
 
 def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
@@ -118,8 +116,8 @@ def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     >>> round(float(ellipeinc(1.0, 0.5)), 12)
     0.927329883624
     """
-    phi, _, m1 = to_common_dtype(phi=phi, **number_and_complement("m", m, m1))
-    return _integral_at_any_amplitude((0, -1, 0), phi, m1)
+    phi, _, m1 = common(phi=phi, **with_complement("m", m, m1))
+    return _at_amplitude((0, -1, 0), phi, m1)
 
 
 def ellippiinc(
@@ -140,23 +138,18 @@ def ellippiinc(
     >>> round(float(ellippiinc(0.5, 1.0, 0.5)), 12)
     1.288978174245
     """
-    _, n1, phi, _, m1 = to_common_dtype(
-        **number_and_complement("n", n, n1), phi=phi, **number_and_complement("m", m, m1)
+    _, n1, phi, _, m1 = common(
+        **with_complement("n", n, n1), phi=phi, **with_complement("m", m, m1)
     )
-    return _integral_at_any_amplitude((0, 0, 1), phi, m1, n1)
+    return _at_amplitude((0, 0, 1), phi, m1, n1)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def incomplete_integral(
     orders: tuple[int, int, int], sine: Array, cosine: Array, m1: Array, n1: Array
 ) -> Array:
-    """Return Legendre's incomplete integral I_jkl(φ, m, n) = ∫₀^φ sin^{2j}θ Δ^{−(2k+1)} (1 − n
-    sin²θ)^{−l} dθ, with Δ = √(1 − m sin²θ), for an amplitude |φ| ≤ π/2.
-
-    - `orders`: the three whole numbers (j, k, l).
-    - `sine`, `cosine`: sin φ and cos φ, which are given in place of φ, so that no digit is lost
-      near φ = π/2.
-    - `m1`, `n1`: 1 − m and 1 − n.
+    """Return I_jkl for the `orders` (j, k, l) and |φ| ≤ π/2, from sin φ and cos φ, so that no digit
+    is lost near φ = π/2.
     """
     j, k, last = orders
     s, c2 = sine, cosine * cosine
@@ -168,7 +161,7 @@ def incomplete_integral(
     if orders == (1, 0, 0):
         return s**3 / 3 * rd(c2, delta2, one)
     if orders == (0, -1, 0):
-        return _incomplete_second_kind(s, c2, delta2, m1)
+        return _second_kind(s, c2, delta2, m1)
     powers, values = [j - k - last + 0.5, 0.5, k + 0.5], [one, c2, delta2]
     if last:
         powers, values = [*powers, float(last)], [*values, c2 + n1 * s * s]
@@ -181,16 +174,7 @@ def _incomplete_integral_jvp(
     primals: tuple[Array, Array, Array, Array],
     tangents: tuple[Tangent, Tangent, Tangent, Tangent],
 ) -> tuple[Array, Array]:
-    """Return Legendre's incomplete integral I_jkl(φ, m, n) = ∫₀^φ sin^{2j}θ Δ^{−(2k+1)}
-    (1 − n sin²θ)^{−l} dθ, with Δ = √(1 − m sin²θ), and its tangent (its change). By this rule JAX
-    differentiates `incomplete_integral`.
-
-    - `orders`: the three whole numbers (j, k, l).
-    - `primals`: sin φ, cos φ, 1 − m and 1 − n.
-    - `tangents`: the changes of these four; a change that is known to be zero is a `SymbolicZero`.
-
-    The tangent is dI_jkl = [integrand at φ] dφ + (k + ½) I_{j+1,k+1,l} dm + l I_{j+1,k,l+1} dn.
-    """
+    """Return I_jkl and its tangent, by the formula in the head of this module."""
     j, k, last = orders
     s, c, m1, n1 = primals
     ds, dc, dm1, dn1 = tangents
@@ -212,23 +196,13 @@ def _incomplete_integral_jvp(
 
 
 def complete_integral(orders: tuple[int, int, int], m1: Array, n1: Array | None = None) -> Array:
-    """Return Legendre's complete integral I_jkl = ∫₀^{π/2} sin^{2j}θ Δ^{−(2k+1)} (1 − n sin²θ)^{−l}
-    dθ, with Δ = √(1 − m sin²θ).
-
-    - `orders`: the three whole numbers (j, k, l).
-    - `m1`: 1 − m.
-    - `n1`: 1 − n, or None for n = 0.
-    """
+    """Return I_jkl for φ = π/2, with n = 0 if `n1` is None."""
     one = jnp.ones_like(m1)
     return incomplete_integral(orders, one, jnp.zeros_like(m1), m1, one if n1 is None else n1)
 
 
 def agm_iterates(m1: Array) -> list[tuple[Array, Array]]:
-    """Return the pairs of arithmetic and geometric means in the order of the iteration, from (1,
-    √m1) to their common value.
-
-    `m1` is 1 − m, where m is the parameter of an elliptic integral.
-    """
+    """Return the pairs of arithmetic and geometric means from (1, √m1) to their common value."""
     rows = [(jnp.ones_like(m1), jnp.sqrt(m1))]
     for _ in range(_MEAN_STEPS[np.dtype(m1.dtype)]):
         a, b = rows[-1]
@@ -238,11 +212,7 @@ def agm_iterates(m1: Array) -> list[tuple[Array, Array]]:
 
 @jax.custom_jvp
 def _complete_first_kind(m1: Array) -> Array:
-    """Return Legendre's complete integral of the first kind, K(m) = ∫₀^{π/2}
-    dθ/√(1 − m sin²θ) = π/(2 agm(1, √m1)), where agm is the arithmetic–geometric mean.
-
-    - `m1`: 1 − m, where m is the parameter; K is infinite for m1 = 0.
-    """
+    """Return K(m) = π/(2 agm(1, √m1)), infinite for m1 = 0."""
     a, b = agm_iterates(m1)[-1]
     return jnp.where(m1 == 0, jnp.inf, math.pi / (a + b))
 
@@ -251,35 +221,20 @@ def _complete_first_kind(m1: Array) -> Array:
 def _complete_first_kind_jvp(
     primals: tuple[Array], tangents: tuple[PyTree, ...]
 ) -> tuple[Array, Array]:
-    """Return Legendre's complete integral of the first kind K(m) and its tangent (its change) for a
-    change of 1 − m: the rule by which JAX differentiates K.
-
-    - `primals`: a tuple of one item, 1 − m.
-    - `tangents`: a tuple of one item, the change of 1 − m.
-    """
+    """Return K and its tangent."""
     (m1,), (dm1,) = primals, tangents
     return _complete_first_kind(m1), -0.5 * complete_integral((1, 1, 0), m1) * dm1
 
 
-def _incomplete_second_kind(
-    sine: Array, cosine_squared: Array, delta_squared: Array, m1: Array
-) -> Array:
-    """Return Legendre's incomplete integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ,
-    for |φ| ≤ π/2.
-
-    - `sine`, `cosine_squared`: sin φ and cos²φ.
-    - `delta_squared`: 1 − m sin²φ.
-    - `m1`: 1 − m.
-
-    The formula is DLMF 19.25.10 for 0 ≤ m ≤ 1 and DLMF 19.25.9 for m < 0: with this choice every
-    term is positive.
+def _second_kind(sine: Array, cosine_squared: Array, delta_squared: Array, m1: Array) -> Array:
+    """Return E(φ|m) for |φ| ≤ π/2, by DLMF 19.25.10 for 0 ≤ m ≤ 1 and 19.25.9 for m < 0: with this
+    choice every term is positive.
     """
     m, one = 1 - m1, jnp.ones_like(sine)
     # For m = 1 and |φ| = π/2 Carlson's integrals below are not finite; E(φ|1) is sin φ.
     end = delta_squared == 0
     cosine_squared, delta_squared = (
-        jnp.where(end, one, cosine_squared),
-        jnp.where(end, one, delta_squared),
+        jnp.where(end, one, x) for x in (cosine_squared, delta_squared)
     )
     above = m >= 0
     first = jnp.where(above, m1, one) * sine * rf(cosine_squared, delta_squared, one)
@@ -292,19 +247,13 @@ def _incomplete_second_kind(
     return jnp.where(m1 < 0, jnp.nan, value)
 
 
-def _integral_at_any_amplitude(
+def _at_amplitude(
     orders: tuple[int, int, int], phi: Array, m1: Array, n1: Array | None = None
 ) -> Array:
-    """Return Legendre's incomplete integral I_jkl(φ, m, n) = ∫₀^φ sin^{2j}θ Δ^{−(2k+1)}
-    (1 − n sin²θ)^{−l} dθ, with Δ = √(1 − m sin²θ), for an amplitude φ of any size.
+    """Return I_jkl for an amplitude of any size, with n = 0 if `n1` is None.
 
-    - `orders`: the three whole numbers (j, k, l).
-    - `phi`: the amplitude φ, rad.
-    - `m1`: 1 − m.
-    - `n1`: 1 − n, or None for n = 0.
-
-    With φ = Nπ + r, for a whole number N and |r| ≤ π/2, the integral is 2N times the complete
-    integral (from 0 to π/2) plus the integral from 0 to r.
+    With φ = Nπ + r, for a whole number N and |r| ≤ π/2, it is 2N times the complete integral plus
+    the integral from 0 to r.
     """
     turns, remainder = split_half_turns(phi)
     n1 = jnp.ones_like(m1) if n1 is None else n1

@@ -15,17 +15,17 @@ from rigidjax.exact.jacobi_duplication import (
     Elliptic,
     HalfPeriod,
     Modulus,
-    clip_time_on_separatrix,
+    clip_time,
+    doubled,
     elliptic_functions,
-    elliptic_functions_at_double_time,
     half_period,
 )
-from rigidjax.rotation.barrier import barrier, compiled_as_one_kernel
+from rigidjax.rotation.barrier import barrier, one_kernel
 
 
 class ClosedFormConstants(NamedTuple):
-    """Hold the constants of the motion of a free rigid body, in principal axes that are labelled
-    1, 2, 3 in ascending or descending order of their moments I₁, I₂, I₃.
+    """Hold the constants of a free motion, in principal axes that are labelled 1, 2, 3 in ascending
+    or descending order of their moments I₁, I₂, I₃.
     """
 
     a: Scalar  # 1/I₁, the reciprocal of the moment of axis 1
@@ -41,13 +41,10 @@ class ClosedFormConstants(NamedTuple):
     swapped: Float[Array, ""]  # whether axis 1 has the largest moment
 
 
-@compiled_as_one_kernel
+@one_kernel
 def closed_form_constants(moments: Triple, momentum: Triple) -> ClosedFormConstants:
-    """Return the constants of a free motion, from which its body momentum and its rotation follow
-    at any time.
-
-    - `moments`: the principal moments I₁ ≤ I₂ ≤ I₃; two of them, or all three, may be equal.
-    - `momentum`: the three components of the body momentum at time 0, in the principal axes.
+    """Return the constants of a free motion in ascending principal moments, of which some may be
+    equal.
     """
     (i1, i2, i3), (p1, p2, p3) = moments, momentum
     r1, r2, r3 = 1.0 / i1, 1.0 / i2, 1.0 / i3
@@ -73,9 +70,7 @@ def closed_form_constants(moments: Triple, momentum: Triple) -> ClosedFormConsta
 
 
 class ReducedTime(NamedTuple):
-    """Hold a time from which a whole number of half periods was subtracted: of the half periods of
-    the elliptic functions S, C, D in which a free motion is written.
-    """
+    """Hold a time from which a whole number of half periods of S, C, D was subtracted."""
 
     halves: Scalar  # the number of half periods that were subtracted
     rest: Scalar  # the time that is left
@@ -83,96 +78,35 @@ class ReducedTime(NamedTuple):
 
 
 def reduce_time(u: Scalar, half_period: Scalar, modulus: Modulus) -> ReducedTime:
-    """Return the time u less a whole number of half periods of the elliptic functions S, C, D in
-    which a free motion is written.
+    """Return the time u less a whole number of half periods.
 
-    - `u`: the time.
-    - `half_period`: the length of one half period, which is infinite on the separatrix.
-    - `modulus`: the parameters of the elliptic functions, which tell whether the motion is on the
-      separatrix. There the body ends in a steady spin about its middle axis, and a time within this
-      spin is replaced by the time at which the spin begins.
+    On the separatrix the half period is infinite, and the body ends in a steady spin about its
+    middle axis: a time within this spin is replaced by the time at which the spin begins.
     """
     count = jnp.round(u / half_period)
     rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half_period)
-    return ReducedTime(count, rest, clip_time_on_separatrix(rest, modulus))
+    return ReducedTime(count, rest, clip_time(rest, modulus))
 
 
-def restore_half_periods(
-    constants: ClosedFormConstants, functions: Elliptic, half_time: ReducedTime
-) -> tuple[Elliptic, Scalar]:
-    """Return two things: the elliptic functions S, C, D of a free motion at the time t/2, from
-    their values at a reduced time; and the angle by which the phase ξ at t/2 is larger than the
-    phase at the reduced time.
-
-    - `constants`: the constants of the motion.
-    - `functions`: S, C, D and ξ at the reduced time `half_time.near`. S solves dS/du = CD with
-      S(0) = 0, where C² = 1 − pS² and D² = 1 − qS²; ξ is the angle κ ∫ S²/(1 + μS²) du from 0. The
-      numbers p, q, κ and μ are among the `constants`.
-    - `half_time`: the reduced time, and the number of half periods that were subtracted from t/2.
-
-    The angle belongs to the half periods that were subtracted and, on the separatrix, to the time
-    in which the body spins steadily about its middle axis.
-    """
-    big = jnp.maximum(constants.modulus.p, constants.modulus.q)
-    whole = jnp.where(half_time.halves == 0, 0.0, half_time.halves)
-    # On the separatrix, from `half_time.near` on, the momentum rests on the middle axis and the
-    # body spins steadily. There S² = 1/max(p, q), with the parameters p and q of S, so that the
-    # phase grows at the constant rate κ S²/(1 + μS²) = κ/(max(p, q) + μ).
-    spin = (
-        (half_time.rest - half_time.near)
-        * constants.phase_factor
-        / jnp.where(big > 0, big + constants.mu, 1.0)
-    )
-    odd = jnp.abs(whole - 2.0 * jnp.round(0.5 * whole)) > 0.5
-    sign = jnp.where(odd, -1.0, 1.0)
-    around_three = constants.modulus.gap > 0
-    return (
-        functions._replace(
-            S=sign * functions.S,
-            C=jnp.where(around_three, sign, 1.0) * functions.C,
-            D=jnp.where(around_three, 1.0, sign) * functions.D,
-        ),
-        whole * jnp.where(half_time.halves == 0, 0.0, constants.half.phase) + spin,
-    )
-
-
-def restore_elliptic_identity(functions: Elliptic, modulus: Modulus) -> Elliptic:
-    """Return the elliptic functions S, C, D with the larger of C² and D² computed again from the
-    smaller, by D² − C² = (p − q)S².
-
-    - `functions`: S, C and D, with the errors of round-off from their computation, in which the
-      time is doubled many times.
-    - `modulus`: the numbers p and q, where C² = 1 − pS² and D² = 1 − qS².
-
-    If the momentum is near the middle axis, its first component is a small difference of two terms,
-    one with the factor C and one with the factor SD. If C and D have equal errors, these cancel in
-    the difference; an error of C alone or of D alone does not cancel, and the identity removes it.
-    """
-    gs = modulus.gap * functions.S * functions.S
-    other = jnp.sqrt(
-        jnp.where(gs > 0, functions.C * functions.C + gs, functions.D * functions.D - gs)
-    )
-    return functions._replace(
-        C=jnp.where(gs > 0, functions.C, jnp.copysign(other, functions.C)),
-        D=jnp.where(gs > 0, jnp.copysign(other, functions.D), functions.D),
-    )
-
-
-def momentum_from_elliptic_functions(constants: ClosedFormConstants, functions: Elliptic) -> Triple:
-    """Return the three components of the body momentum of a free motion at the time of the elliptic
+def momentum_at(constants: ClosedFormConstants, functions: Elliptic) -> Triple:
+    """Return the body momentum, in the labels of `constants`, at the time of the elliptic
     functions.
-
-    - `constants`: the constants of the motion, which also fix the labels 1, 2, 3 of the principal
-      axes.
-    - `functions`: the elliptic functions S, C and D at the time for which the momentum is computed:
-      S solves dS/du = CD with S(0) = 0, where C² = 1 − pS² and D² = 1 − qS² for two numbers p and q
-      of the motion.
     """
     p1, p2, p3 = constants.P
-    functions = restore_elliptic_identity(functions, constants.modulus)
-    y1 = p1 * functions.C - constants.d23 * p2 * p3 * functions.S * functions.D
-    y2 = p2 * functions.C * functions.D + constants.d13 * p1 * p3 * functions.S
-    y3 = p3 * functions.D - constants.d12 * p1 * p2 * functions.S * functions.C
+    S, C, D, *_ = functions
+    # Compute the larger of C² and D² again from the smaller, by D² − C² = (p − q)S². If the
+    # momentum is near the middle axis, its first component is a small difference of two terms, one
+    # with the factor C and one with the factor SD. Equal errors of C and D cancel in the
+    # difference; an error of C alone or of D alone does not, and the identity removes it.
+    gs = constants.modulus.gap * S * S
+    other = jnp.sqrt(jnp.where(gs > 0, C * C + gs, D * D - gs))
+    C, D = (
+        jnp.where(gs > 0, C, jnp.copysign(other, C)),
+        jnp.where(gs > 0, jnp.copysign(other, D), D),
+    )
+    y1 = p1 * C - constants.d23 * p2 * p3 * S * D
+    y2 = p2 * C * D + constants.d13 * p1 * p3 * S
+    y3 = p3 * D - constants.d12 * p1 * p2 * S * C
     size = jnp.maximum(jnp.maximum(jnp.abs(y1), jnp.abs(y2)), jnp.abs(y3))
     still = size <= 0
     size = jnp.where(still, 1.0, size)
@@ -184,17 +118,20 @@ def momentum_from_elliptic_functions(constants: ClosedFormConstants, functions: 
     return y1 * r, y2 * r, y3 * r
 
 
-@compiled_as_one_kernel
-def momentum_and_rotation(
-    constants: ClosedFormConstants, t: Scalar
-) -> tuple[Triple, QuaternionEntries]:
-    """Return two things: the body momentum at the time t; and the quaternion (w, x, y, z) of the
-    rotation of the body from time 0 to t. Both have components along the principal axes.
-
-    `constants` are the constants of the motion.
+class MomentumAndTurn(NamedTuple):
+    """Hold the body momentum Π(t) and the turn, which is the rotation of the body from time 0 to t,
+    both along the principal axes.
     """
+
+    momentum: Triple
+    turn: QuaternionEntries
+
+
+@one_kernel
+def momentum_and_turn(constants: ClosedFormConstants, t: Scalar) -> MomentumAndTurn:
+    """Return the motion at the time t."""
     half_time = reduce_time(0.5 * t, constants.half.time, constants.modulus)
-    return momentum_and_rotation_from_elliptic_functions(
+    return from_elliptic(
         constants,
         elliptic_functions(half_time.near, constants.modulus, constants.mu, constants.phase_factor),
         half_time,
@@ -202,24 +139,35 @@ def momentum_and_rotation(
     )
 
 
-def momentum_and_rotation_from_elliptic_functions(
+def from_elliptic(
     constants: ClosedFormConstants, functions: Elliptic, half_time: ReducedTime, t: Scalar
-) -> tuple[Triple, QuaternionEntries]:
-    """Return two things: the body momentum at the time t; and the quaternion (w, x, y, z) of the
-    rotation of the body from time 0 to t. Both have components along the principal axes.
-
-    - `constants`: the constants of the motion.
-    - `functions`: the elliptic functions S, C, D and their phase ξ at the time `half_time.near`.
-    - `half_time`: the time t/2, reduced by whole half periods.
+) -> MomentumAndTurn:
+    """Return the motion at the time t from the elliptic functions and their phase at the time t/2
+    reduced by whole half periods, `half_time.near`.
     """
-    functions, phase = barrier(restore_half_periods(constants, functions, half_time))
-    full = barrier(
-        elliptic_functions_at_double_time(
-            functions, constants.modulus, constants.mu, constants.phase_factor
-        )
+    big = jnp.maximum(constants.modulus.p, constants.modulus.q)
+    whole = jnp.where(half_time.halves == 0, 0.0, half_time.halves)
+    # On the separatrix, from `half_time.near` on, the momentum rests on the middle axis and the
+    # body spins steadily. There S² = 1/max(p, q), with the parameters p and q of S, so that the
+    # phase grows at the constant rate κ S²/(1 + μS²) = κ/(max(p, q) + μ).
+    spin = (
+        (half_time.rest - half_time.near)
+        * constants.phase_factor
+        / jnp.where(big > 0, big + constants.mu, 1.0)
     )
-    _, k2, k3 = barrier(momentum_from_elliptic_functions(constants, functions))
-    m1, m2, m3 = barrier(momentum_from_elliptic_functions(constants, full))
+    # Restore the half periods: each turns the signs of two functions and adds its phase.
+    sign = jnp.where(jnp.abs(whole - 2.0 * jnp.round(0.5 * whole)) > 0.5, -1.0, 1.0)
+    around_three = constants.modulus.gap > 0
+    functions = functions._replace(
+        S=sign * functions.S,
+        C=jnp.where(around_three, sign, 1.0) * functions.C,
+        D=jnp.where(around_three, 1.0, sign) * functions.D,
+    )
+    phase = whole * jnp.where(half_time.halves == 0, 0.0, constants.half.phase) + spin
+    functions, phase = barrier((functions, phase))
+    full = barrier(doubled(functions, constants.modulus, constants.mu, constants.phase_factor))
+    _, k2, k3 = barrier(momentum_at(constants, functions))
+    m1, m2, m3 = barrier(momentum_at(constants, full))
 
     # The rotation of the body from time 0 to t is the product (c, s Π(0)) ⊗ b of two quaternions.
     # The first, with two numbers c and s, turns about the initial momentum Π(0); the second,
@@ -250,4 +198,4 @@ def momentum_and_rotation_from_elliptic_functions(
     swap = constants.swapped
     momentum = jnp.where(swap, m3, m1), jnp.where(swap, -m2, m2), jnp.where(swap, m1, m3)
     turn = w, jnp.where(swap, z, x), jnp.where(swap, -y, y), jnp.where(swap, x, z)
-    return momentum, turn
+    return MomentumAndTurn(momentum, turn)

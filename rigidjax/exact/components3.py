@@ -21,16 +21,12 @@ HALF = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
 
 
 def add(v: Triple, w: Triple) -> Triple:
-    """Return the sum of the two vectors v and w, each a tuple of three components."""
+    """Return v + w."""
     return v[0] + w[0], v[1] + w[1], v[2] + w[2]
 
 
 def matvec(matrix: SymmetricEntries, vector: Triple) -> Triple:
-    """Return the product of a symmetric matrix and a vector, as three components.
-
-    - `matrix`: the entries (11, 22, 33, 12, 13, 23).
-    - `vector`: three components.
-    """
+    """Return the product of a symmetric matrix and a vector."""
     a, b, c, x, y, z = matrix
     return (
         a * vector[0] + x * vector[1] + y * vector[2],
@@ -40,10 +36,7 @@ def matvec(matrix: SymmetricEntries, vector: Triple) -> Triple:
 
 
 def commuting_product(left: SymmetricEntries, right: SymmetricEntries) -> SymmetricEntries:
-    """Return the product of two symmetric matrices that commute; the product is symmetric, too.
-
-    All three matrices are tuples of the entries (11, 22, 33, 12, 13, 23).
-    """
+    """Return the product of two symmetric matrices that commute; the product is symmetric, too."""
     a, b, c, x, y, z = left
     d, e, f, u, v, w = right
     return (
@@ -57,23 +50,19 @@ def commuting_product(left: SymmetricEntries, right: SymmetricEntries) -> Symmet
 
 
 def symmetric_rows(matrix: SymmetricEntries) -> tuple[Array, ...]:
-    """Return the three rows, each (3,), of the symmetric matrix with the entries (11, 22, 33, 12,
-    13, 23).
-    """
+    """Return the three rows, each (3,), of a symmetric matrix."""
     a, b, c, x, y, z = matrix
     return jnp.stack([a, x, y]), jnp.stack([x, b, z]), jnp.stack([y, z, c])
 
 
 def determinant(matrix: SymmetricEntries) -> Scalar:
-    """Return the determinant of the symmetric matrix with the entries (11, 22, 33, 12, 13, 23)."""
+    """Return the determinant of a symmetric matrix."""
     a, b, c, x, y, z = matrix
     return a * b * c + 2.0 * x * y * z - a * z * z - b * y * y - c * x * x
 
 
 def adjugate(matrix: SymmetricEntries) -> SymmetricEntries:
-    """Return the adjugate of a symmetric matrix, which is its determinant times its inverse; both
-    matrices are tuples of the entries (11, 22, 33, 12, 13, 23).
-    """
+    """Return the adjugate of a symmetric matrix, which is its determinant times its inverse."""
     a, b, c, x, y, z = matrix
     return (
         b * c - z * z,
@@ -86,10 +75,8 @@ def adjugate(matrix: SymmetricEntries) -> SymmetricEntries:
 
 
 def half_product(q: QuaternionEntries, vector: Triple) -> QuaternionEntries:
-    """Return the four components of ½ q ⊗ (0, v), where ⊗ is the product of quaternions (w, x, y,
-    z) and v = `vector`.
-
-    If v is the body rate, this is the rate of change of q.
+    """Return ½ q ⊗ (0, v), which is the rate of change of the quaternion q if v = `vector` is the
+    body rate.
     """
     w, x, y, z = q
     a, b, c = 0.5 * vector[0], 0.5 * vector[1], 0.5 * vector[2]
@@ -101,10 +88,8 @@ def half_product(q: QuaternionEntries, vector: Triple) -> QuaternionEntries:
     )
 
 
-def change_by_inverse_rotation(q: QuaternionEntries, vector: Triple) -> Triple:
-    """Return the three components of R(q)ᵀ v − v, where v = `vector` and R(q) is the rotation by
-    the unit quaternion q; the change is computed without a difference of nearly equal numbers.
-    """
+def change_unrotated(q: QuaternionEntries, vector: Triple) -> Triple:
+    """Return R(q)ᵀ v − v for a unit quaternion q, without a difference of nearly equal numbers."""
     w, *axis = q
     first = cross(vector, tuple(axis))
     second = cross(first, tuple(axis))

@@ -1,7 +1,7 @@
 """Solve a free motion in diffrax by the closed form, exact at any step size, with dense output."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax as dfx
 import jax
@@ -15,28 +15,19 @@ from rigidjax.motion.equations import AttitudeEquations, EulerEquations
 
 
 class FreeInterpolation(dfx.AbstractLocalInterpolation):
-    """Evaluate the motion of a free body between the two ends of a diffrax step in closed form.
+    """Evaluate the motion of a free body between the two ends of a diffrax step in closed form."""
 
-    - `t0`, `t1`: the times of the two ends as diffrax counts them, which are −t if it integrates
-      backwards in the time t.
-    - `y0`: the state at `t0`, a `Spin` (a body rate) or an `Attitude` (a quaternion and a body
-      rate).
-    - `inertia`: the inertia of the body about its centre of mass.
-    - `direction`: −1 if diffrax integrates backwards, else 1.
-    """
-
-    t0: Any
+    t0: Any  # as diffrax counts the time: −t if it integrates backwards in the time t
     t1: Any
-    y0: Any
+    y0: Any  # the `Spin` or `Attitude` at t0
     inertia: Inertia
-    direction: Any
+    direction: Any  # −1 if diffrax integrates backwards, else 1
 
     def evaluate(
         self, t0: RealLike, t1: RealLike | None = None, left: bool = True
     ) -> PyTree[Array]:
-        """Return the state at the time `t0`; if `t1` is given, return the state at `t1` minus the
-        state at `t0`. The argument `left`, the side of a jump, is not used, because there is no
-        jump.
+        """Return the state at the time `t0`, or the state at `t1` minus the state at `t0`; `left`,
+        the side of a jump, is not used, because there is no jump.
         """
         motion = FreeBody(self.inertia, self.y0)
         state = motion(self.direction * (t0 - self.t0))
@@ -91,7 +82,7 @@ class FreeSolver(dfx.AbstractSolver):
         """Return an empty solver state; raise a `ValueError` unless `terms` are the equations of a
         free body.
         """
-        _free_euler_equations(terms)
+        _free_equations(terms)
         return ()
 
     def step(
@@ -109,10 +100,8 @@ class FreeSolver(dfx.AbstractSolver):
         and success.
         """
         # The direction is −1 if diffrax integrates backwards, in which case its times are −t.
-        inertia, direction = (
-            _free_euler_equations(terms).inertia,
-            jnp.asarray(field_and_direction(terms)[1], jnp.result_type(t0)),
-        )
+        inertia = _free_equations(terms).inertia
+        direction = jnp.asarray(field_and_direction(terms).direction, jnp.result_type(t0))
         y1 = FreeBody(inertia, y0)(direction * (t1 - t0))
         error = jax.tree.map(jnp.zeros_like, y0)
         dense = dict(y0=y0, inertia=inertia, direction=direction)
@@ -127,26 +116,26 @@ class FreeSolver(dfx.AbstractSolver):
         return terms.vf(t0, y0, args)
 
 
-def field_and_direction(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
-    """Return two things from inside the terms that diffrax gives to a solver: the vector field, or
-    `None` if there is none; and the direction of time, 1, or −1 if diffrax integrates backwards.
+class FieldAndDirection(NamedTuple):
+    """Hold what lies inside the terms that diffrax gives to a solver."""
 
-    - `terms`: an `ODETerm`, or an object of diffrax that holds such a term and the direction.
+    field: Any  # the vector field, or None
+    direction: Any  # −1 if diffrax integrates backwards, else 1
+
+
+def field_and_direction(terms: PyTree[dfx.AbstractTerm]) -> FieldAndDirection:
+    """Return the vector field and the direction of time of an `ODETerm`, or of diffrax's object
+    around it.
     """
     # Read the attributes of the term and of the object around it: the public methods of a term,
     # `vf` and `contr`, return numbers only, but the solver needs the inertia in the vector field.
     term = getattr(terms, "term", terms)
-    return getattr(term, "vector_field", None), getattr(terms, "direction", 1)
+    return FieldAndDirection(getattr(term, "vector_field", None), getattr(terms, "direction", 1))
 
 
-def _free_euler_equations(terms: PyTree[dfx.AbstractTerm]) -> EulerEquations:
-    """Return Euler's equations of a free body from inside the terms of a diffrax solver.
-
-    - `terms`: an `ODETerm` whose vector field is the equations of motion of a `Spin` (a body rate)
-      or an `Attitude` (a quaternion and a body rate), with no torque. diffrax may have wrapped this
-      term together with the direction of time.
-
-    A `ValueError` is raised for any other terms.
+def _free_equations(terms: PyTree[dfx.AbstractTerm]) -> EulerEquations:
+    """Return Euler's equations of a free body from inside the terms of a diffrax solver; raise a
+    `ValueError` for any other terms.
     """
     field, _ = field_and_direction(terms)
     euler = field.euler if isinstance(field, AttitudeEquations) else field

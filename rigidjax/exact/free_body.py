@@ -13,11 +13,11 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, ScalarLike, Vec3
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
+from rigidjax.body.scaling import binary_exponent, times_power_of_two
 from rigidjax.exact.derivatives import (
     FreeMotionConstants,
-    body_rate_and_rotation,
-    free_motion_constants,
+    motion_constants,
+    rate_and_turn,
 )
 from rigidjax.motion import Rigid
 from rigidjax.rotation.kernels import quaternion_product
@@ -30,9 +30,9 @@ State = TypeVar("State", bound=HasSpin)
 class FreeMotion(eqx.Module):
     """Hold the motion of a free body from any initial state, a `Spin`, an `Attitude` or a `Rigid`.
 
-    The body and the state are not checked. Call the object with one time or with times (n,), s; the
-    time is 0 at the initial state. The result is NaN at a time until which the body turns by more
-    than 1/eps rad, where eps is the machine epsilon of the dtype.
+    The body and the state are not checked. Call the object with one time or with times (n,), s,
+    since `state0`. The result is NaN at a time until which the body turns by more than 1/eps rad,
+    where eps is the machine epsilon of the dtype.
     """
 
     state0: Any
@@ -46,16 +46,14 @@ class FreeMotion(eqx.Module):
         # Divide the tensor and the body rate by powers of two, so that their largest entries are
         # near 1: this loses no digit, and no product below overflows or underflows for a huge or a
         # tiny body.
-        self.exponent = largest_binary_exponent(state0.omega)
-        self.tensor = times_power_of_two(tensor, -largest_binary_exponent(tensor))
+        self.exponent = binary_exponent(state0.omega)
+        self.tensor = times_power_of_two(tensor, -binary_exponent(tensor))
         self.omega = times_power_of_two(state0.omega, -self.exponent)
-        self.setting = free_motion_constants(*jax.lax.stop_gradient((self.tensor, self.omega)))
+        self.setting = motion_constants(*jax.lax.stop_gradient((self.tensor, self.omega)))
         self.state0 = state0
 
     def __call__(self, since: Float[Array, "*n"]) -> Any:
-        """Return the state of the free body at the time `since`, or the states at the times `since`
-        (n,), s; the time is 0 at the initial state `state0`.
-        """
+        """Return the state at the time `since`, or the states at the times `since`."""
         t = since.astype(self.tensor.dtype)
         # If the body turns by more than 1/eps rad until the time t, the dtype holds no digit of the
         # angle within one turn, and the state is unknown: replace t by NaN, so that the state is
@@ -63,7 +61,7 @@ class FreeMotion(eqx.Module):
         turned = jnp.abs(t) * jnp.max(jnp.abs(self.state0.omega))
         t = jnp.where(turned <= 1 / jnp.finfo(t.dtype).eps, t, jnp.nan)
         scaled = times_power_of_two(t, self.exponent)
-        omega, turn = body_rate_and_rotation(self.tensor, self.omega, self.setting, scaled)
+        omega, turn = rate_and_turn(self.tensor, self.omega, self.setting, scaled)
         omega = times_power_of_two(omega, self.exponent)
         state = eqx.tree_at(lambda s: s.omega, self.state0, omega)
         if isinstance(state, HasAttitude):
@@ -164,13 +162,8 @@ _jitted = jax.jit(lambda inertia, state0, t: FreeMotion(inertia, state0)(t))
 
 
 def _checked_time(t: ScalarLike, omega: Array) -> Scalar:
-    """Return the time t, s, as an array after a check of its shape and dtype.
-
-    - `t`: the time, one number.
-    - `omega`: (3,) the body rate, rad/s.
-
-    A `ValueError` is raised if the body turns so far in this time that the dtype holds no digit of
-    the angle within one turn. This is not checked if t or `omega` is traced by JAX.
+    """Return the time, s, as an array; raise a `ValueError` if the dtype holds no digit of the
+    angle within one turn of the body in this time, where both arguments are known.
     """
     t = _checks.checked_time(t)
     if not _checks.is_known((t, omega)):
@@ -187,15 +180,8 @@ def _checked_time(t: ScalarLike, omega: Array) -> Scalar:
 
 
 def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
-    """Return the inertia of the body after checks of the inertia and of the state of the body; a
-    traced inertia that no real body has becomes NaN.
-
-    - `inertia`: the `Inertia` of one body, about its centre of mass.
-    - `state0`: a `Spin` (a body rate) or an `Attitude` (a quaternion and a body rate), with arrays
-      of the dtype of the inertia. The body rate and the quaternion must be finite, and the
-      quaternion must be of length 1.
-
-    A `TypeError` or `ValueError` is raised for any other inertia or state.
+    """Return the inertia after checks of it and of the state; a traced inertia that no real body
+    has becomes NaN.
     """
     if isinstance(state0, HasPose) or not isinstance(state0, HasSpin):
         raise TypeError(
@@ -227,8 +213,6 @@ def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
 
 @functools.partial(jnp.vectorize, signature="(n),(n)->(n)")
 def _unit_product(left: Quat, right: Quat) -> Quat:
-    """Return the product `left` ⊗ `right` of two quaternions (w, x, y, z), divided by its length;
-    arrays (…, 4) are multiplied pair by pair.
-    """
+    """Return the product of two quaternions, divided by its length."""
     out = jnp.stack(quaternion_product(components(left), components(right)))
     return out / jnp.sqrt(jnp.sum(out * out))

@@ -26,13 +26,9 @@ from rigidjax._types import Scalar
 
 
 class Elliptic(NamedTuple):
-    """Hold the elliptic functions S, C and D of a free body at some time, and the phase ξ as a
-    direction (x, y) ∝ (cos ξ, sin ξ).
-
-    S(u) solves dS/du = CD with S(0) = 0, where C² = 1 − pS² and D² = 1 − qS² for two numbers p and
-    q of the motion; S, C and D are Jacobi's sn, cn and dn in another scaling. The phase ξ is an
-    angle, rad: a correction to the rotation of the body about its momentum (see
-    `elliptic_functions`).
+    """Hold the elliptic functions S, C and D of a free body at some time (see the head of this
+    module), and the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`, rad, as a direction (x, y) ∝ (cos ξ, sin ξ):
+    a correction to the rotation of the body about its momentum.
     """
 
     S: Scalar
@@ -43,11 +39,9 @@ class Elliptic(NamedTuple):
 
 
 class Modulus(NamedTuple):
-    """Hold the two parameters p and q of the elliptic functions S, C and D, where C² = 1 − p S² and
-    D² = 1 − q S², and `gap` = p − q.
+    """Hold the parameters p and q of the elliptic functions and `gap` = p − q, all in 1/s².
 
-    All three are in 1/s². The caller computes `gap` without subtracting q from p, which would lose
-    digits.
+    The caller computes `gap` without subtracting q from p, which would lose digits.
     """
 
     p: Scalar
@@ -56,12 +50,8 @@ class Modulus(NamedTuple):
 
 
 class IterationLimits(NamedTuple):
-    """Hold, for one dtype, how often the computation of the elliptic functions repeats its steps,
-    and two limits beyond which a free motion is taken as a simpler one.
-
-    `doublings` and `agm` are the numbers of doublings of the time and of steps of the
-    arithmetic–geometric mean; `floor` and `rest` are the limits, where u is the time, and p and q
-    are the parameters of the elliptic functions of the motion.
+    """Hold, for one dtype, how often the steps of the elliptic functions are repeated, and two
+    limits beyond which a free motion is taken as a simpler one.
     """
 
     doublings: int  # the number of doublings from u/2^doublings to u
@@ -71,33 +61,25 @@ class IterationLimits(NamedTuple):
 
 
 def iteration_limits(dtype: jnp.dtype) -> IterationLimits:
-    """Return the numbers of steps and the limits with which the elliptic functions of a free motion
-    are computed in the dtype float32 or float64.
+    """Return the numbers of steps and the limits for float32 or float64.
 
-    The number of doublings is enough for the longest quarter period, which is ln(4/√floor)/√max(p,
-    q), where p and q are the parameters of the elliptic functions. The limit `floor` is chosen so
-    that C⁴, where C is one of these functions, does not underflow in the doublings.
+    The doublings are enough for the longest quarter period, ln(4/√floor)/√max(p, q); with this
+    `floor`, C⁴ does not underflow in them.
     """
     wide = dtype == jnp.float64
     return IterationLimits(9, 11, 1e-64, 75.0) if wide else IterationLimits(7, 9, 1e-33, 20.0)
 
 
 def is_aperiodic(modulus: Modulus) -> Bool[Array, ""]:
-    """Return whether the motion with the parameters `modulus` has no period: on the separatrix, for
-    a sphere, and at rest.
-    """
+    """Return whether a motion has no period: on the separatrix, for a sphere, and at rest."""
     return jnp.abs(modulus.gap) <= iteration_limits(modulus.p.dtype).floor * jnp.maximum(
         modulus.p, modulus.q
     )
 
 
-def clip_time_on_separatrix(reduced_time: Scalar, modulus: Modulus) -> Scalar:
-    """Return a time; on the separatrix it is clipped to the time after which the motion is taken as
-    a steady spin about the middle axis.
-
-    - `reduced_time`: the time, from which whole half periods were subtracted.
-    - `modulus`: the parameters of the elliptic functions, which tell whether the motion is on the
-      separatrix. For every other motion the time is returned unchanged.
+def clip_time(reduced_time: Scalar, modulus: Modulus) -> Scalar:
+    """Return a time from which whole half periods were subtracted; on the separatrix it is clipped
+    to the time after which the motion is taken as a steady spin about the middle axis.
     """
     big = jnp.maximum(modulus.p, modulus.q)
     rest = iteration_limits(reduced_time.dtype).rest / jnp.sqrt(jnp.where(big > 0, big, 1.0))
@@ -106,19 +88,11 @@ def clip_time_on_separatrix(reduced_time: Scalar, modulus: Modulus) -> Scalar:
     )
 
 
-def elliptic_functions_at_double_time(
-    functions: Elliptic, modulus: Modulus, mu: Scalar, phase_factor: Scalar
-) -> Elliptic:
-    """Return the elliptic functions S, C, D and the phase ξ at the time 2u, from their values at
-    the time u.
+def doubled(functions: Elliptic, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Elliptic:
+    """Return the elliptic functions and the phase at the time 2u from those at the time u.
 
-    - `functions`: the values at the time u. S(u) solves dS/du = CD with S(0) = 0, where
-      C² = 1 − pS² and D² = 1 − qS².
-    - `modulus`: the parameters p and q in these equations.
-    - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
-
-    The phase is ξ(2u) = 2ξ + arctan(B/A), with A = C² + pS²D² + μS²(C²D² + C² + D²) and B = 2κS³CD,
-    both at the time u; it is computed as a product of complex numbers.
+    The phase is ξ(2u) = 2ξ + arctan(B/A), with A = C² + pS²D² + μS²(C²D² + C² + D²) and B = 2κS³CD
+    at the time u; it is computed as a product of complex numbers.
     """
     S, C, D, x, y = functions
     s, cc, dd = S * S, C * C, D * D
@@ -136,16 +110,9 @@ def elliptic_functions_at_double_time(
     return Elliptic(2.0 * S * C * D * r, C2, D2, x2 * scale, y2 * scale)
 
 
-def elliptic_taylor_series(
-    time: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar
-) -> Elliptic:
-    """Compute the elliptic functions S, C, D and the phase ξ at a short time by Taylor series,
-    exact to round-off for √max(p, q) |u| ≤ 0.15 in float64 and ≤ 0.31 in float32.
-
-    - `time`: the short time u.
-    - `modulus`: the parameters p and q of S, C and D: S solves dS/du = CD with S(0) = 0, where
-      C² = 1 − pS² and D² = 1 − qS².
-    - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫ S²/(1 + μS²) du`.
+def elliptic_series(time: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Elliptic:
+    """Compute the elliptic functions and the phase at a short time by Taylor series, exact to
+    round-off for √max(p, q) |u| ≤ 0.15 in float64 and ≤ 0.31 in float32.
     """
     hh = time * time
     p, q = modulus.p * hh, modulus.q * hh
@@ -164,24 +131,19 @@ def elliptic_taylor_series(
     ]
     S = time * (functools.reduce(operator.add, terms) + 1.0)
     s = S * S
-    xi = phase_factor * third_kind_integral_series(S, modulus, mu)
+    xi = phase_factor * third_kind_series(S, modulus, mu)
     z = xi * xi
     tangent = xi * (1.0 + z * (1 / 3 + z * (2 / 15 + z * (17 / 315))))
     one = jnp.ones_like(s)
     return Elliptic(S, jnp.sqrt(1.0 - modulus.p * s), jnp.sqrt(1.0 - modulus.q * s), one, tangent)
 
 
-def third_kind_integral_series(S: Scalar, modulus: Modulus, mu: Scalar) -> Scalar:
-    """Return the integral ∫ S²/(1 + μS²) du over the time from 0 to u, for a small value `S` of the
-    elliptic function at u.
+def third_kind_series(S: Scalar, modulus: Modulus, mu: Scalar) -> Scalar:
+    """Return the integral ∫ S²/(1 + μS²) du from 0 to u, for a small value `S` at u.
 
-    - `S`: the value S(u). S solves (dS/du)² = (1 − pS²)(1 − qS²) with S(0) = 0.
-    - `modulus`: the parameters p and q in this equation.
-    - `mu`: the number μ.
-
-    With S as the variable, the integral is ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)), and the
-    result is a power series in S. The recurrence of Legendre's polynomials gives the terms of
-    1/(√(1 − pS²) √(1 − qS²)), and a second recurrence multiplies this series by 1/(1 + μS²).
+    With S as the variable, it is ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)), a power series in S.
+    The recurrence of Legendre's polynomials gives the terms of 1/(√(1 − pS²) √(1 − qS²)), and a
+    second recurrence multiplies this series by 1/(1 + μS²).
     """
     s = S * S
     e, f, w = (modulus.p + modulus.q) * s, (modulus.p * modulus.q) * (s * s), mu * s
@@ -195,31 +157,18 @@ def third_kind_integral_series(S: Scalar, modulus: Modulus, mu: Scalar) -> Scala
 
 
 def elliptic_functions(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Elliptic:
-    """Return the elliptic functions S, C, D of a free body at the time u, and the phase `ξ = κ ∫₀ᵘ
-    S²/(1 + μS²) du`, an angle.
-
-    - `u`: a reduced time: |u| is at most a quarter period.
-    - `modulus`: the parameters p and q of S, C and D: S solves dS/du = CD with S(0) = 0, where
-      C² = 1 − pS² and D² = 1 − qS².
-    - `mu`: the number μ, between 0 and √(pq).
-    - `phase_factor`: the constant factor κ.
-
-    The function `closed_form_constants` computes `modulus`, `mu` and `phase_factor` for a body.
+    """Return the elliptic functions and the phase at the time u, where |u| is at most a quarter
+    period and 0 ≤ μ ≤ √(pq).
     """
     n = iteration_limits(u.dtype).doublings
-    f = elliptic_taylor_series(u * 2.0**-n, modulus, mu, phase_factor)
+    f = elliptic_series(u * 2.0**-n, modulus, mu, phase_factor)
     # Double the time in a loop: it compiles eight times sooner than nine doublings written out.
-    return jax.lax.fori_loop(
-        0, n, lambda _, g: elliptic_functions_at_double_time(g, modulus, mu, phase_factor), f
-    )
+    return jax.lax.fori_loop(0, n, lambda _, g: doubled(g, modulus, mu, phase_factor), f)
 
 
 class HalfPeriod(NamedTuple):
-    """Hold the duration of half a period of the elliptic function S of a free motion, the phase ξ
-    at its end, and the mean of S² over it.
-
-    S solves (dS/du)² = (1 − pS²)(1 − qS²) with S(0) = 0, and ξ is the angle κ ∫ S²/(1 + μS²) du
-    from 0, for four numbers p, q, μ and κ of the motion.
+    """Hold the duration of half a period of the elliptic function S, the phase ξ at its end, and
+    the mean of S² over it.
     """
 
     time: Scalar  # the least time T > 0 with S(T) = 0; infinite on the separatrix
@@ -228,12 +177,7 @@ class HalfPeriod(NamedTuple):
 
 
 def half_period(modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> HalfPeriod:
-    """Return three numbers of half a period of the elliptic function S: the least time T > 0 with
-    S(T) = 0; the phase ξ at T; and the mean of S² from 0 to T.
-
-    - `modulus`: the parameters p and q of S, which solves (dS/du)² = (1 − pS²)(1 − qS²) with
-      S(0) = 0.
-    - `mu`, `phase_factor`: the numbers μ and κ in the phase ξ, the angle `κ ∫₀ᵘ S²/(1 + μS²) du`.
+    """Return the half period of the elliptic function S.
 
     With λ² = max(p, q), a₀ = 1 and b₀ = √|p − q|/λ, the time is `T = π/(λ agm(a₀, b₀))` (DLMF
     19.8.5), where agm is the arithmetic–geometric mean. With `c₁ = (a₀ − b₀)/2` and `c_{n+1} =
@@ -254,50 +198,27 @@ def half_period(modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> HalfPerio
     # c₁ = w/(2(a₀ + b₀)) equals (a₀ − b₀)/2, but has no difference that would lose digits.
     c = w / (2.0 * (a + b))
     ratio = w / (4.0 * (a + b) ** 2)
+    point, half, one = jnp.sqrt(1.0 + mu / big), jnp.full_like(a, 0.5), jnp.ones_like(a)
+
+    def step(_, state):
+        # After n steps a and b are the two means, c is c_{n+1} = (a − b)/2, and `ratio` is
+        # 2ⁿ c_{n+1}²/w, whose sum, with ½, is `total`. `point` and `part` are p_n and Q_n of DLMF
+        # 19.8.7–19.8.9.
+        a, b, c, ratio, total, point, part, sum_parts = state
+        square, product = point * point, a * b
+        part = 0.5 * part * (square - product) / (square + product)
+        a, b = 0.5 * (a + b), jnp.sqrt(product)
+        narrow = c / (2.0 * (a + b))
+        ratios = c * narrow, 2.0 * ratio * narrow * narrow, total + ratio
+        return a, b, *ratios, 0.5 * (square + product) / point, part, sum_parts + part
+
     # Use a loop: the eleven steps of the arithmetic–geometric mean, written out, would take as long
     # to compile as the rest of the free motion.
-    point, half, one = jnp.sqrt(1.0 + mu / big), jnp.full_like(a, 0.5), jnp.ones_like(a)
     start = (a, b, c, ratio, half, point, one, one)
-    a, *_, total, _, _, sum_parts = jax.lax.fori_loop(
-        0, iteration_limits(a.dtype).agm, _arithmetic_geometric_mean_step, start
-    )
+    steps = iteration_limits(a.dtype).agm
+    a, *_, total, _, _, sum_parts = jax.lax.fori_loop(0, steps, step, start)
     time = math.pi / (a * jnp.sqrt(big))
     # The phase ξ = κ ∫ S²/(1 + μS²) du over half a period T is ½ κ T Σ/(λ² + μ), where Σ is
     # `sum_parts`, κ is `phase_factor` and λ² = max(p, q) (DLMF 19.8.7 with α² = −μ/λ²).
     phase = phase_factor * time * 0.5 / (big + mu) * sum_parts
     return HalfPeriod(jnp.where(endless, jnp.inf, time), phase, total / big)
-
-
-def _arithmetic_geometric_mean_step(_: Array, state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-    """Return the eight numbers of the arithmetic–geometric mean, and of two sums over its steps,
-    after one more step.
-
-    Write n for the number of steps so far, p and q for the parameters of the elliptic function S,
-    which solves (dS/du)² = (1 − pS²)(1 − qS²) with S(0) = 0, and λ² for max(p, q). The first
-    argument is the number of the step as the loop counts it, and is not used. The second is the
-    `state`, with eight numbers:
-
-    - `a`, `b`: the arithmetic mean a_n and the geometric mean b_n.
-    - `c`: c_{n+1} = (a_n − b_n)/2, half the difference of the two means.
-    - `ratio`: 2ⁿ c_{n+1}²/w, where w = min(p, q)/λ².
-    - `total`: ½ plus the sum of all earlier values of `ratio`. At the end, `total`/λ² is the mean
-      of S² over half a period.
-    - `point`, `part`, `sum_parts`: the numbers called p_n and Q_n in DLMF 19.8.7–19.8.9, and the
-      sum of all Q_n so far. At the end, `sum_parts` is proportional to the integral ∫ S²/(1 + μS²)
-      du over half a period, with a number μ of the motion.
-    """
-    a, b, c, ratio, total, point, part, sum_parts = state
-    square, product = point * point, a * b
-    part = 0.5 * part * (square - product) / (square + product)
-    a, b = 0.5 * (a + b), jnp.sqrt(product)
-    narrow = c / (2.0 * (a + b))
-    return (
-        a,
-        b,
-        c * narrow,
-        2.0 * ratio * narrow * narrow,
-        total + ratio,
-        0.5 * (square + product) / point,
-        part,
-        sum_parts + part,
-    )

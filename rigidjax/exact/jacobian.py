@@ -26,30 +26,36 @@ from rigidjax.exact.components3 import SymmetricEntries, Triple
 from rigidjax.exact.jacobi_duplication import (
     Elliptic,
     Modulus,
-    elliptic_functions_at_double_time,
-    elliptic_taylor_series,
+    doubled,
+    elliptic_series,
     iteration_limits,
-    third_kind_integral_series,
+    third_kind_series,
 )
-from rigidjax.exact.sigma_form import Differences, motion_invariants
+from rigidjax.exact.sigma_form import Differences, invariants
 
 
 class Integrals(NamedTuple):
-    """Hold the elliptic functions of a free body at some time u, and two integrals over the time
-    from 0 to u.
-
-    - `f`: the functions S, C and D, with C² = 1 − pS² and D² = 1 − qS² for two numbers p and q of
-      the motion, and their phase.
-    - `y2`: the integral Y₂ = ∫ S² du.
-    - `y`: the integral Y = ∫ S²/E² du, where E is D if p > q, else C: this function has no zero.
+    """Hold the elliptic functions of a free body at some time u, and the integrals over the time
+    from 0 to u that the head of this module names.
     """
 
     f: Elliptic
-    y2: Scalar
-    y: Scalar
+    y2: Scalar  # Y₂ = ∫ S² du
+    y: Scalar  # Y = ∫ S²/E² du
 
 
-def momentum_jacobian_and_integral(
+class MomentumParts(NamedTuple):
+    """Hold the derivatives of Π(t) − Π(0) with respect to the variables of `ten_variables`,
+    one array for each component, and the matrix G = ∫ Π Πᵀ dt from 0 to t.
+
+    All derivatives of a free motion follow from them.
+    """
+
+    rows: tuple[Float[Array, "10"], ...]
+    integral: SymmetricEntries
+
+
+def momentum_jacobian(
     inverse_inertia: Differences,
     momentum: Triple,
     t: Scalar,
@@ -57,34 +63,22 @@ def momentum_jacobian_and_integral(
     halves: Scalar,
     duration_of_halves: Scalar,
     mean_of_s_squared: Scalar,
-) -> tuple[tuple[Float[Array, "10"], ...], SymmetricEntries]:
-    """Return two things: the derivatives of Π(t) − Π(0) with respect to ten variables, as three
-    arrays (10,), one for each component of the body momentum Π; and the six entries of the matrix G
-    = ∫ Π Πᵀ dt from 0 to t.
+) -> MomentumParts:
+    """Return the derivatives of the momentum and the matrix G.
 
-    The ten variables are d12, d23, k12, k13, k23, the three components of Π(0), k33 and t, where
-    kij are the entries of K = I⁻¹ (the inverse of the inertia tensor) and dij = kii − kjj.
-
-    - `inverse_inertia`: the differences dij, and the off-diagonal entries kij, which must be zero.
-    - `momentum`: the three components of Π(0).
-    - `t`: the time.
-    - `half_time_integrals`: the elliptic functions and integrals at the reduced half time, which is
-      t/2 less a whole number of half periods. C² = 1 − pS² and D² = 1 − qS² hold with the p and q
-      that `sigma_form.motion_invariants` gives for the axes in the order of `inverse_inertia`.
-    - `halves`: the number of half periods that were subtracted from t/2.
-    - `duration_of_halves`: the duration of 2 × `halves` half periods, by which the whole time t was
-      thus reduced.
-    - `mean_of_s_squared`: the mean of S² over a period, where S is the first elliptic function.
+    - `inverse_inertia`: with off-diagonal entries that are zero.
+    - `half_time_integrals`: at t/2 less the whole number `halves` of half periods, with the p and q
+      of `sigma_form.invariants` for the axes in the order of `inverse_inertia`.
+    - `duration_of_halves`: the duration of 2 × `halves` half periods.
+    - `mean_of_s_squared`: the mean of S² over a period.
     """
     d12, d13, d23 = inverse_inertia[:3]
     p1, p2, p3 = momentum
-    _, A1, A2, A3, q, p, gap, *_ = motion_invariants(inverse_inertia, momentum)
+    _, A1, A2, A3, q, p, gap, *_ = invariants(inverse_inertia, momentum)
     m = Modulus(p, q, gap)
     three = gap > 0
     top = jnp.where(three, p, q)
-    after = functions_and_integrals_at_double_time(
-        half_time_integrals, m, jnp.zeros_like(t), jnp.zeros_like(t)
-    )
+    after = doubled_integrals(half_time_integrals, m, jnp.zeros_like(t), jnp.zeros_like(t))
     S, C, D, *_ = after.f
     grown2 = after.y2 + duration_of_halves * mean_of_s_squared
     grown = after.y + duration_of_halves * (1.0 - top * mean_of_s_squared) / jnp.where(
@@ -95,11 +89,8 @@ def momentum_jacobian_and_integral(
     # function of the inverse inertia K. If the entry k12 of K changes, the entry 12 of T changes by
     # t12 times this change; t13 and t23 are the factors for the entries 13 and 23. Each factor is a
     # divided difference of two diagonal entries of T.
-    s = half_time_integrals.f.S * half_time_integrals.f.S
-    cc, dd = (
-        half_time_integrals.f.C * half_time_integrals.f.C,
-        half_time_integrals.f.D * half_time_integrals.f.D,
-    )
+    f = half_time_integrals.f
+    s, cc, dd = f.S * f.S, f.C * f.C, f.D * f.D
     g = 2.0 * s / (cc + p * s * dd)
     t12, t13, t23 = -g * cc * A3, g * A2, g * dd * A1
 
@@ -174,51 +165,36 @@ def momentum_jacobian_and_integral(
     g12 = (p1 * p2 * S * C + h * (p1 * u2 + p2 * u1) + 0.5 * p3 * d12 * t12 * t12) * rw
     g13 = (p1 * p3 * S + h * (p1 * u3 + p3 * u1) - 0.5 * p2 * d13 * t13 * t13) * rw
     g23 = (p2 * p3 * S * D + h * (p2 * u3 + p3 * u2) + 0.5 * p1 * d23 * t23 * t23) * rw
-    return rows, (g11, g22, g33, g12, g13, g23)
+    return MomentumParts(rows, (g11, g22, g33, g12, g13, g23))
 
 
-def elliptic_functions_and_integrals(
-    u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar
-) -> Integrals:
-    """Return the elliptic functions S, C, D of a free body and their phase ξ at the time u, and the
-    integrals of S² and of S²/E² from 0 to u. Here E is D if p > q, else C: this function has no
-    zero.
-
-    - `u`: a reduced time: |u| is at most a quarter period.
-    - `modulus`: the parameters p and q of S, C and D: S solves dS/du = CD with S(0) = 0, where C² =
-      1 − pS² and D² = 1 − qS².
-    - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
+def elliptic_integrals(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Integrals:
+    """Return the elliptic functions, their phase and the integrals at the time u, where |u| is at
+    most a quarter period.
     """
     n = iteration_limits(u.dtype).doublings
-    f = elliptic_taylor_series(u * 2.0**-n, modulus, mu, phase_factor)
+    f = elliptic_series(u * 2.0**-n, modulus, mu, phase_factor)
     # The integrand S²/D² is S²/(1 + μS²) with μ = −q, and S²/C² is the same with μ = −p: one series
     # serves for both.
     low = jnp.where(modulus.gap > 0, -modulus.q, -modulus.p)
     first = Integrals(
         f,
-        third_kind_integral_series(f.S, modulus, jnp.zeros_like(u)),
-        third_kind_integral_series(f.S, modulus, low),
+        third_kind_series(f.S, modulus, jnp.zeros_like(u)),
+        third_kind_series(f.S, modulus, low),
     )
     return jax.lax.fori_loop(
         0,
         n,
-        lambda _, g: functions_and_integrals_at_double_time(g, modulus, mu, phase_factor),
+        lambda _, g: doubled_integrals(g, modulus, mu, phase_factor),
         first,
     )
 
 
-def functions_and_integrals_at_double_time(
+def doubled_integrals(
     start: Integrals, modulus: Modulus, mu: Scalar, phase_factor: Scalar
 ) -> Integrals:
-    """Return the elliptic functions S, C, D of a free body and the integrals of S² and of S²/E²
-    from 0 to 2u, from the functions and integrals at the time u. Here E is D if p > q, else C, with
-    C² = 1 − pS² and D² = 1 − qS².
-
-    - `start`: the functions and integrals at the time u.
-    - `modulus`: the parameters p and q of the elliptic functions.
-    - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
-    """
+    """Return the elliptic functions and integrals at the time 2u from those at the time u."""
     f, three = start.f, modulus.gap > 0
-    after = elliptic_functions_at_double_time(f, modulus, mu, phase_factor)
+    after = doubled(f, modulus, mu, phase_factor)
     a, b = f.S / jnp.where(three, f.D, f.C), after.S / jnp.where(three, after.D, after.C)
     return Integrals(after, 2.0 * start.y2 + f.S * f.S * after.S, 2.0 * start.y + a * a * b)

@@ -10,12 +10,12 @@ from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, Vec3, Vec3Like
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
-from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
+from rigidjax.body.scaling import binary_exponent, times_power_of_two
 from rigidjax.exact import sigma_form
 from rigidjax.exact.components3 import HALF, SymmetricEntries, Triple, matvec
-from rigidjax.exact.derivatives import inverse_inertia_and_energy, motion_and_derivatives
+from rigidjax.exact.derivatives import inverted, motion_and_derivatives
 from rigidjax.exact.jacobi_duplication import Modulus, half_period, is_aperiodic
-from rigidjax.exact.principal_axes import components_along, principal_tensor_and_axes
+from rigidjax.exact.principal_axes import components_along, principal_axes
 
 
 def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
@@ -45,7 +45,7 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> bool(abs(body_period(top, jnp.array([1.0, 0.5, 0.0])) - 4 * jnp.pi) < 1e-14)
     True
     """
-    return _body_and_precession_periods(*_checked_tensor_and_rate(inertia, omega0))[0]
+    return _checked_periods(inertia, omega0)[0]
 
 
 def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
@@ -71,42 +71,27 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> precession_period(top, jnp.array([1.0, 0.5, 0.0]))  # 2π I₂/|L|
     Array(8.88576588, dtype=float64)
     """
-    return _body_and_precession_periods(*_checked_tensor_and_rate(inertia, omega0))[1]
+    return _checked_periods(inertia, omega0)[1]
 
 
-def _checked_tensor_and_rate(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
-    """Return two things after checks of both: the inertia tensor (3, 3), kg m²; and the body rate
-    (3,), rad/s, in the dtype of the tensor.
-
-    - `inertia`: the `Inertia` of one body.
-    - `omega0`: (3,) the body rate, rad/s.
-
-    A `ValueError` or `TypeError` is raised for a wrong shape or dtype, or for a principal moment
-    that is zero and not traced by JAX.
-    """
+def _checked_periods(inertia: Inertia, omega0: Vec3Like) -> tuple[Scalar, Scalar]:
+    """Return the body period and the precession period after checks of the arguments."""
     _checks.require_unbatched_instance(
         inertia, Inertia, "inertia", hint="of MassProperties pass .inertia"
     )
     tensor = validation.require_physical_body(inertia, inertia.tensor, None, throw=False).tensor
-    return tensor, _checks.array_of_shape(omega0, (3,), "omega0").astype(tensor.dtype)
+    rate = _checks.array_of_shape(omega0, (3,), "omega0").astype(tensor.dtype)
+    return _periods(tensor, rate)
 
 
 @jax.jit
-def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
-    """Return two times, s, of a free body, both computed in one program: the period of the body
-    rate; and the mean period in which a principal axis of the body turns about the momentum. This
-    axis is the one that the momentum circles in the body frame.
-
-    - `tensor`: (3, 3) the inertia tensor, kg m².
-    - `omega`: (3,) the body rate at any moment, rad/s.
-    """
-    exponent = largest_binary_exponent(omega)
-    moments, axes = principal_tensor_and_axes(
-        times_power_of_two(tensor, -largest_binary_exponent(tensor))
-    )
+def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
+    """Return the body period and the precession period, s, from one program."""
+    exponent = binary_exponent(omega)
+    moments, axes = principal_axes(times_power_of_two(tensor, -binary_exponent(tensor)))
     momentum = matvec(moments, components_along(axes, times_power_of_two(omega, -exponent)))
-    body, _, _ = inverse_inertia_and_energy(moments, momentum)
-    v = sigma_form.motion_invariants(body, momentum)
+    body, _, _ = inverted(moments, momentum)
+    v = sigma_form.invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
     endless = is_aperiodic(jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap)))
     # If the motion has no period, compute the period of another motion, whose result is discarded
@@ -117,8 +102,8 @@ def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Sca
     safe_moments, safe_momentum = jax.tree.map(
         lambda a, b: jnp.where(endless, a, b), other, (moments, momentum)
     )
-    body, _, _ = inverse_inertia_and_energy(safe_moments, safe_momentum)
-    period = sigma_form.momentum_period(sigma_form.motion_invariants(body, safe_momentum))
+    body, _, _ = inverted(safe_moments, safe_momentum)
+    period = sigma_form.momentum_period(sigma_form.invariants(body, safe_momentum))
     angle = _precession_angle(safe_moments, safe_momentum, period)
     still = h == 0
     middle = 2.0 * math.pi * moments[1] / jnp.where(still, 1.0, h)
@@ -129,15 +114,11 @@ def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Sca
 
 @jax.custom_jvp
 def _precession_angle(inertia: SymmetricEntries, momentum: Triple, period: Scalar) -> Scalar:
-    """Return the angle, rad, by which a principal axis of a free body turns about the momentum in
-    one period of the body rate. The axis is the one that the momentum circles in the body frame.
-
-    - `inertia`: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes.
-    - `momentum`: the three components of the body momentum.
-    - `period`: the period of the body rate, s.
+    """Return the angle, rad, by which the axis that the momentum circles turns about the momentum
+    in one `period` of the body rate.
     """
-    body, k, _ = inverse_inertia_and_energy(inertia, momentum)
-    v = sigma_form.motion_invariants(body, momentum)
+    body, k, _ = inverted(inertia, momentum)
+    v = sigma_form.invariants(body, momentum)
     about_three, h = v.a2 > 0, jnp.sqrt(v.h2)
     mu = jnp.where(about_three, body.d23 * v.a3, body.d12 * v.a1)
     rate = jnp.where(about_three, -body.d13, body.d13) * h * mu
@@ -151,19 +132,10 @@ def _precession_angle_jvp(
     primals: tuple[SymmetricEntries, Triple, Scalar],
     tangents: tuple[PyTree, ...],
 ) -> tuple[Scalar, Scalar]:
-    """Return the angle, rad, by which a principal axis of a free body turns about the momentum in
-    one period of the body rate, and the change of this angle for a change of the inputs. By this
-    rule JAX differentiates `_precession_angle`.
-
-    - `primals`: the three inputs: the six entries of the inertia tensor in principal axes, the
-      three components of the body momentum, and the period, s.
-    - `tangents`: the changes of these three inputs, in the same form.
-    """
+    """Return the angle and its tangent, by the formula for Π·θ in the head of `derivatives`."""
     moments, momentum, period = primals
-    (_, _, energy2), (_, d_k, d_energy2) = jax.jvp(
-        inverse_inertia_and_energy, (moments, momentum), tangents[:2]
-    )
-    g = _momentum_integral_of_period(moments, momentum, period)
+    (_, _, energy2), (_, d_k, d_energy2) = jax.jvp(inverted, (moments, momentum), tangents[:2])
+    g = _period_integral(moments, momentum, period)
     along = 0.5 * period * d_energy2 + energy2 * tangents[2]
     along = along + sum(w * a * b for w, a, b in zip(HALF, g, d_k, strict=True))
     h = jnp.sqrt(sum(p * p for p in momentum))
@@ -171,51 +143,35 @@ def _precession_angle_jvp(
 
 
 @jax.custom_jvp
-def _momentum_integral_of_period(
+def _period_integral(
     inertia: SymmetricEntries, momentum: Triple, period: Scalar
 ) -> SymmetricEntries:
-    """Return the six entries (11, 22, 33, 12, 13, 23) of the matrix G = ∫ Π Πᵀ dt over one period
-    of the body rate of a free body, where Π is the body momentum in principal axes.
+    """Return G = ∫ Π Πᵀ dt over one `period` of the body rate, in principal axes.
 
-    - `inertia`: the six entries of the inertia tensor in principal axes.
-    - `momentum`: the three components of the body momentum.
-    - `period`: the period of the body rate, s.
-
-    Over a whole period the integral of the product of two different components is zero. The squares
-    of the three components have the means `A₃(1 − p⟨S²⟩)/d₁₃`, `A₁A₃⟨S²⟩` and `A₁(1 − q⟨S²⟩)/d₁₃`,
-    with the numbers A₁, A₃, p and q of `sigma_form.motion_invariants`, d₁₃ = 1/I₁ − 1/I₃, and the
-    mean ⟨S²⟩ of `half_period`.
+    The integral of the product of two different components is zero. The squares of the components
+    have the means `A₃(1 − p⟨S²⟩)/d₁₃`, `A₁A₃⟨S²⟩` and `A₁(1 − q⟨S²⟩)/d₁₃`, with the numbers of
+    `sigma_form.invariants`, and ⟨S²⟩ of `half_period`.
     """
-    body, _, _ = inverse_inertia_and_energy(inertia, momentum)
-    v = sigma_form.motion_invariants(body, momentum)
+    body, _, _ = inverted(inertia, momentum)
+    v = sigma_form.invariants(body, momentum)
     mean = half_period(Modulus(v.p, v.q, v.gap), jnp.zeros_like(period), period).mean
     zero = jnp.zeros_like(period)
-    return (
-        period * v.a3 * (1.0 - v.p * mean) / body.d13,
-        period * v.a1 * v.a3 * mean,
-        period * v.a1 * (1.0 - v.q * mean) / body.d13,
-        zero,
-        zero,
-        zero,
-    )
+    g11 = period * v.a3 * (1.0 - v.p * mean) / body.d13
+    g33 = period * v.a1 * (1.0 - v.q * mean) / body.d13
+    return g11, period * v.a1 * v.a3 * mean, g33, zero, zero, zero
 
 
-@_momentum_integral_of_period.defjvp
-def _momentum_integral_of_period_jvp(
+@_period_integral.defjvp
+def _period_integral_jvp(
     primals: tuple[SymmetricEntries, Triple, Scalar],
     tangents: tuple[PyTree, ...],
 ) -> tuple[SymmetricEntries, SymmetricEntries]:
-    """Return two things: the six entries of the matrix G = ∫ Π Πᵀ dt over one period of the body
-    rate, where Π is the body momentum; and the changes of these entries for a change of the inputs.
-    By this rule JAX takes second derivatives of a period.
+    """Return G over one period and its tangent.
 
-    - `primals`: the six entries of the inertia tensor in principal axes, the three components of
-      the body momentum, and the period, s.
-    - `tangents`: the changes of these three inputs, in the same form.
-
-    The closed form holds for a diagonal inertia tensor alone. The change is therefore taken from
-    the integral of Π Πᵀ from 0 to a time t, whose derivative is known for the whole tensor. The
-    program of this change takes seconds to compile, and first derivatives do not need it.
+    The closed form holds for a diagonal tensor alone. The tangent is therefore that of the integral
+    from 0 to a time t, which is known for the whole tensor. Its program takes seconds to compile,
+    and first derivatives do not need it.
     """
-    change = jax.jvp(lambda *at: motion_and_derivatives(*at)[2][1], primals, tangents)[1]
-    return _momentum_integral_of_period(*primals), change
+    of_time = lambda *at: motion_and_derivatives(*at).parts.integral  # noqa: E731
+    change = jax.jvp(of_time, primals, tangents)[1]
+    return _period_integral(*primals), change

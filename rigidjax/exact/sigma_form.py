@@ -52,7 +52,7 @@ from rigidjax.exact.components3 import (
 )
 from rigidjax.exact.jacobi_duplication import (
     Modulus,
-    clip_time_on_separatrix,
+    clip_time,
     is_aperiodic,
     iteration_limits,
 )
@@ -60,11 +60,8 @@ from rigidjax.rotation.barrier import barrier
 
 
 class Differences(NamedTuple):
-    """Hold the symmetric matrix K = I⁻¹ (the inverse of an inertia tensor, 1/(kg m²)) up to a
-    multiple of the unit matrix.
-
-    The numbers d12, d13 and d23 are the differences dij = kii − kjj of the diagonal entries kii,
-    and k12, k13 and k23 are the off-diagonal entries.
+    """Hold K = I⁻¹, the inverse of an inertia tensor in principal axes, 1/(kg m²), up to a multiple
+    of the unit matrix: the differences dij = kii − kjj and the off-diagonal entries.
     """
 
     d12: Scalar
@@ -77,63 +74,44 @@ class Differences(NamedTuple):
 
 class Invariants(NamedTuple):
     """Hold the constants of a free motion from which its sigma functions are computed: the entries
-    of the matrix E − E₂₂ 1, where 1 is the unit matrix, and the numbers from which these entries
-    follow.
-
-    Here E = E₂ K + |Π|² adj(K), with the inverse K of the inertia tensor, the body momentum Π and
-    E₂ = Π·KΠ, which is twice the energy; E₂₂ is the middle diagonal entry of E.
-
-    - `h2`: |Π|².
-    - `a1`, `a2`, `a3`: k₁₁h² − E₂, k₂₂h² − E₂ and E₂ − k₃₃h², where h = |Π| and kᵢᵢ are the
-      diagonal entries of K.
-    - `q`, `p`: the entries 11 and 33 of E − E₂₂ 1.
-    - `gap`: p − q, computed without a subtraction of q from p.
-    - `e12`, `e13`, `e23`: the off-diagonal entries of E.
+    of the matrix E − E₂₂ 1, and the numbers from which these follow.
     """
 
-    h2: Scalar
-    a1: Scalar
-    a2: Scalar
-    a3: Scalar
-    q: Scalar
-    p: Scalar
-    gap: Scalar
+    h2: Scalar  # h² = |Π|²
+    a1: Scalar  # k₁₁h² − E₂
+    a2: Scalar  # k₂₂h² − E₂
+    a3: Scalar  # E₂ − k₃₃h²
+    q: Scalar  # the entry 11 of E − E₂₂ 1
+    p: Scalar  # the entry 33
+    gap: Scalar  # p − q, computed without a subtraction of q from p
     e12: Scalar
     e13: Scalar
     e23: Scalar
 
 
 class Sigma(NamedTuple):
-    """Hold Weierstrass's four sigma functions of a free motion at some time u: one is the number σ,
-    and the other three are the eigenvalues of a symmetric matrix T.
-
-    σ and T satisfy T² = w 1 − σ² E, with a number w and the unit matrix 1. Here E = E₂ K + |Π|²
-    adj(K), with the inverse K of the inertia tensor, the body momentum Π and E₂ = Π·KΠ. Each matrix
-    in this class is symmetric and is the tuple of its entries (11, 22, 33, 12, 13, 23).
-
-    - `s`: the number σ. A factor common to σ and T is free; it is chosen so that T₂₂ = 1.
-    - `t`: the matrix T.
-    - `adjugate`, `det`: the adjugate and the determinant of T.
-    - `y`: the matrix Y = ∫₀ᵘ σ² T⁻² du.
+    """Hold Weierstrass's four sigma functions of a free motion at some time u, the number σ and the
+    eigenvalues of the matrix T, each matrix as its entries (11, 22, 33, 12, 13, 23).
     """
 
-    s: Scalar
-    t: SymmetricEntries
-    adjugate: SymmetricEntries
-    det: Scalar
-    y: SymmetricEntries
+    s: Scalar  # σ; the factor common to σ and T is chosen so that T₂₂ = 1
+    t: SymmetricEntries  # T
+    adjugate: SymmetricEntries  # of T
+    det: Scalar  # of T
+    y: SymmetricEntries  # Y = ∫₀ᵘ σ² T⁻² du
 
 
-def motion_invariants(inverse_inertia: Differences, momentum: Triple) -> Invariants:
-    """Return the constants of a free motion from which its sigma functions are computed.
-
-    They are the entries of the matrix E − E₂₂ 1, where 1 is the unit matrix, and the numbers from
-    which these entries follow. Here E = E₂ K + |Π|² adj(K), and E₂ = Π·KΠ is twice the energy.
-
-    - `inverse_inertia`: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
-      inertia tensor.
-    - `momentum`: the three components of the body momentum Π(0).
+class MomentumAndIntegral(NamedTuple):
+    """Hold the body momentum Π after some time, and the matrix G = ∫ Π Πᵀ dt over it (or one term
+    of G).
     """
+
+    momentum: Triple
+    integral: SymmetricEntries
+
+
+def invariants(inverse_inertia: Differences, momentum: Triple) -> Invariants:
+    """Return the constants of a free motion from K and the initial momentum."""
     d12, d13, d23, k12, k13, k23 = inverse_inertia
     p1, p2, p3 = momentum
     x1, x2, x3 = p1 * p1, p2 * p2, p3 * p3
@@ -160,58 +138,39 @@ def motion_invariants(inverse_inertia: Differences, momentum: Triple) -> Invaria
 
 
 # The time is halved, and later doubled, this many times more often than `iteration_limits` says: at
-# so short a time two terms of the series in `sigma_by_taylor_series` are enough.
+# so short a time two terms of the series in `sigma_series` are enough.
 _MORE = 10
 
 
-def sigma_by_taylor_series(u: Scalar, constants: Invariants) -> Sigma:
-    """Return the sigma functions of a free motion (a number σ, and a matrix T whose eigenvalues are
-    the other three functions) at a tiny time, from their Taylor series.
+def sigma_series(u: Scalar, constants: Invariants) -> Sigma:
+    """Return the sigma functions at a time u so short that two terms of their Taylor series are
+    exact to round-off.
 
-    - `u`: the time, so small that two terms of the series are exact to round-off.
-    - `constants`: the invariants of the motion, which contain the matrix E = E₂ K + |Π|² adj(K),
-      with the inverse K of the inertia tensor, the body momentum Π and E₂ = Π·KΠ.
-
-    The matrix T = √(1 − X) is taken from its series to second order in the matrix X = σ² (E − E₂₂
-    1), where 1 is the unit matrix and E₂₂ the middle diagonal entry of E.
+    The matrix T = √(1 − X) is taken to second order in the matrix X = σ² (E − E₂₂ 1).
     """
     uu, zero = u * u, jnp.zeros_like(u)
     c1 = (constants.p + constants.q) * uu
     s = barrier(u * (1.0 - c1 / 6))
     x = barrier(
-        _scaled_matrix(
+        _scaled(
             (constants.q, zero, constants.p, constants.e12, constants.e13, constants.e23), s * s
         )
     )
     t = tuple(-0.5 * (a + 0.25 * b) for a, b in zip(x, commuting_product(x, x), strict=True))
     # The integral Y of σ² T⁻² from 0 to u is ⅓u³ (1 − c₁/5 + 3X/5) to the fifth power of u, where
     # `c1` is c₁ = (p + q) u², and `x` is the matrix X of the docstring.
-    y = _scaled_matrix(_add_to_diagonal(_scaled_matrix(x, 0.6), 1.0 - 0.2 * c1), u * uu / 3)
-    return _normalised_sigma(s, _add_to_diagonal(t, 1.0), y)
+    y = _scaled(_shifted(_scaled(x, 0.6), 1.0 - 0.2 * c1), u * uu / 3)
+    return _normalised(s, _shifted(t, 1.0), y)
 
 
-def sigma_at_double_time(sigma: Sigma, constants: Invariants) -> Sigma:
-    """Return the sigma functions of a free motion (a number σ, and a matrix T whose eigenvalues are
-    the other three functions) at the time 2u, from their values at the time u.
-
-    - `sigma`: the values at the time u.
-    - `constants`: the invariants of the motion.
-
-    The formulas are T(2u) = T⁴ − σ⁴ χ'(E) and σ(2u) = 2 σ det T, where χ' is the derivative of the
-    characteristic polynomial χ of the matrix E = E₂ K + |Π|² adj(K), with the inverse K of the
-    inertia tensor, the body momentum Π and E₂ = Π·KΠ.
+def doubled_sigma(sigma: Sigma, constants: Invariants) -> Sigma:
+    """Return the sigma functions at the time 2u from those at the time u, by T(2u) = T⁴ − σ⁴ χ'(E)
+    and σ(2u) = 2 σ det T.
     """
     t1, t2, t3, t12, t13, t23 = sigma.t
     s = sigma.s
     ss = s * s
-    q, p, gap, e12, e13, e23 = (
-        constants.q,
-        constants.p,
-        constants.gap,
-        constants.e12,
-        constants.e13,
-        constants.e23,
-    )
+    *_, q, p, gap, e12, e13, e23 = constants
     s12, s13, s23 = t12 * t12, t13 * t13, t23 * t23
     # By T² = w 1 − σ²E, the off-diagonal entries of M = T² are exactly those of −σ²E.
     m11, m22, m33 = t1 * t1 + s12 + s13, t2 * t2 + s12 + s23, t3 * t3 + s13 + s23
@@ -237,26 +196,24 @@ def sigma_at_double_time(sigma: Sigma, constants: Invariants) -> Sigma:
     n12 = 2.0 * (m12 * m33 - m13 * m23)
     n13 = 2.0 * (m13 * m22 - m12 * m23)
     n23 = 2.0 * (m23 * m11 - m12 * m13)
-    after = _normalised_sigma(2.0 * s * sigma.det, (n11, n22, n33, n12, n13, n23), sigma.y)
+    after = _normalised(2.0 * s * sigma.det, (n11, n22, n33, n12, n13, n23), sigma.y)
     # The integral Y = ∫₀ᵘ σ² T⁻² du at the double time is Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u).
-    before = barrier(_scaled_matrix(sigma.adjugate, s / sigma.det))
+    before = barrier(_scaled(sigma.adjugate, s / sigma.det))
     more = commuting_product(
         barrier(commuting_product(before, before)),
-        _scaled_matrix(after.adjugate, after.s / after.det),
+        _scaled(after.adjugate, after.s / after.det),
     )
     return after._replace(y=barrier(tuple(2.0 * a + b for a, b in zip(sigma.y, more, strict=True))))
 
 
 class DivisorTerms(NamedTuple):
-    """Hold the terms and factors of a number W that do not depend on the body momentum Π.
+    """Hold the terms and factors that do not depend on Π of the divisor W in the addition theorem
+    Π(t) = (adj(T) Π + σ T (Π × KΠ))/W.
 
-    The number W is the divisor in the addition theorem Π(t) = (adj(T) Π + σ T (Π × KΠ))/W. It is `W
-    = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²)`, with the sigma functions σ and T at the duration of the
-    step, the inverse K of the inertia tensor, E₂ = Π·KΠ and E = E₂ K + |Π|² adj(K). The index i is
-    1 if `first` is true, else 3: with this choice W is a sum of positive terms. The number `square`
-    is (T²)ᵢᵢ. The factor of σ² is `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13 Π₁ Π₃ + |KΠ|² − less`, where
-    K in KΠ is taken without its diagonal; d13 and k13 belong to `Differences`, and `d`, `k`,
-    `slant` and `less` to this class.
+    It is `W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²)`, where i is 1 if `first` is true, else 3: with
+    this choice W is a sum of positive terms. The number `square` is (T²)ᵢᵢ. The factor of σ² is `d
+    Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13 Π₁ Π₃ + |KΠ|² − less`, where K in KΠ is taken without its
+    diagonal.
     """
 
     first: Array
@@ -267,17 +224,10 @@ class DivisorTerms(NamedTuple):
     less: Scalar
 
 
-def momentum_divisor_terms(
+def divisor_of_step(
     inverse_inertia: Differences, constants: Invariants, sigma_of_step: Sigma
 ) -> DivisorTerms:
-    """Return the terms and factors of a number W that do not depend on the body momentum Π, where W
-    is the divisor in the addition theorem, the formula for Π after a step of time.
-
-    - `inverse_inertia`: the differences and off-diagonal entries of K, the inverse of the inertia
-      tensor.
-    - `constants`: the invariants of the motion.
-    - `sigma_of_step`: the sigma functions at the time u, where u is the duration of the step.
-    """
+    """Return the terms of W for a step whose sigma functions are given."""
     one, three = (
         (inverse_inertia.d12, inverse_inertia.d12, inverse_inertia.k12),
         (inverse_inertia.d23, -inverse_inertia.d23, -inverse_inertia.k23),
@@ -292,26 +242,17 @@ def momentum_divisor_terms(
     )
 
 
-def momentum_after_step_and_integral_term(
+def step_and_term(
     inverse_inertia: Differences,
     divisor_terms: DivisorTerms,
     sigma_of_step: Sigma,
     momentum: Triple,
-) -> tuple[Triple, SymmetricEntries]:
-    """Return two things: the body momentum after a step of time u; and the first of the two terms
-    of the integral G = ∫ Π Πᵀ dt over an interval of length 2u, as the six entries of a symmetric
-    matrix.
+) -> MomentumAndIntegral:
+    """Return the momentum after a step of time u, and the first term of the integral G over an
+    interval of length 2u, 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ with Π = `momentum`.
 
-    - `inverse_inertia`: the differences and off-diagonal entries of K, the inverse of the inertia
-      tensor.
-    - `divisor_terms`: the terms and factors of the divisor W that do not depend on Π; the momentum
-      after the step is a vector divided by W.
-    - `sigma_of_step`: the sigma functions σ and T at the time u, the duration of the step.
-    - `momentum`: the three components of the body momentum Π before the step.
-
-    The first term is 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ, with Π = `momentum`. The interval has its
-    mid point at the beginning of the step, where the momentum is Π. The head of this module gives
-    the other term.
+    The interval has its mid point at the beginning of the step. The head of this module gives the
+    other term.
     """
     p1, p2, p3 = momentum
     d12, d13, d23, k12, k13, k23 = inverse_inertia
@@ -328,35 +269,27 @@ def momentum_after_step_and_integral_term(
         d13 * (divisor_terms.k * (end * p2)) + divisor_terms.slant * (k13 * (p1 * p3))
     )
     z = z + (r1 * r1 + r2 * r2 + r3 * r3 - divisor_terms.less)
-    r, (a1, a2, a3) = (
-        barrier(1.0 / (divisor_terms.square + sigma_of_step.s * sigma_of_step.s * z)),
-        adj,
-    )
+    r = barrier(1.0 / (divisor_terms.square + sigma_of_step.s * sigma_of_step.s * z))
+    a1, a2, a3 = adj
     c = barrier(2.0 * sigma_of_step.s * r / sigma_of_step.det)
     part = tuple(c * x for x in (a1 * a1, a2 * a2, a3 * a3, a1 * a2, a1 * a3, a2 * a3))
-    return barrier(
-        (tuple((a + sigma_of_step.s * b) * r for a, b in zip(adj, turned, strict=True)), part)
-    )
+    after = tuple((a + sigma_of_step.s * b) * r for a, b in zip(adj, turned, strict=True))
+    return barrier(MomentumAndIntegral(after, part))
 
 
-def momentum_and_integral_in_four_parts(
+def four_parts(
     inverse_inertia: Differences, momentum: Triple, constants: Invariants, duration: Scalar
-) -> tuple[Triple, SymmetricEntries]:
-    """Return two things: the body momentum Π after the time `duration`; and the integral ∫ Π Πᵀ dt
-    over this time, as the six entries of a symmetric matrix.
+) -> MomentumAndIntegral:
+    """Return the momentum after a time of either sign, and G over this time, in four equal parts.
 
-    - `inverse_inertia`: the differences and off-diagonal entries of K, the inverse of the inertia
-      tensor.
-    - `momentum`: the three components of Π(0).
-    - `constants`: the invariants of the motion.
-    - `duration`: the time, of either sign.
-
-    The time is divided into four equal parts, so that the sigma functions are needed at short times
-    only: the integral needs the inverse of their matrix T, and T has no inverse at a quarter
-    period.
+    The sigma functions are thus needed at short times only: the integral needs the inverse of T,
+    and T has none at a quarter period.
     """
-    sigma, hh = sigma_functions_at(0.125 * duration, constants), constants.h2
-    terms = barrier(momentum_divisor_terms(inverse_inertia, constants, sigma))
+    u, hh = 0.125 * duration, constants.h2
+    n = iteration_limits(u.dtype).doublings + _MORE
+    sigma = sigma_series(u * 2.0**-n, constants)
+    sigma = jax.lax.fori_loop(0, n, lambda _, g: doubled_sigma(g, constants), sigma)
+    terms = barrier(divisor_of_step(inverse_inertia, constants, sigma))
     k12, k13, k23 = (hh * c for c in inverse_inertia[3:])
     b = (
         -constants.a2 * constants.a3 - k23 * k23,
@@ -372,33 +305,20 @@ def momentum_and_integral_in_four_parts(
         # a part Π is the momentum at the middle of the part: the second step, with an odd i, gives
         # the term of the integral that belongs to this part.
         point, total = state
-        point, part = momentum_after_step_and_integral_term(inverse_inertia, terms, sigma, point)
+        point, part = step_and_term(inverse_inertia, terms, sigma, point)
         odd = i % 2 == 1
-        return point, tuple(a + jnp.where(odd, c, 0.0) for a, c in zip(total, part, strict=True))
+        total = tuple(a + jnp.where(odd, c, 0.0) for a, c in zip(total, part, strict=True))
+        return MomentumAndIntegral(point, total)
 
-    return jax.lax.fori_loop(
-        0, 8, take_eighth, (momentum, _scaled_matrix(commuting_product(b, sigma.y), -8.0))
-    )
-
-
-def sigma_functions_at(u: Scalar, constants: Invariants) -> Sigma:
-    """Return the sigma functions of a free motion at the time u, from their Taylor series at the
-    time u/2ⁿ and n doublings of the time.
-
-    `constants` are the invariants of the motion.
-    """
-    n = iteration_limits(u.dtype).doublings + _MORE
-    f = sigma_by_taylor_series(u * 2.0**-n, constants)
-    return jax.lax.fori_loop(0, n, lambda _, g: sigma_at_double_time(g, constants), f)
+    first = MomentumAndIntegral(momentum, _scaled(commuting_product(b, sigma.y), -8.0))
+    return jax.lax.fori_loop(0, 8, take_eighth, first)
 
 
 def momentum_period(constants: Invariants) -> Scalar:
-    """Return the time after which the body momentum Π of a free motion repeats, from the invariants
-    of the motion.
+    """Return the time after which the body momentum of a free motion repeats.
 
-    The period is `2π/agm(√(z − x), √(z − y))`, where agm is the arithmetic–geometric mean. The
-    numbers x, y and z are the eigenvalues of the matrix E = E₂ K + |Π|² adj(K), with the inverse K
-    of the inertia tensor and E₂ = Π·KΠ; z is the largest eigenvalue.
+    The period is `2π/agm(√(z − x), √(z − y))`, where agm is the arithmetic–geometric mean, x, y and
+    z are the eigenvalues of E, and z is the largest.
 
     In value z is the largest diagonal entry of E. One step of Newton's method from this entry gives
     the derivatives of z up to third order. The other two eigenvalues, x and y, enter only through
@@ -406,11 +326,8 @@ def momentum_period(constants: Invariants) -> Scalar:
     """
     three = constants.gap > 0
     top = jnp.where(three, constants.p, constants.q)
-    off = (
-        constants.e12 * constants.e12,
-        constants.e13 * constants.e13,
-        constants.e23 * constants.e23,
-    )
+    *_, e12, e13, e23 = constants
+    off = (e12 * e12, e13 * e13, e23 * e23)
 
     def differences(z):
         # Return the differences of z and the three diagonal entries of E. If z is the largest of
@@ -426,13 +343,7 @@ def momentum_period(constants: Invariants) -> Scalar:
         return x1 * x2 + x1 * x3 + x2 * x3 - (off[0] + off[1] + off[2])
 
     x1, x2, x3 = differences(top)
-    f = (
-        x1 * x2 * x3
-        - x1 * off[2]
-        - x2 * off[1]
-        - x3 * off[0]
-        - 2.0 * constants.e12 * constants.e13 * constants.e23
-    )
+    f = x1 * x2 * x3 - x1 * off[2] - x2 * off[1] - x3 * off[0] - 2.0 * e12 * e13 * e23
     x1, x2, x3 = barrier(differences(barrier(top - f / slope(x1, x2, x3))))
     root = barrier(jnp.sqrt(slope(x1, x2, x3)))
     a, b = 0.5 * jnp.sqrt(x1 + x2 + x3 + 2.0 * root), jnp.sqrt(root)
@@ -441,18 +352,13 @@ def momentum_period(constants: Invariants) -> Scalar:
     return 2.0 * jnp.pi / a
 
 
-def momentum_and_outer_product_integral(
+def momentum_and_integral(
     inverse_inertia: Differences, momentum: Triple, t: Scalar
-) -> tuple[Triple, SymmetricEntries]:
-    """Return two things: the body momentum Π(t) of a free body; and G = ∫₀ᵗ Π Πᵀ dt, as the six
-    entries of a symmetric matrix. Both are smooth functions of the whole inertia tensor.
-
-    - `inverse_inertia`: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
-      inertia tensor.
-    - `momentum`: the three components of Π(0).
-    - `t`: the time, of either sign and any size.
+) -> MomentumAndIntegral:
+    """Return Π(t) and G at a time t of either sign and any size, both smooth functions of the whole
+    inertia tensor.
     """
-    v = barrier(motion_invariants(inverse_inertia, momentum))
+    v = barrier(invariants(inverse_inertia, momentum))
     m = jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap))
     endless = is_aperiodic(m)
     # If the motion has no period, compute the period of another motion (`tame`), whose result is
@@ -466,46 +372,31 @@ def momentum_and_outer_product_integral(
     several = count != 0
     usual = barrier(jax.tree.map(lambda a, b: jnp.where(several, a, b), v, tame))
     whole = barrier(momentum_period(usual))
-    r = 2.0 * clip_time_on_separatrix(0.5 * (t - jnp.where(several, count * whole, 0.0)), m)
+    r = 2.0 * clip_time(0.5 * (t - jnp.where(several, count * whole, 0.0)), m)
 
     # The time t is `count` whole periods and the rest r. Compute the motion over r and over one
     # whole period by the same program, in one loop, so that this program is compiled once.
     both = jax.tree.map(lambda *a: jnp.stack(a), (v, r), (usual, whole))
-    out, g = jax.lax.map(
-        lambda a: momentum_and_integral_in_four_parts(inverse_inertia, momentum, *a), both
-    )
+    out, g = jax.lax.map(lambda a: four_parts(inverse_inertia, momentum, *a), both)
     g = tuple(c[0] + jnp.where(several, count * c[1], 0.0) for c in g)
-    return tuple(p[0] for p in out), g
+    return MomentumAndIntegral(tuple(p[0] for p in out), g)
 
 
-def _normalised_sigma(
-    sigma: Scalar, t_matrix: SymmetricEntries, integral: SymmetricEntries
-) -> Sigma:
-    """Return Weierstrass's sigma functions of a free motion with a common scale: the number σ and
-    the symmetric matrix T are divided by the entry T₂₂, so that T₂₂ = 1 in value.
+def _normalised(sigma: Scalar, t_matrix: SymmetricEntries, integral: SymmetricEntries) -> Sigma:
+    """Return the sigma functions with σ and T divided by T₂₂, so that T₂₂ = 1 in value.
 
-    - `sigma`: the number σ.
-    - `t_matrix`: the six entries (11, 22, 33, 12, 13, 23) of T.
-    - `integral`: the six entries of the matrix Y = ∫ σ² T⁻² du over the time u, which the division
-      does not change.
-
-    The divisor T₂₂ is a constant in derivatives: a factor common to σ and T changes no result.
+    The divisor is a constant in derivatives: a factor common to σ and T changes no result.
     """
     factor = barrier(1.0 / jax.lax.stop_gradient(t_matrix[1]))
-    sigma, t_matrix = barrier((sigma * factor, _scaled_matrix(t_matrix, factor)))
+    sigma, t_matrix = barrier((sigma * factor, _scaled(t_matrix, factor)))
     return Sigma(sigma, t_matrix, *barrier((adjugate(t_matrix), determinant(t_matrix))), integral)
 
 
-def _scaled_matrix(matrix: SymmetricEntries, factor: Scalar | float) -> SymmetricEntries:
-    """Return the six entries of a symmetric matrix, each multiplied by the scalar `factor`."""
+def _scaled(matrix: SymmetricEntries, factor: Scalar | float) -> SymmetricEntries:
+    """Return the matrix times a number."""
     return tuple(c * factor for c in matrix)
 
 
-def _add_to_diagonal(matrix: SymmetricEntries, summand: Scalar | float) -> SymmetricEntries:
-    """Return the six entries (11, 22, 33, 12, 13, 23) of the matrix A + x 1, for a symmetric matrix
-    A, a number x and the unit matrix 1.
-
-    - `matrix`: the six entries of A, in the same order.
-    - `summand`: x, a scalar.
-    """
+def _shifted(matrix: SymmetricEntries, summand: Scalar | float) -> SymmetricEntries:
+    """Return the matrix plus `summand` times the unit matrix."""
     return (matrix[0] + summand, matrix[1] + summand, matrix[2] + summand, *matrix[3:])

@@ -102,23 +102,21 @@ class Force(AbstractScene):
             return jnp.zeros_like(state.x)
         with _checks.explain_tracing("force", self.force):
             value = self.force(t, state, None)
-        return checked_force_per_mass(value, self.force)
+        return force_per_mass(value, self.force)
 
     def conserved(self, t: ScalarLike, state: PyTree) -> dict[str, Scalar]:
         return {}
 
 
-def checked_force_per_mass(value: NumbersLike, force: object) -> Vec3:
-    """Return `value`, a value of the function `force` that a user gave, after a check that its
-    shape is (3,).
-    """
+def force_per_mass(value: NumbersLike, force: object) -> Vec3:
+    """Return the value of the user's function `force` after a check of its shape."""
     name = getattr(force, "__name__", type(force).__name__)
     return _checks.array_of_shape(value, (3,), f"force {name}", hint="force per mass, m/s²")
 
 
 def jump_times_within(*laws: object) -> Float[Array, " n"]:
-    """Return the times (n,), s, at which any of the `laws` (forces, torques, functions of time)
-    jumps or has a kink, in no particular order; they are in the attribute `jump_times` of each law.
+    """Return the times, s, at which any of the `laws` (forces, torques, functions of time) jumps or
+    has a kink, in no particular order.
 
     A scene or torque that contains other laws must have the jump times of all these laws, because
     the solver reads the `jump_times` of the outermost scene or torque only.
@@ -129,7 +127,7 @@ def jump_times_within(*laws: object) -> Float[Array, " n"]:
 
 
 def cast_like(x: Array, *values: Array) -> tuple[Array, ...]:
-    """Return `values`, constants of a scene, converted to the dtype of the state `x`, so that a
-    float32 solve stays in float32.
+    """Return `values`, constants of a scene, in the dtype of the state x, so that a float32 solve
+    stays in float32.
     """
     return tuple(value.astype(x.dtype) for value in values)

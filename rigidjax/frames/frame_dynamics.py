@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from rigidjax import _checks, _show
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia
-from rigidjax.frames.base import AbstractScene, Force, checked_force_per_mass, jump_times_within
+from rigidjax.frames.base import AbstractScene, Force, force_per_mass, jump_times_within
 from rigidjax.frames.moving import MovingFrame, fictitious_acceleration, require_frame
 from rigidjax.frames.rotation_models import Uniform
 from rigidjax.rotation import linalg3, quaternion
@@ -64,11 +64,9 @@ class InFrame(AbstractScene):
         now = self.frame.at(t)
         total = fictitious_acceleration(self.frame, now, state.x, state.v)
         if self.inside is not None:
-            total = total + checked_force_per_mass(self.inside(t, state), self.inside).astype(
-                total.dtype
-            )
+            total = total + force_per_mass(self.inside(t, state), self.inside).astype(total.dtype)
         if self.outside is not None:
-            outer = checked_force_per_mass(self.outside(t, now.to_inertial(state)), self.outside)
+            outer = force_per_mass(self.outside(t, now.to_inertial(state)), self.outside)
             total = total + now.from_inertial_axes(outer).astype(total.dtype)
         if self.potential is not None:
             total = total - jax.grad(self.potential)(state.x)

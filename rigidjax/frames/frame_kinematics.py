@@ -117,28 +117,21 @@ class Instant(eqx.Module):
 
         - `x`, `v`: the position (3,), m, and the velocity (3,), m/s, of a particle in S'
         """
-        turning = acceleration_due_to_rotation(self, x, v)
+        turning = turning_acceleration(self, x, v)
         return turning + self.translational_acceleration().astype(turning.dtype)
 
 
-def acceleration_due_to_rotation(instant: Instant, x: Vector, v: Vector) -> Vec3:
-    """Return the sum of the centrifugal, Coriolis and Euler accelerations (3,), m/s², in the axes
-    of a moving frame S'.
-
-    It does not depend on the rotation matrix of S'. In a frame whose origin is at rest it is the
-    whole fictitious acceleration.
-
-    - `instant`: the motion of S' at one time
-    - `x`, `v`: the position (3,), m, and the velocity (3,), m/s, of a particle in S'
+def turning_acceleration(instant: Instant, x: Vector, v: Vector) -> Vec3:
+    """Return the sum of the centrifugal, Coriolis and Euler accelerations, m/s², in the axes of a
+    moving frame S'; it does not depend on the rotation matrix of S'.
     """
     x, v = _checks.array_of_shape(x, (3,), "x"), _checks.array_of_shape(v, (3,), "v")
     return instant.centrifugal(x) + instant.coriolis(v) + instant.euler_acceleration(x)
 
 
 def _require_transformable(state: PyTree) -> None:
-    """Raise an error unless `state` is one state, not a batch, that can be transformed between
-    frames: a state with `x` (3,) and `v` (3,), with `q` (4,) and `omega` (3,), or with all four
-    fields.
+    """Raise an error unless `state` is one state with `x` and `v`, with `q` and `omega`, or with
+    all four.
     """
     point = hasattr(state, "x") and hasattr(state, "v")
     attitude = hasattr(state, "q") and hasattr(state, "omega")
@@ -156,8 +149,6 @@ def _require_transformable(state: PyTree) -> None:
 
 
 def _replace_fields(state: PyTree, fields: dict[str, Array]) -> PyTree:
-    """Return a copy of `state` with the new values in `fields`, which maps names of fields of the
-    state to arrays.
-    """
+    """Return a copy of `state` with new values of some fields."""
     names = list(fields)
     return eqx.tree_at(lambda s: [getattr(s, n) for n in names], state, [fields[n] for n in names])

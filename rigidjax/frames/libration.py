@@ -16,10 +16,8 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class OrbitalGravityGradient(eqx.Module):
-    """Compute the gravity-gradient torque 3n² u × I u (3,), N m, body axes (Hughes 1986, sec. 8.1).
-
-    Here n is `rate`, rad/s, the angular rate of a circular orbit; u is the unit vector away from
-    the planet, in body axes; I is the inertia of the body.
+    """Compute the gravity-gradient torque 3n² u × I u, N m, body axes, on a circular orbit with the
+    angular rate n, rad/s, where u is the unit vector away from the planet (Hughes 1986, sec. 8.1).
     """
 
     feels: ClassVar[type] = HasAttitude
@@ -77,10 +75,7 @@ def libration_integral(state: PyTree, body: _inertia.Inertia, rate: ScalarLike) 
     n = _checks.array_of_shape(rate, (), "rate").astype(state.q.dtype)
     up, normal = (quaternion.rotate_inverse(state.q, axes[i]) for i in (0, 2))
 
-    def inertia_quadratic_form(y: Vec3) -> Scalar:
+    def form(y: Vec3) -> Scalar:
         return linalg3.dot(y, _inertia.apply(body.tensor, y))
 
-    return 0.5 * (
-        inertia_quadratic_form(state.omega)
-        + n * n * (3 * inertia_quadratic_form(up) - inertia_quadratic_form(normal))
-    )
+    return 0.5 * (form(state.omega) + n * n * (3 * form(up) - form(normal)))

@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 from rigidjax import _checks, _show
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.frames import rotation_models
-from rigidjax.frames.frame_kinematics import Instant, acceleration_due_to_rotation
+from rigidjax.frames.frame_kinematics import Instant, turning_acceleration
 from rigidjax.frames.point import require_point
 from rigidjax.rotation import linalg3
 
@@ -64,14 +64,14 @@ class MovingFrame(eqx.Module):
             _checks.require_function(origin, "origin", "of time to (3,)", hint=hint)
         if rate is not None:
             _checks.require_function(rate, "rate", "of time to (3,)")
-        self.rotation, self.origin = rotation_models.with_forward_mode_adjoints(rotation), origin
+        self.rotation, self.origin = rotation_models.forward_mode(rotation), origin
         self.rate = getattr(rotation, "rate", None) if rate is None else rate
 
     def matrix(self, t: ScalarLike) -> Mat3:
         """Return the rotation matrix M(t) (3, 3) of this moving frame S' at the time `t`, s, which
         takes components in S' to components in the inertial frame S (notes, eq 85).
         """
-        return rotation_models.rotation_matrix_at(self.rotation, _checks.checked_time(t))
+        return rotation_models.matrix_at(self.rotation, _checks.checked_time(t))
 
     def at(self, t: ScalarLike) -> Instant:
         """Return the motion of this frame at the time `t`, s, as an `Instant`: its rotation matrix
@@ -98,7 +98,7 @@ class MovingFrame(eqx.Module):
         t = _checks.checked_time(t)
         if self.rate is not None:
             return _checks.array_of_shape(self.rate(t), (3,), "rate").astype(t.dtype)
-        state = rotation_models.rotation_value_at(self.rotation, t)
+        state = rotation_models.value_at(self.rotation, t)
         if hasattr(state, "omega"):
             return state.omega.astype(t.dtype)
         m, m_dot = jax.jvp(self.matrix, (t,), (jnp.ones_like(t),))
@@ -263,25 +263,18 @@ class MovingFrame(eqx.Module):
 
 
 def fictitious_acceleration(frame: MovingFrame, instant: Instant, x: Vector, v: Vector) -> Vec3:
-    """Return the fictitious acceleration (3,), m/s², of a particle in a moving frame S', in the
-    axes of S'.
+    """Return the fictitious acceleration, m/s², in the axes of S'.
 
     The rotation matrix of S', which most frames compute by sines and cosines, is used only if S'
     has an `origin`.
-
-    - `frame`: the frame S'
-    - `instant`: the motion of S' at the time at which the acceleration is wanted
-    - `x`, `v`: the position (3,), m, and the velocity (3,), m/s, of the particle in S'
     """
     if frame.origin is None:
-        return acceleration_due_to_rotation(instant, x, v)
+        return turning_acceleration(instant, x, v)
     return instant.fictitious(x, v)
 
 
 def require_frame(frame: object, name: str) -> MovingFrame:
-    """Return `frame` if it is a `MovingFrame`; raise `TypeError` for anything else. `name` is the
-    name of the argument, for the message.
-    """
+    """Return `frame` if it is a `MovingFrame`; raise a `TypeError` for anything else."""
     hint = "make one from a rotation with MovingFrame(rotation)"
     return _checks.require_instance(
         frame, MovingFrame, name, requirement="a MovingFrame", hint=hint
@@ -289,13 +282,8 @@ def require_frame(frame: object, name: str) -> MovingFrame:
 
 
 class _ComposedMotion(eqx.Module):
-    """Describe the motion of a composed frame relative to the inertial frame. The composed frame
-    moves relative to the moving frame `outer` as the frame `inner` moves relative to an inertial
-    frame.
-
-    The methods `rotation`, `rate` and `origin` are functions of the time, s, for a `MovingFrame`:
-    the rotation matrix (3, 3) of the composed frame; its angular velocity (3,), rad/s, in its own
-    axes; and its origin (3,), m, in the axes of the inertial frame.
+    """Describe the motion of a frame that moves relative to `outer` as `inner` does relative to an
+    inertial frame, by functions of time for a `MovingFrame`.
     """
 
     outer: MovingFrame
@@ -315,11 +303,8 @@ class _ComposedMotion(eqx.Module):
 
 
 class _InverseMotion(eqx.Module):
-    """Describe the motion of the inertial frame relative to the moving frame `frame`.
-
-    The methods `rotation`, `rate` and `origin` are functions of the time, s, for a `MovingFrame`:
-    the rotation matrix (3, 3), inertial → moving frame; the angular velocity (3,), rad/s, in the
-    axes of the inertial frame; and the origin (3,), m, in the axes of the moving frame.
+    """Describe the motion of the inertial frame relative to the moving frame `frame`, by functions
+    of time for a `MovingFrame`.
     """
 
     frame: MovingFrame

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from rigidjax import _checks, _show
 from rigidjax._types import Mat3, ScalarLike, Vec3
 from rigidjax.rotation import linalg3, quaternion, so3
-from rigidjax.rotation.validation import require_near_unit, require_rotation_matrix
+from rigidjax.rotation.validation import require_near_unit, require_rotation
 
 
 class Uniform(eqx.Module):
@@ -84,13 +84,12 @@ class AboutAxis(eqx.Module):
         return speed * self.axis.astype(t.dtype)
 
 
-def with_forward_mode_adjoints(rotation: PyTree) -> PyTree:
-    """Return the function of time `rotation` with each `diffrax.RecursiveCheckpointAdjoint` in it
-    replaced by `diffrax.ForwardMode`.
+def forward_mode(rotation: PyTree) -> PyTree:
+    """Return the function of time `rotation` with `diffrax.ForwardMode` in place of each
+    `diffrax.RecursiveCheckpointAdjoint`.
 
-    If `rotation` is a solution of `simulate`, it contains such an object, which says how diffrax
-    differentiates the solve. The derivative of a frame's angular velocity is computed in forward
-    mode, which is not possible through a `diffrax.RecursiveCheckpointAdjoint`.
+    A solution of `simulate` contains such an adjoint; the derivative of a frame's angular velocity
+    is computed in forward mode, which is not possible through it.
     """
 
     def reverse(part: PyTree) -> bool:
@@ -99,23 +98,16 @@ def with_forward_mode_adjoints(rotation: PyTree) -> PyTree:
     return jax.tree.map(lambda p: dfx.ForwardMode() if reverse(p) else p, rotation, is_leaf=reverse)
 
 
-def rotation_value_at(rotation: PyTree, t: Array) -> PyTree:
-    """Return the value of a frame's `rotation` at the time `t`, s: a matrix (3, 3), a quaternion
-    (4,), or a state with `q` and `omega`.
-
-    `rotation` is a function of the time, or a solution of `simulate`, which is evaluated at `t`.
+def value_at(rotation: PyTree, t: Array) -> PyTree:
+    """Return the matrix, quaternion or state that a function of time, or a solution of `simulate`,
+    has at the time t.
     """
     return rotation.evaluate(t) if hasattr(rotation, "evaluate") else rotation(t)
 
 
-def rotation_matrix_at(rotation: PyTree, t: Array) -> Mat3:
-    """Return the rotation matrix M (3, 3) of a moving frame S' at the time `t`, s, from its field
-    `rotation`; M takes components in S' to components in the inertial frame S.
-
-    `rotation` is a function of the time that returns a matrix (3, 3), a quaternion (4,) or a state
-    with `q`; or it is a solution of `simulate`.
-    """
-    value = rotation_value_at(rotation, t)
+def matrix_at(rotation: PyTree, t: Array) -> Mat3:
+    """Return the rotation matrix, S' → S, of a frame's field `rotation` at the time t."""
+    value = value_at(rotation, t)
     value = getattr(value, "q", value)
     shape = jnp.shape(value)
     if shape == (4,):
@@ -124,4 +116,4 @@ def rotation_matrix_at(rotation: PyTree, t: Array) -> Mat3:
     m = _checks.array_of_shape(
         value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)"
     )
-    return _checks.check_if_known(require_rotation_matrix, m, "rotation").astype(t.dtype)
+    return _checks.check_if_known(require_rotation, m, "rotation").astype(t.dtype)

@@ -47,48 +47,32 @@ class Coordinates(eqx.Module):
 
 
 class LagrangeEquations(eqx.Module):
-    """Evaluate Lagrange's equations of a Lagrangian and of forces as a vector field.
-
-    The vector field is called as `f(t, y, args)`. `lagrangian` is a function `(q, q̇) → L`, J, of
-    the coordinates and their time derivatives; `force` is a function `(t, q, q̇) → Q` of the
-    generalised forces, or `None`. The state y is a `Coordinates`. `equations_of_motion` makes this
-    Module.
-
-    >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
-    >>> round(float(pendulum.energy(Coordinates([0.0], [2.0]))), 6)  # ½ v² − 9.81 cos q
-    -7.81
+    """Evaluate Lagrange's equations as a vector field `f(t, y, args)`, whose state is a
+    `Coordinates`; `equations_of_motion` makes this Module.
     """
 
-    lagrangian: Callable[[Any, Any], Any]
-    force: Callable[[Any, Any, Any], Any] | None
+    lagrangian: Callable[[Any, Any], Any]  # (q, q̇) → L, J
+    force: Callable[[Any, Any, Any], Any] | None  # (t, q, q̇) → Q, the generalised forces
 
     def __call__(self, t: ScalarLike, y: Coordinates, args: object = None) -> Coordinates:
         q, rate = y.q, y.rate
-        momentum = jax.grad(self._lagrangian_value, argnums=1)
+        momentum = jax.grad(self._value, argnums=1)
         _, carried = jax.jvp(lambda x: momentum(x, rate), (q,), (rate,))
-        push = jax.grad(self._lagrangian_value)(q, rate) - carried
+        push = jax.grad(self._value)(q, rate) - carried
         if self.force is not None:
             push = push + _checks.array_of_shape(self.force(t, q, rate), q.shape, "force")
-        return Coordinates(
-            rate, _solve_for_acceleration(jax.jacfwd(lambda v: momentum(q, v))(rate), push)
-        )
+        return Coordinates(rate, _acceleration(jax.jacfwd(lambda v: momentum(q, v))(rate), push))
 
     def energy(self, y: Coordinates) -> Scalar:
-        """Return Jacobi's integral `q̇·∂L/∂q̇ − L` of the Lagrangian L in the state `y`, J, a
-        scalar; q̇ are the rates of the coordinates.
-
-        The integral is conserved if there is no `force`.
+        """Return Jacobi's integral `q̇·∂L/∂q̇ − L`, J, which is conserved if there is no
+        `force`.
         """
-        momentum = jax.grad(self._lagrangian_value, argnums=1)(y.q, y.rate)
-        return jnp.sum(y.rate * momentum) - self._lagrangian_value(y.q, y.rate)
+        momentum = jax.grad(self._value, argnums=1)(y.q, y.rate)
+        return jnp.sum(y.rate * momentum) - self._value(y.q, y.rate)
 
-    def _lagrangian_value(self, q: Array, q_rate: Array) -> Scalar:
-        """Return the value of the Lagrangian, J, a scalar.
-
-        - `q`: (n,) the coordinates.
-        - `q_rate`: (n,) their rates, the derivatives with respect to time.
-
-        An error is raised unless the user's function returns one number.
+    def _value(self, q: Array, q_rate: Array) -> Scalar:
+        """Return the Lagrangian, J, or raise an error unless the user's function returns one
+        number.
         """
         return _checks.array_of_shape(
             self.lagrangian(q, q_rate), (), "lagrangian", hint="one number, J"
@@ -205,16 +189,10 @@ def from_attitude(state: HasAttitude) -> Coordinates:
     return Coordinates(angles, euler.omega_to_rates(angles, state.omega))
 
 
-def _solve_for_acceleration(
+def _acceleration(
     mass_matrix: Float[Array, "n n"], generalised_force: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Return the second time derivatives q̈ (n,) of n coordinates q, the solution of M q̈ = F.
-
-    - `mass_matrix`: (n, n) M = ∂²L/∂q̇∂q̇, the second derivatives of the Lagrangian L with respect
-      to the rates q̇.
-    - `generalised_force`: (n,) F, the sum of the generalised forces and of all terms of Lagrange's
-      equations without q̈.
-    """
+    """Return q̈, the solution of M q̈ = F with M = ∂²L/∂q̇∂q̇."""
     n = generalised_force.shape[0]
     if n == 1:
         return generalised_force / mass_matrix[0]

@@ -35,21 +35,12 @@ class Momentum(eqx.Module):
 
 
 class MomentumAndDirection(eqx.Module):
-    """Hold the state of a heavy top: the angular momentum, and a vector fixed in the world (such as
-    the acceleration of gravity), both in body axes.
+    """Hold the state of a heavy top, both in body axes: the angular momentum Π, N m s, and the
+    vector γ = Rᵀ d for the attitude R and a vector d fixed in the world, of any unit; for
+    `HeavyTopHamiltonian` d is the acceleration of gravity, m/s².
 
     The attitude itself is not needed, because the equations do not change if the body is turned
     about this vector.
-
-    **Arguments:**
-
-    - `pi`: (3,) the angular momentum Π, N m s, body frame.
-    - `gamma`: (3,) the vector γ = Rᵀ d, body frame, where d is a vector fixed in the world and R
-      the attitude, body → world. d has any length and unit; for `HeavyTopHamiltonian` it is the
-      acceleration of gravity g, m/s².
-
-    >>> MomentumAndDirection([1.0, 0.0, 0.0], [0.0, 0.0, -9.81]).gamma.shape
-    (3,)
     """
 
     pi: Float[Array, "*batch 3"]
@@ -62,27 +53,19 @@ class MomentumAndDirection(eqx.Module):
 
 
 class LiePoisson(eqx.Module):
-    """Evaluate `dΠ/dt = Π × ∇H(Π)` as a vector field `f(t, y, args)`, whose state is a `Momentum`.
-
-    Π (3,) is the angular momentum in body axes, N m s, and H is the `hamiltonian`, a function
-    `Π → H`, J. `lie_poisson` makes this Module.
+    """Evaluate `dΠ/dt = Π × ∇H(Π)` as a vector field `f(t, y, args)`, whose state is a `Momentum`;
+    `lie_poisson` makes this Module.
     """
 
     hamiltonian: Callable[[Any], Any]
 
     def __call__(self, t: ScalarLike, y: Momentum, args: object = None) -> Momentum:
-        return Momentum(
-            cross(y.pi, jax.grad(lambda p: _require_scalar_energy(self.hamiltonian(p)))(y.pi))
-        )
+        return Momentum(cross(y.pi, jax.grad(lambda p: _one_energy(self.hamiltonian(p)))(y.pi)))
 
 
 class LiePoissonWithDirection(eqx.Module):
-    """Evaluate the Lie–Poisson equations of a Hamiltonian H(Π, γ) as a vector field.
-
-    Π (3,) is the angular momentum, N m s, and γ (3,) a vector fixed in the world, both in body
-    axes; `hamiltonian` is the function `(Π, γ) → H`, J. The state is a `MomentumAndDirection`. The
-    equations are dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ and dγ/dt = γ × ∂H/∂Π. `lie_poisson_with_direction`
-    makes this Module.
+    """Evaluate the Lie–Poisson equations of a Hamiltonian H(Π, γ) as a vector field, whose state is
+    a `MomentumAndDirection`; `lie_poisson_with_direction` makes this Module.
     """
 
     hamiltonian: Callable[[Any, Any], Any]
@@ -90,7 +73,7 @@ class LiePoissonWithDirection(eqx.Module):
     def __call__(
         self, t: ScalarLike, y: MomentumAndDirection, args: object = None
     ) -> MomentumAndDirection:
-        value = lambda p, g: _require_scalar_energy(self.hamiltonian(p, g))  # noqa: E731
+        value = lambda p, g: _one_energy(self.hamiltonian(p, g))  # noqa: E731
         turn, pull = jax.grad(value, argnums=(0, 1))(y.pi, y.gamma)
         return MomentumAndDirection(cross(y.pi, turn) + cross(y.gamma, pull), cross(y.gamma, turn))
 
@@ -134,10 +117,8 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
 
 
 def _require_invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
-    """Return the inertia of one body after a check that it has an inverse.
-
-    An error is raised if a principal moment is zero, or if no real body can have the moments. If
-    JAX traces the inertia, it becomes NaN in these cases.
+    """Return the inertia of one body, or raise an error if a moment is zero or no real body has the
+    moments; a traced inertia becomes NaN in these cases.
     """
     _checks.require_unbatched_instance(inertia, _inertia.Inertia, "inertia")
     return validation.require_physical_body(inertia, inertia.tensor, None, throw=False)
@@ -199,10 +180,8 @@ class HeavyTopHamiltonian(eqx.Module):
     def __call__(
         self, pi: Float[ArrayLike, "3"] | list[float], gamma: Float[ArrayLike, "3"] | list[float]
     ) -> Scalar:
-        pi, gamma = (
-            _checks.array_of_shape(pi, (3,), "pi"),
-            _checks.array_of_shape(gamma, (3,), "gamma"),
-        )
+        pi = _checks.array_of_shape(pi, (3,), "pi")
+        gamma = _checks.array_of_shape(gamma, (3,), "gamma")
         return 0.5 * dot(pi, apply(self.inverse, pi)) - self.top.mass * dot(self.top.com, gamma)
 
     def start(self, state: HasAttitude) -> MomentumAndDirection:
@@ -216,11 +195,6 @@ class HeavyTopHamiltonian(eqx.Module):
         return MomentumAndDirection(pi, quaternion.rotate_inverse(state.q, self.top.gravity))
 
 
-def _require_scalar_energy(value: Any) -> Scalar:
-    """Return the value of a Hamiltonian, J, as a scalar array.
-
-    - `value`: what the user's Hamiltonian, a function, returned.
-
-    An error is raised unless the value is one number.
-    """
+def _one_energy(value: Any) -> Scalar:
+    """Return what the user's Hamiltonian returned, J, or raise an error unless it is one number."""
     return _checks.array_of_shape(value, (), "hamiltonian", hint="one number, J")

@@ -14,7 +14,7 @@ from rigidjax.body.inertia import Inertia, MassProperties, apply, inverse
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques.base import Torque, evaluate_torque, force_and_torque, require_torque
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.kernels import squared_quaternion_length
+from rigidjax.rotation.kernels import squared_norm
 from rigidjax.rotation.linalg3 import components, cross
 
 State = TypeVar("State")
@@ -233,4 +233,4 @@ def _normalise_reproducibly(q: Quat) -> Quat:
     of 1e-11). Here the root and the quotient are kept as two separate operations, which round
     equally in every program.
     """
-    return q / lax.optimization_barrier(jnp.sqrt(squared_quaternion_length(components(q))))
+    return q / lax.optimization_barrier(jnp.sqrt(squared_norm(components(q))))

@@ -3,7 +3,7 @@ points.
 """
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,8 +17,8 @@ from rigidjax._types import Scalar, ScalarLike
 from rigidjax.orbits import differential_correction as correction
 from rigidjax.orbits.differential_correction import (
     PeriodicOrbit,
-    index_of_held,
-    numbers_at_crossing,
+    held_index,
+    numbers_of,
     orbit_of,
 )
 
@@ -61,56 +61,36 @@ def family(
     >>> [round(float(p), 3) for p in found.period]
     [2.712, 2.811]
     """
-    start, index = numbers_at_crossing(orbit), index_of_held(hold)
+    start, index = numbers_of(orbit), held_index(hold)
     length = np.shape(values)
     if len(length) != 1 or length[0] < 1:
         raise ValueError(f"values: wanted shape (N,), values of {hold}, got shape {length}")
     values = _checks.require_finite(_checks.array_of_shape(values, length, "values"), "values")
     values = values.astype(start.dtype)
     held = 0.5 * values if hold == "period" else values
-    numbers, residuals = _members_at_values(
-        scene, start, held, index, correction.usual_tolerance(start)
-    )
+    numbers, residuals = _members(scene, start, held, index, correction.usual_tolerance(start))
     where = lambda i: f" at {hold} = {values[i]:.9g}"  # noqa: E731
     advice = "; take smaller steps, or the family turns back there: hold another of x, z, vy, "
     lost = _is_lost(start, numbers, residuals)
-    return _orbits_unless_lost(
+    return _unless_lost(
         numbers, lost, where, "family: lost the family", advice + "period, or use follow"
     )
 
 
 def _is_lost(start: Array, numbers: Array, residuals: Array) -> Bool[Array, " members"]:
-    """Return whether Newton's method lost a family of periodic orbits at each of N members, as
-    booleans (N,).
-
-    The family is lost at a member if Newton's method failed there. It is also lost if the period of
-    the member is less than half or more than twice the period of the member before it, since
-    Newton's method then went to another orbit.
-
-    - `start`: (4,) the numbers x, z, v_y, T/2 of the orbit before the first member: its position,
-      its velocity and half of its period T, where it crosses y = 0 at a right angle.
-    - `numbers`: (N, 4) the numbers x, z, v_y, T/2 of the members.
-    - `residuals`: (N,) the largest of |y|, |v_x| and |v_z| of each member after half a period;
-      Newton's method failed if it is NaN or above the usual tolerance.
+    """Return for each member whether Newton's method failed, or went to another orbit: its period
+    is less than half or more than twice that of the member before it.
     """
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
     return ~((residuals <= correction.usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
 
 
-def _orbits_unless_lost(
+def _unless_lost(
     numbers: Array, is_lost: Array, describe_member: Callable[[int], str], message: str, advice: str
 ) -> PeriodicOrbit:
-    """Return the N members of a family as one `PeriodicOrbit` with a leading axis, or raise an
-    error if a member is lost (if Newton's method did not find it).
-
-    - `numbers`: (N, 4) the numbers x, z, v_y, T/2 of the members: position, velocity and half of
-      the period T, where an orbit crosses y = 0 at a right angle.
-    - `is_lost`: (N,) true for each member that is lost.
-    - `describe_member`: a function that returns, for the index of the first lost member, the words
-      that name this member in the error; it is called only if `is_lost` is known, and not traced as
-      within `jax.jit`.
-    - `message`, `advice`: the words of the error before and after the words that name the member.
+    """Return the members of a family, or raise an error with the words `describe_member` (called
+    only if `is_lost` is not traced) of the first lost one.
     """
     known = _checks.is_known(is_lost) and bool(is_lost.any())
     member = describe_member(int(np.argmax(np.asarray(is_lost)))) if known else ""
@@ -118,37 +98,31 @@ def _orbits_unless_lost(
     return jax.vmap(orbit_of)(_checks.error_if(numbers, is_lost.any(), words))
 
 
+class Members(NamedTuple):
+    """Hold members of a family of periodic orbits."""
+
+    numbers: Float[Array, "members 4"]  # see `differential_correction`
+    residuals: Float[Array, " members"]  # the largest of |y|, |v_x|, |v_z| after half a period
+
+
 @eqx.filter_jit
-def _members_at_values(
+def _members(
     scene: "AbstractReversible", start: Array, held_values: Array, index: int, tolerance: float
-) -> tuple[Array, Array]:
-    """Return two arrays: the numbers x, z, v_y, T/2 (N, 4) of the members of a family of periodic
-    orbits, one for each of N held values; and the largest residual (N,) of each, |y|, |v_x| or
-    |v_z| after half a period.
-
-    The numbers are position, velocity and half of the period T, where an orbit crosses y = 0 at a
-    right angle. Each member is predicted along the tangent of the family and corrected by Newton's
-    method.
-
-    - `scene`: the equations of motion.
-    - `start`: (4,) the numbers x, z, v_y, T/2 of an orbit near the first member.
-    - `held_values`: (N,) the values of the number that each member must have.
-    - `index`: the index, 0 to 3, of the number that is held, which is the same for all members.
-    - `tolerance`: the largest residual of a member.
+) -> Members:
+    """Return the members at which the number with this `index` has the `held_values`, each
+    predicted along the tangent of the family and corrected by Newton's method.
     """
     free = np.delete(np.arange(4), index)
     still = jax.tree.map(lambda n: lax.stop_gradient(n) if eqx.is_array(n) else n, scene)
 
-    def next_member(previous: Array, value: Scalar) -> tuple[Array, tuple[Array, Array]]:
+    def next_member(previous: Array, value: Scalar) -> tuple[Array, Members]:
         # The starting point of Newton's method is not differentiated: the converged orbit does not
         # depend on this point.
         previous, aim = lax.stop_gradient(previous), lax.stop_gradient(value)
-        guess = previous[free] + _derivative_along_family(still, previous, index) * (
-            aim - previous[index]
-        )
+        guess = previous[free] + _family_tangent(still, previous, index) * (aim - previous[index])
         root, largest = correction.correct_orbit(index, tolerance, scene, guess, value)
         numbers = correction.insert_held(root, value, index)
-        return numbers, (numbers, largest)
+        return numbers, Members(numbers, largest)
 
     # The guess is corrected first: the tangent of the family exists only at an exact member.
     held_now = lax.stop_gradient(start[index])
@@ -173,44 +147,28 @@ def family_slope(
     >>> round(float(hill.family_slope(orbit).period), 3)
     12.076
     """
-    change = _orbit_derivative(scene, numbers_at_crossing(orbit), index_of_held(hold))
+    change = _slope(scene, numbers_of(orbit), held_index(hold))
     turned = ~jnp.isfinite(change.period)
     words = f"family_slope: the family has a fold in {hold} here; take another of x, z, vy, period"
     return _checks.error_if(change, turned, words)
 
 
-def _derivative_along_family(
-    scene: "AbstractReversible", numbers: Array, index: int
-) -> Float[Array, "3"]:
-    """Return the derivatives (3,), along a family of periodic orbits, of three of the numbers x, z,
-    v_y, T/2 with respect to the fourth.
-
-    The numbers are position, velocity and half of the period T, where an orbit crosses y = 0 at a
-    right angle.
-
-    - `scene`: the equations of motion.
-    - `numbers`: (4,) the numbers x, z, v_y, T/2 of the orbit at which the derivatives are taken.
-    - `index`: the index, 0 to 3, of the number with respect to which the other three are
-      differentiated.
+def _family_tangent(scene: "AbstractReversible", numbers: Array, index: int) -> Float[Array, "3"]:
+    """Return the derivatives along a family of three of the four numbers with respect to the one
+    with this `index`.
     """
     _, matrix = correction.value_and_jacobian(
-        lambda n: correction.periodicity_residual(scene, n), numbers
+        lambda n: correction.half_period_residual(scene, n), numbers
     )
     return -jnp.linalg.solve(matrix[:, np.delete(np.arange(4), index)], matrix[:, index])
 
 
 @eqx.filter_jit
-def _orbit_derivative(scene: "AbstractReversible", numbers: Array, index: int) -> PeriodicOrbit:
-    """Return the derivative of the start and period of a periodic orbit along its family, as a
-    `PeriodicOrbit` that holds derivatives.
-
-    - `scene`: the equations of motion.
-    - `numbers`: (4,) x, z, v_y, T/2 of the orbit: position, velocity and half of the period T,
-      where it crosses y = 0 at a right angle.
-    - `index`: the index, 0 to 3, of the number with respect to which the orbit is differentiated;
-      for 3 the derivative is with respect to the whole period T, not to T/2.
+def _slope(scene: "AbstractReversible", numbers: Array, index: int) -> PeriodicOrbit:
+    """Return the derivative of the start and period of an orbit along its family with respect to
+    the number with this `index`; for 3 with respect to the whole period.
     """
-    unknown = _derivative_along_family(scene, numbers, index)
+    unknown = _family_tangent(scene, numbers, index)
     change = orbit_of(correction.insert_held(unknown, jnp.ones_like(unknown[0]), index))
     # The last of `numbers` is half the period, but `hold="period"` means the whole period.
     return jax.tree.map(lambda leaf: 0.5 * leaf, change) if index == 3 else change
@@ -243,70 +201,48 @@ def follow(
     `periodic_orbit` first. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) with the
     number of members found before the family was lost.
     """
-    start, index = numbers_at_crossing(orbit), index_of_held(rising)
+    start, index = numbers_of(orbit), held_index(rising)
     length = _checks.array_of_shape(step, (), "step").astype(start.dtype)
     bad = ~(jnp.isfinite(length) & (length != 0))
     length = _checks.error_if(length, bad, "step: wanted a number that is not 0")
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"count: wanted the number of members, an integer ≥ 1, got {count!r}")
     tolerance = correction.usual_tolerance(start)
-    numbers, residuals = _follow_family(scene, start, length, count, index, tolerance)
+    numbers, residuals = _followed(scene, start, length, count, index, tolerance)
     moved = jnp.diff(jnp.concatenate([start[None], numbers]), axis=0)
     far = jnp.sqrt(jnp.sum(moved * moved, axis=1)) > 2 * jnp.abs(length)
     lost = _is_lost(start, numbers, residuals) | far
     where = lambda i: f" after {i} of {count} members"  # noqa: E731
-    return _orbits_unless_lost(
-        numbers, lost, where, "follow: lost the family", "; take smaller steps"
-    )
+    return _unless_lost(numbers, lost, where, "follow: lost the family", "; take smaller steps")
 
 
 @eqx.filter_jit
-def _follow_family(
+def _followed(
     scene: "AbstractReversible", start: Array, step: Array, count: int, index: int, tolerance: float
-) -> tuple[Array, Array]:
-    """Return two arrays for the next N = `count` members of a family of periodic orbits, at equal
-    steps of arclength: their numbers x, z, v_y, T/2 (N, 4); and the largest residual (N,) of each,
-    |y|, |v_x| or |v_z| after half a period.
-
-    The numbers are position, velocity and half of the period T, where an orbit crosses y = 0 at a
-    right angle. The method is pseudo-arclength continuation: a step along the tangent of the
-    family, then Newton's method across the tangent.
-
-    - `scene`: the equations of motion.
-    - `start`: (4,) the numbers of the orbit from which the family is followed.
-    - `step`: the arclength from each member to the next, in the space of the four numbers.
-    - `index`: the index, 0 to 3, of the number that grows in the first step if `step` is positive.
-    - `tolerance`: the largest residual of a member.
+) -> Members:
+    """Return the next members of a family at equal steps of arclength, by pseudo-arclength
+    continuation; the number with this `index` grows in the first step if `step` is positive.
     """
 
     def residual(numbers: Array) -> Array:
-        return correction.periodicity_residual(scene, numbers)
-
-    def unit_tangent(matrix: Array, previous: Array) -> Array:
-        """Return the unit tangent (4,) of the family at a member, whose scalar product with
-        `previous` is positive.
-
-        - `matrix`: (3, 4) the Jacobian of the periodicity residual (y, v_x, v_z after half a
-          period) with respect to the four numbers x, z, v_y, T/2 of the member; its product with
-          the tangent is zero.
-        - `previous`: (4,) the tangent at the member before.
-        """
-        rows = jnp.concatenate([matrix, previous[None]])
-        along = jnp.linalg.solve(rows, jnp.zeros(4, start.dtype).at[3].set(1))
-        return along / jnp.sqrt(jnp.sum(along * along))
+        return correction.half_period_residual(scene, numbers)
 
     def next_member(
         carry: tuple[Array, Array], _member: None
-    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    ) -> tuple[tuple[Array, Array], Members]:
         last, before = carry
         _, matrix = correction.value_and_jacobian(residual, last)
-        along = unit_tangent(matrix, before)
+        # The tangent of the family is orthogonal to the rows of the Jacobian, and its scalar
+        # product with the tangent at the member before is positive.
+        rows = jnp.concatenate([matrix, before[None]])
+        along = jnp.linalg.solve(rows, jnp.zeros(4, start.dtype).at[3].set(1))
+        along = along / jnp.sqrt(jnp.sum(along * along))
 
         def across(numbers: Array) -> Array:
             return jnp.append(residual(numbers), jnp.sum(along * (numbers - last)) - step)
 
         root = correction.newton_root(across, last + step * along, tolerance)
-        return (root, along), (root, jnp.max(jnp.abs(residual(root))))
+        return (root, along), Members(root, jnp.max(jnp.abs(residual(root))))
 
     first = jnp.zeros(4, start.dtype).at[index].set(1)
     carry: Any = start, first
@@ -360,13 +296,13 @@ def bifurcation(
     """
     from scipy.optimize import brentq
 
-    place = index_of_held(hold)
+    place = held_index(hold)
     if isinstance(index, bool) or index not in (0, 1):
         raise ValueError(f"index: wanted 0 or 1, which of the two stability indices, got {index!r}")
     value = _checks.python_float(value, "value")
     if not np.isfinite(value):
         raise ValueError(f"value: wanted a finite number, got {value}")
-    a, b = (float(numbers_at_crossing(one)[place]) for one in (orbit, other))
+    a, b = (float(numbers_of(one)[place]) for one in (orbit, other))
     left, right = (scene.periodic_orbit(one, hold=hold) for one in (orbit, other))
     orbits = {a: left, b: right}
 
@@ -375,7 +311,11 @@ def bifurcation(
             share = (held_value - a) / (b - a)
             guess = jax.tree.map(lambda x, y: (1 - share) * x + share * y, left, right)
             orbits[held_value] = scene.periodic_orbit(guess, hold=hold)
-        away = _stability_index(scene, orbits[held_value], index) - value
+        stability = np.asarray(_indices(scene, orbits[held_value]))[index]
+        if abs(stability.imag) > 1e-9 * max(1.0, abs(stability)):
+            words = "the stability indices are complex at a member between the orbits"
+            raise ValueError(f"bifurcation: {words}; give orbits nearer to each other")
+        away = float(stability.real) - value
         return away if abs(away) > 1e-12 * max(1.0, abs(value)) else 0.0
 
     low, high = excess(a), excess(b)
@@ -389,29 +329,7 @@ def bifurcation(
     return orbits[root]
 
 
-def _stability_index(scene: "AbstractReversible", orbit: PeriodicOrbit, index: int) -> float:
-    """Return one stability index ν = ½(λ + 1/λ) of a periodic orbit as a Python float, and raise
-    `ValueError` if the index is complex.
-
-    The monodromy matrix of an orbit has the eigenvalues 1, 1 and two pairs λ, 1/λ; each pair gives
-    one index. `index`, 0 or 1, selects one of the two stability indices of the `orbit` in the
-    `scene`.
-    """
-    stability = np.asarray(_compiled_stability_indices(scene, orbit))[index]
-    if abs(stability.imag) > 1e-9 * max(1.0, abs(stability)):
-        words = "the stability indices are complex at a member between the orbits"
-        raise ValueError(f"bifurcation: {words}; give orbits nearer to each other")
-    return float(stability.real)
-
-
 @eqx.filter_jit
-def _compiled_stability_indices(
-    scene: "AbstractReversible", orbit: PeriodicOrbit
-) -> Complex[Array, "2"]:
-    """Return both stability indices ν = ½(λ + 1/λ) (2,) of a periodic `orbit`, complex, the larger
-    real part first, by a compiled program.
-
-    The monodromy matrix of an orbit has the eigenvalues 1, 1 and two pairs λ, 1/λ; each pair gives
-    one index. The `scene` has the equations of motion.
-    """
+def _indices(scene: "AbstractReversible", orbit: PeriodicOrbit) -> Complex[Array, "2"]:
+    """Return both stability indices of an orbit, by a compiled program."""
     return scene.stability_indices(orbit)

@@ -18,12 +18,10 @@ from rigidjax.orbits.reversible_scene import AbstractReversible
 from rigidjax.rotation.linalg3 import components
 
 
-def smallest_accurate_distance(dtype: DTypeLike) -> float:
-    """Return the distance r = eps^0.4 from a body below which the attraction loses too many digits,
-    so that a run ends there.
-
-    eps is the machine epsilon of `dtype`. Positions have rounding errors of about eps, so that the
-    relative error of the attraction at r is about eps/r = eps^0.6.
+def least_distance(dtype: DTypeLike) -> float:
+    """Return the distance r = eps^0.4 from a body below which the attraction loses too many digits:
+    positions have rounding errors of about eps, and so its relative error at r is about eps/r =
+    eps^0.6.
     """
     return float(jnp.finfo(dtype).eps) ** 0.4
 
@@ -134,9 +132,7 @@ class ThreeBody(AbstractReversible):
         and the distance that counts as a collision with this body.
         """
         gaps = jnp.stack(self.distances(state.x))
-        return gaps, jnp.maximum(
-            self.radii.astype(gaps.dtype), smallest_accurate_distance(gaps.dtype)
-        )
+        return gaps, jnp.maximum(self.radii.astype(gaps.dtype), least_distance(gaps.dtype))
 
     @property
     def lagrange_points(self) -> Float[Array, "5 3"]:
@@ -201,7 +197,7 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
     (Earth–Moon 0.01215…); `radii` (2,) the radii of the two bodies in units of the distance between
     them. A run that comes closer to a body than its radius ends with a message that says the body,
     the time and the distance. For radii of zero a run ends at the distance where rounding spoils
-    the attraction (`smallest_accurate_distance`). **Raises:** `ValueError` for μ outside (0, ½]
+    the attraction (`least_distance`). **Raises:** `ValueError` for μ outside (0, ½]
     (`EquinoxRuntimeError` under `jit`). Source: notes, eq 91, with a uniform Ω = (0, 0, 1);
     Szebehely 1967, Theory of Orbits.
 
@@ -267,7 +263,7 @@ class Hill(AbstractReversible):
         distance that counts as a collision with it.
         """
         gap = jnp.sqrt(jnp.sum(state.x * state.x, keepdims=True))
-        least = jnp.maximum(self.radius.astype(gap.dtype), smallest_accurate_distance(gap.dtype))
+        least = jnp.maximum(self.radius.astype(gap.dtype), least_distance(gap.dtype))
         return gap, least.reshape(1)
 
     @property

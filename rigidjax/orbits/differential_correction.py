@@ -1,7 +1,12 @@
-"""Find periodic orbits by Newton's method, differentiably."""
+"""Find periodic orbits by Newton's method, differentiably.
+
+An orbit of period T is given by the four numbers x, z, v_y, T/2: its position and velocity where it
+crosses the plane y = 0 at a right angle, and half of its period. Its residual is y, v_x and v_z
+after half a period. One of the four numbers is held, and Newton's method finds the other three.
+"""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -74,11 +79,11 @@ def periodic_orbit(
     >>> round(float(orbit.period), 4)
     2.712
     """
-    numbers, index = numbers_at_crossing(guess), index_of_held(hold)
+    numbers, index = numbers_of(guess), held_index(hold)
     free = np.delete(np.arange(4), index)
     if tolerance is None:
         tolerance = usual_tolerance(numbers)
-    unknown, left = _compiled_correction(scene, numbers[free], numbers[index], index, tolerance)
+    unknown, left = _corrected(scene, numbers[free], numbers[index], index, tolerance)
     bad = ~(left <= tolerance)
     said = ""
     if _checks.is_known(left):
@@ -96,20 +101,13 @@ def periodic_orbit(
     return orbit_of(corrected)
 
 
-def index_of_held(hold: str) -> int:
-    """Return the index, 0 to 3, of the quantity `hold` (`"x"`, `"z"`, `"vy"` or `"period"`) among
-    the numbers x, z, v_y, T/2 of an orbit, where T is its period.
-    """
+def held_index(hold: str) -> int:
+    """Return the place of the quantity `hold` among the four numbers of an orbit."""
     return _NAMES.index(_checks.require_option(hold, _NAMES, "hold"))
 
 
-def numbers_at_crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
-    """Return the four numbers x, z, v_y, T/2 (4,) of an orbit `guess`: its position and velocity at
-    the plane y = 0, and half of its period T.
-
-    An error is raised unless the state of `guess` crosses this plane at a right angle, so that y,
-    v_x and v_z are zero.
-    """
+def numbers_of(guess: PeriodicOrbit) -> Float[Array, "4"]:
+    """Return the four numbers of an orbit, after checks."""
     made = "lyapunov_guess and halo_guess make one"
     wanted = "a PeriodicOrbit(state, period)"
     _checks.require_instance(guess, PeriodicOrbit, "guess", requirement=wanted, hint=made)
@@ -124,26 +122,15 @@ def numbers_at_crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
 
 
 def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
-    """Return the orbit with the `numbers` x, z, v_y, T/2 (4,).
-
-    This function is the inverse of `numbers_at_crossing`: the position is (x, 0, z), the velocity
-    (0, v_y, 0), and the period T.
-    """
+    """Return the orbit with these four numbers, the inverse of `numbers_of`."""
     x, z, vy, half = components(numbers)
     zero = jnp.zeros_like(x)
     return PeriodicOrbit(Point(jnp.stack([x, zero, z]), jnp.stack([zero, vy, zero])), 2 * half)
 
 
 def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> Float[Array, "4"]:
-    """Return the four numbers x, z, v_y, T/2 (4,) of a periodic orbit from three unknown numbers
-    and one number that is held.
-
-    The numbers are position, velocity and half of the period T, where the orbit crosses y = 0 at a
-    right angle.
-
-    - `unknown`: (3,) the three unknown numbers, in the order x, z, v_y, T/2.
-    - `held_value`: the number that is held.
-    - `index`: the place, 0 to 3, of the held number among the four numbers.
+    """Return the four numbers of an orbit from three and the one that is held, at the place
+    `index`.
     """
     parts = list(unknown)
     parts.insert(index, held_value)
@@ -151,23 +138,15 @@ def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> F
 
 
 def usual_tolerance(numbers: Array) -> float:
-    """Return the default tolerance for |y|, |v_x| and |v_z| after half a period of an orbit: 1e-12
-    if the `numbers` of the orbit are float64, else 1e-4.
-    """
+    """Return the default tolerance of a residual, by the dtype of the numbers."""
     return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
 
 
-def integrate_particle(
+def integrate(
     scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **options: Any
 ) -> dfx.Solution:
-    """Return the solution of a particle's motion from `state` at time 0 to time `t`, with
-    derivatives in forward mode.
-
-    - `scene`: the equations of motion.
-    - `state`: the initial position and velocity, a `Point`.
-    - `t`: the last time, in the scene's unit.
-    - `rtol`, `atol`: the relative and absolute tolerance of a step.
-    - `options`: further arguments of `diffrax.diffeqsolve`.
+    """Return the motion from `state` at time 0 to time `t`, with derivatives in forward mode;
+    `options` are further arguments of `diffrax.diffeqsolve`.
     """
     motion = dfx.ODETerm(scene.field), dfx.Dopri8(), jnp.zeros_like(t), t, None, state
     options |= dict(adjoint=dfx.ForwardMode(), max_steps=100_000, throw=False)
@@ -179,15 +158,10 @@ def integrate_particle(
 def state_after(
     scene: AbstractScene, numbers: Float[Array, "6"], t: Array, *, rtol: float, atol: float
 ) -> Float[Array, "6"]:
-    """Return the position and velocity (x, v) (6,) after a motion of duration `t` that starts at
-    (x, v) = `numbers` (6,).
-
-    An error is raised if the solve fails. The `scene` has the equations of motion; `rtol` and
-    `atol` are the relative and absolute tolerance of a step.
+    """Return the position and velocity after a motion of duration `t`; an error is raised if the
+    solve fails.
     """
-    out = integrate_particle(
-        scene, Point(numbers[:3], numbers[3:]), t.astype(numbers.dtype), rtol, atol
-    )
+    out = integrate(scene, Point(numbers[:3], numbers[3:]), t.astype(numbers.dtype), rtol, atol)
     end: Any = out.result.error_if(out.ys, out.result != dfx.RESULTS.successful)
     return jnp.concatenate([end.x[0], end.v[0]])
 
@@ -204,53 +178,39 @@ def transition_matrix(
     """
     _checks.require_instance(state, Point, "state", requirement="a Point(x, v)")
     t = _checks.require_finite(_checks.array_of_shape(t, (), "t"), "t")
-    return _compiled_transition_matrix(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
+    return _transition(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
 
 
 @eqx.filter_jit
-def _compiled_transition_matrix(
-    scene: AbstractScene, numbers: Array, t: Array, rtol: float, atol: float
-) -> Array:
-    """Return the state-transition matrix (6, 6), the derivatives of the final position and velocity
-    with respect to the initial position and velocity.
-
-    - `scene`: the equations of motion.
-    - `numbers`: (6,) the initial position and velocity (x, v).
-    - `t`: the duration of the motion, in the scene's unit of time.
-    - `rtol`, `atol`: the relative and absolute tolerance of a step.
-    """
+def _transition(scene: AbstractScene, numbers: Array, t: Array, rtol: float, atol: float) -> Array:
+    """Return the state-transition matrix, by a compiled program."""
     # Forward mode solves the six variational equations together with the motion.
     return jax.jacfwd(lambda n: state_after(scene, n, t, rtol=rtol, atol=atol))(numbers)
 
 
-def periodicity_residual(scene: AbstractScene, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
-    """Return y, v_x and v_z (3,) after half a period; the orbit is periodic if all three are zero.
-
-    **Arguments:** `scene` the equations of motion; `numbers` (4,) x, z, v_y at time 0, where y = 0
-    and v_x = v_z = 0, and half of the period, T/2.
-    """
+def half_period_residual(scene: AbstractScene, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
+    """Return the residual of an orbit, NaN if the solve fails."""
     orbit = orbit_of(numbers)
     tight = float(jnp.finfo(numbers.dtype).eps)
-    out = integrate_particle(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight)
+    out = integrate(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight)
     end: Any = out.ys
     left = jnp.stack([end.x[0, 1], end.v[0, 0], end.v[0, 2]])
     return jnp.where(out.result == dfx.RESULTS.successful, left, jnp.nan)
 
 
-def value_and_jacobian(f: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
-    """Return f(x) (m,) and the Jacobian (m, n) of `f` at `x` (n,), from one pass in forward
-    mode.
-    """
+def value_and_jacobian(
+    f: Callable[[Array], Array], x: Array
+) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+    """Return f(x) and the Jacobian of f at x, from one pass in forward mode."""
     along = jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 1))
     return along(jnp.eye(x.shape[0], dtype=x.dtype))
 
 
 def newton_root(f: Callable[[Array], Array], start: Array, tolerance: float) -> Array:
-    """Return a zero (n,) of the function `f` near the point `start` (n,), by Newton's method.
+    """Return a zero of `f` near `start` by Newton's method.
 
     The method ends after the first step that began at a point where all values of |f| are at most a
-    tenth of `tolerance`, or after `MAX_STEPS` steps. `f` returns as many values (n,) as it has
-    unknowns.
+    tenth of `tolerance`, or after `MAX_STEPS` steps.
     """
 
     def is_unfinished(carry: tuple[Array, Array, Array | int]) -> Array:
@@ -270,68 +230,47 @@ def newton_root(f: Callable[[Array], Array], start: Array, tolerance: float) -> 
     return lax.while_loop(is_unfinished, newton_step, carry)[0]
 
 
+class Corrected(NamedTuple):
+    """Hold an orbit after Newton's method."""
+
+    unknown: Float[Array, "3"]  # the numbers that are not held
+    residual: Scalar  # the largest of |y|, |v_x| and |v_z| after half a period
+
+
 # Newton's method itself is not differentiated: `_correct_orbit_jvp` is its derivative. This rule is
 # linear in the tangents, so that it serves both `jax.jacfwd` and `jax.grad`, although the motions
 # inside the rule are differentiated in forward mode.
 @eqx.filter_jit
-def _compiled_correction(
+def _corrected(
     scene: AbstractScene, unknown: Array, held_value: Array, index: int, tolerance: float
-) -> tuple[Array, Array]:
-    """Return two things: the three corrected numbers (3,) of a periodic orbit; and the largest
-    residual, |y|, |v_x| or |v_z| after half a period.
-
-    A periodic orbit of period T is given by x, z, v_y, T/2, where it crosses y = 0 at a right
-    angle; one of these four numbers is held. The program is compiled, and can be differentiated in
-    forward and reverse mode.
-
-    - `scene`: the equations of motion.
-    - `unknown`: (3,) the values of the other three numbers, from which Newton's method starts.
-    - `held_value`: the number that is held.
-    - `index`: the place, 0 to 3, of the held number among the four numbers.
-    - `tolerance`: the largest accepted residual.
-    """
+) -> Corrected:
+    """Return the corrected orbit, by a compiled program."""
     return correct_orbit(index, float(tolerance), scene, unknown, held_value)
 
 
 @eqx.filter_custom_jvp
 def correct_orbit(
     index: int, tolerance: float, scene: AbstractScene, unknown: Array, held_value: Array
-) -> tuple[Array, Array]:
-    """Return two things: the three numbers (3,) that make an orbit periodic, by Newton's method;
-    and the largest residual, |y|, |v_x| or |v_z| after half a period.
-
-    A periodic orbit of period T is given by x, z, v_y, T/2, where it crosses y = 0 at a right
-    angle; one of these four numbers is held.
-
-    - `index`: the place, 0 to 3, of the held number.
-    - `tolerance`: the largest accepted residual.
-    - `scene`: the equations of motion.
-    - `unknown`: (3,) the values of the other three numbers, from which Newton's method starts.
-    - `held_value`: the number that is held.
+) -> Corrected:
+    """Return the orbit near the three numbers `unknown` whose residual is zero, or at most
+    `tolerance`, by Newton's method.
     """
 
     def residual(unknown: Array) -> Array:
-        return periodicity_residual(scene, insert_held(unknown, held_value, index))
+        return half_period_residual(scene, insert_held(unknown, held_value, index))
 
     unknown = newton_root(residual, unknown, tolerance)
-    return unknown, jnp.max(jnp.abs(residual(unknown)))
+    return Corrected(unknown, jnp.max(jnp.abs(residual(unknown))))
 
 
 @correct_orbit.def_jvp
 def _correct_orbit_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return two things: the two results of `correct_orbit`; and their derivatives along given
-    tangents, by the implicit function theorem.
+) -> tuple[Corrected, Corrected]:
+    """Return the corrected orbit and its tangent, by the implicit function theorem.
 
-    The first result is the three numbers (3,) that make an orbit periodic. The second result is the
-    largest residual that is left; its derivative is taken as zero.
-
-    - `primals`: the arguments of `correct_orbit`: index, tolerance, scene, unknown numbers (3,) and
-      held value.
-    - `tangents`: the tangents of these arguments, `None` for constants; only the tangents of the
-      scene (the equations of motion) and of the held value are used, since the corrected orbit does
-      not depend on the point from which Newton's method starts.
+    The result does not depend on the `unknown` numbers from which Newton's method starts; the
+    tangent of what is left of the residual is taken as zero.
     """
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents
@@ -345,7 +284,7 @@ def _correct_orbit_jvp(
     def residual(flat: Array) -> Array:
         leaves, held, unknown = unflatten(flat)
         whole = eqx.combine(jax.tree.unflatten(tree, leaves), rest)
-        return periodicity_residual(whole, insert_held(unknown, held, index))
+        return half_period_residual(whole, insert_held(unknown, held, index))
 
     matrix = jax.jacfwd(residual)(flat)
     paths = {path: dot for path, dot in jax.tree.leaves_with_path(scene_dot) if dot is not None}
@@ -356,4 +295,4 @@ def _correct_orbit_jvp(
     pushed, _ = ravel_pytree((dots, held_dot))
     moved = jnp.sum(matrix[:, :-3] * pushed[None], axis=1)
     total = -jnp.linalg.solve(matrix[:, -3:], moved)
-    return (root, left), (total, jnp.zeros_like(left))
+    return Corrected(root, left), Corrected(total, jnp.zeros_like(left))

@@ -18,8 +18,8 @@ from rigidjax.frames.point import Point
 from rigidjax.orbits import continuation
 from rigidjax.orbits.differential_correction import (
     PeriodicOrbit,
-    integrate_particle,
-    numbers_at_crossing,
+    integrate,
+    numbers_of,
     state_after,
 )
 from rigidjax.solve.run import Ends
@@ -65,13 +65,11 @@ class Manifold(eqx.Module):
 
 
 def unstable_direction(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]:
-    """Return two things: the real multiplier λ of an orbit with the largest |λ|; and its unit
-    eigenvector (6,).
+    """Return the real multiplier λ of an orbit with the largest |λ|, and its unit eigenvector; both
+    are NaN if no real multiplier has |λ| > 1.
 
-    The multipliers are the eigenvalues of the `monodromy` matrix, the state-transition matrix over
-    one period. λ is computed from the traces of this matrix and of its square; inverse iteration
-    and one bordered linear solve give the eigenvector. Both results are NaN if no real multiplier
-    has |λ| > 1.
+    λ is computed from the traces of the monodromy matrix and of its square; inverse iteration and
+    one bordered linear solve give the eigenvector.
     """
     index = continuation.stability_indices(monodromy)
     real = jnp.abs(index.imag) <= 1e-6 * jnp.abs(index)
@@ -86,14 +84,14 @@ def unstable_direction(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Ar
     near = value * (1 + jnp.finfo(value.dtype).eps ** 0.5)
     still, shift = lax.stop_gradient((monodromy, near))
 
-    def improve_both_eigenvectors(_: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
+    def improve(_: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
         right, left = both
         right = jnp.linalg.solve(still - shift * eye, right)
         left = jnp.linalg.solve((still - shift * eye).T, left)
         return right / jnp.sqrt(jnp.sum(right**2)), left / jnp.sqrt(jnp.sum(left**2))
 
     first = jnp.asarray(np.full(6, 6**-0.5), monodromy.dtype)
-    right, left = lax.fori_loop(0, _ITERATIONS, improve_both_eigenvectors, (first, first))
+    right, left = lax.fori_loop(0, _ITERATIONS, improve, (first, first))
     # The bordered system (M − λ) v + m left = 0, right · v = 1 for the eigenvector v and a number m
     # is regular although M − λ is singular. Here M is the monodromy matrix, λ its eigenvalue, and
     # left and right are its eigenvectors by inverse iteration. The derivatives of v come from this
@@ -115,30 +113,18 @@ def manifold_point(
     side: int,
     distance: Scalar,
 ) -> tuple[Point, Scalar]:
-    """Return two things, after checks: a state near a periodic orbit, on its stable or unstable
-    manifold; and the multiplier λ, the factor by which the distance from the orbit changes in one
-    period.
-
-    An error is raised for another `branch` or `side`, and for an orbit whose state does not cross
-    the plane y = 0 at a right angle.
-
-    - `scene`: the equations of motion.
-    - `orbit`: the unstable periodic orbit.
-    - `phase`: the point of the orbit, in periods since `orbit.state`.
-    - `branch`: `"stable"` or `"unstable"`, the manifold.
-    - `side`: 1 for the half of the manifold that goes to larger x at `orbit.state`, −1 for the
-      opposite half.
-    - `distance`: the distance of the returned state from the orbit, in (x, v).
+    """Return a state on a manifold of an orbit and the orbit's multiplier, for arguments of
+    `manifold_start`, after checks.
     """
     _checks.require_option(branch, ("stable", "unstable"), "branch")
     if isinstance(side, bool) or side not in (1, -1):
         raise ValueError(f"side: wanted 1 (to larger x at the orbit's start) or -1, got {side!r}")
-    numbers_at_crossing(orbit)
-    return _compiled_manifold_point(scene, orbit, phase, branch, side, distance)
+    numbers_of(orbit)
+    return _point(scene, orbit, phase, branch, side, distance)
 
 
 @eqx.filter_jit
-def _compiled_manifold_point(
+def _point(
     scene: "AbstractReversible",
     orbit: PeriodicOrbit,
     phase: Scalar,
@@ -146,17 +132,7 @@ def _compiled_manifold_point(
     side: int,
     distance: Scalar,
 ) -> tuple[Point, Scalar]:
-    """Return two things: a state near a periodic orbit, on its stable or unstable manifold; and the
-    multiplier λ, the factor by which the distance from the orbit changes in one period.
-
-    - `scene`: the equations of motion.
-    - `orbit`: the unstable periodic orbit.
-    - `phase`: the point of the orbit, in periods since `orbit.state`.
-    - `branch`: `"stable"` or `"unstable"`, the manifold.
-    - `side`: 1 for the half of the manifold that goes to larger x at `orbit.state`, −1 for the
-      opposite half.
-    - `distance`: the distance of the returned state from the orbit, in (x, v).
-    """
+    """Return a state on a manifold and the multiplier, by a compiled program."""
     value, vector = unstable_direction(scene.monodromy(orbit))
     # The stable manifold is the mirror image of the unstable manifold. A point of the stable
     # manifold with a given phase is therefore the mirror image of the point of the unstable
@@ -214,7 +190,7 @@ def manifold(
     """
     count, samples = _checks.integer(count, "count", 1), _checks.integer(samples, "samples", 2)
     dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
-    distance = _positive_number(distance, "distance", dtype)
+    distance = _positive(distance, "distance", dtype)
     phases = jnp.arange(count).astype(distance.dtype) / count
     starts, value = jax.vmap(lambda p: manifold_point(scene, orbit, p, branch, side, distance))(
         phases
@@ -222,9 +198,9 @@ def manifold(
     words = "manifold: the orbit has no multiplier that is real and of size above 1: it is stable "
     words += "to first order, or nearby motions spiral; take an orbit with an index |ν| > 1"
     value = _checks.error_if(value[0], jnp.isnan(value[0]), words)
-    length = 2 * orbit.period if time is None else _positive_number(time, "time", dtype)
+    length = 2 * orbit.period if time is None else _positive(time, "time", dtype)
     ts = jnp.linspace(jnp.zeros_like(length), length, samples)
-    states = _manifold_trajectories(scene, starts, ts, branch)
+    states = _trajectories(scene, starts, ts, branch)
     return Manifold(ts if branch == "unstable" else -ts, states, phases, value)
 
 
@@ -257,9 +233,9 @@ def manifold_start(
     return manifold_point(scene, orbit, where, branch, side, away)[0]
 
 
-def _positive_number(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
-    """Return `value` as one positive number in the precision `dtype` (`None` keeps the precision of
-    `value`), or raise an error that begins with `name`.
+def _positive(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
+    """Return a positive number in the given dtype, or its own for `None`, or raise an error that
+    begins with `name`.
     """
     distance = _checks.array_of_shape(value, (), name)
     return _checks.require_positive(
@@ -268,33 +244,23 @@ def _positive_number(value: ScalarLike, name: str, dtype: DTypeLike | None) -> A
 
 
 @eqx.filter_jit
-def _manifold_trajectories(
-    scene: "AbstractReversible", starts: Point, ts: Array, branch: Branch
-) -> Point:
-    """Return the motions that start at N given states on a stable or unstable manifold, as one
-    `Point` with leading axes (N, T) for T times, NaN after a collision.
-
-    Motions on a stable manifold are computed backwards in time, as the mirror images, in y → −y, of
-    motions forwards in time.
-
-    - `scene`: the equations of motion.
-    - `starts`: the N initial states, a `Point` with a leading axis.
-    - `ts`: (T,) the times since the start, ≥ 0, ascending.
-    - `branch`: `"stable"` or `"unstable"`.
+def _trajectories(scene: "AbstractReversible", starts: Point, ts: Array, branch: Branch) -> Point:
+    """Return the motions from states on a manifold at the times `ts` since the start, NaN after a
+    collision; those on a stable manifold run backwards.
     """
     mirror = jnp.asarray(_MIRROR, ts.dtype)
     turn = branch == "stable"
 
-    def mirror_if_stable(state: Point) -> Point:
+    def mirrored(state: Point) -> Point:
         # A motion on the stable manifold is replaced by its mirror image, which is integrated
         # forwards in time.
         return Point(state.x * mirror[:3], state.v * mirror[3:]) if turn else state
 
     def trajectory(start: Point) -> Point:
         how = dict(saveat=dfx.SaveAt(ts=ts), event=dfx.Event(Ends(scene)))
-        out = integrate_particle(scene, mirror_if_stable(start), ts[-1], 1e-11, 1e-12, **how)
+        out = integrate(scene, mirrored(start), ts[-1], 1e-11, 1e-12, **how)
         there: Any = jnp.isfinite(jnp.asarray(out.ts))[:, None]
         ys: Any = jax.tree.map(lambda leaf: jnp.where(there, leaf, jnp.nan), out.ys)
-        return jax.vmap(mirror_if_stable)(ys)
+        return jax.vmap(mirrored)(ys)
 
     return jax.vmap(trajectory)(starts)

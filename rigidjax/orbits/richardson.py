@@ -15,48 +15,34 @@ from rigidjax.orbits.differential_correction import PeriodicOrbit
 
 
 def lagrange_points(mu: Scalar) -> Float[Array, "5 3"]:
-    """Return the positions of L1 … L5 (5, 3), rotating axes, for the mass ratio μ = `mu` of the
-    second body, 0 < μ ≤ ½.
+    """Return the positions of L1 … L5, rotating axes, for the mass ratio μ of the second body, 0 <
+    μ ≤ ½.
 
     L1, L2 and L3 are roots of Euler's quintic polynomials (Szebehely 1967, sec. 4.4).
     """
-    between, beyond, opposite = collinear_point_distances(mu)
+    between, beyond, opposite = point_distances(mu)
     half, zero, height = 0.5 - mu, jnp.zeros_like(mu), jnp.full_like(mu, 0.75**0.5)
     x = jnp.stack([1 - mu - between, 1 - mu + beyond, -mu - opposite, half, half])
     y = jnp.stack([zero, zero, zero, height, -height])
     return jnp.stack([x, y, jnp.zeros_like(x)], axis=1)
 
 
-def collinear_point_distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Return three distances in units of the distance between the two bodies: of L1 from the second
-    body; of L2 from the second body; and of L3 from the first body.
-
-    L1, L2 and L3 are the equilibrium points on the line through the bodies.
-
-    `mu` is the mass ratio μ of the second body, 0 < μ ≤ ½.
+def point_distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """Return the distances of L1 and of L2 from the second body, and of L3 from the first, in units
+    of the distance between the two bodies.
     """
     one = jnp.ones_like(mu)
     hill = jnp.cbrt(mu / (3 * (1 - mu)))
-    between = _polynomial_root_near(
-        [one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3)
-    )
-    beyond = _polynomial_root_near(
-        [one, 3 - mu, 3 - 2 * mu, -mu, -2 * mu, -mu], hill * (1 + hill / 3)
-    )
+    between = _root([one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3))
+    beyond = _root([one, 3 - mu, 3 - 2 * mu, -mu, -2 * mu, -mu], hill * (1 + hill / 3))
     rest = mu - 1
-    opposite = _polynomial_root_near(
-        [one, 2 + mu, 1 + 2 * mu, rest, 2 * rest, rest], 1 - 7 * mu / 12
-    )
+    opposite = _root([one, 2 + mu, 1 + 2 * mu, rest, 2 * rest, rest], 1 - 7 * mu / 12)
     return between, beyond, opposite
 
 
-def _polynomial_root_near(coefficients: list[Scalar], start: Scalar) -> Scalar:
-    """Return a root of a polynomial by seven steps of Newton's method.
-
-    - `coefficients`: the coefficients, that of the highest power first.
-    - `start`: a number near the root. `collinear_point_distances` starts with estimates of the
-      distances of the equilibrium points L1, L2, L3. For every mass ratio these estimates are so
-      near to the roots that seven steps are enough.
+def _root(coefficients: list[Scalar], start: Scalar) -> Scalar:
+    """Return a root of a polynomial, whose highest coefficient is first, by seven steps of Newton's
+    method, which are enough from the estimates of `point_distances` for every mass ratio.
     """
 
     def newton_step(_: object, x: Scalar) -> Scalar:
@@ -71,19 +57,18 @@ def _polynomial_root_near(coefficients: list[Scalar], start: Scalar) -> Scalar:
 def orbit_guess(
     mu: Scalar, point: int, along_x: ScalarLike | None, along_z: ScalarLike | None
 ) -> PeriodicOrbit:
-    """Return an approximate orbit about L1, L2 or L3 (`point` 1, 2 or 3) that starts on the
-    xz-plane.
+    """Return an approximate orbit about L1, L2 or L3 that starts on the xz-plane: a planar Lyapunov
+    orbit with the amplitude `along_x`, or a halo orbit with the amplitude `along_z`, whose sign
+    selects the branch.
 
-    For a planar Lyapunov orbit `along_x` is its amplitude along x, and `along_z` is `None`. For a
-    halo orbit `along_z` is its amplitude along z, whose sign selects the branch, and `along_x` is
-    `None`. The amplitude must be small compared with the distance from the point to the nearer
-    body. `mu` is the mass ratio μ of the second body. Source: Richardson 1980, Celest. Mech. 22,
-    241, doi:10.1007/BF01229511, where the orbit has the phase τ = 0 at its start.
+    The amplitude must be small compared with the distance from the point to the nearer body.
+    Source: Richardson 1980, Celest. Mech. 22, 241, doi:10.1007/BF01229511, where the orbit has the
+    phase τ = 0 at its start.
     """
     if point not in (1, 2, 3):
         raise ValueError(f"point: wanted 1, 2 or 3, a collinear point, got {point}")
-    unit = collinear_point_distances(mu)[point - 1]
-    c2, c3, c4 = (_potential_coefficient(mu, unit, point, n) for n in (2, 3, 4))
+    unit = point_distances(mu)[point - 1]
+    c2, c3, c4 = (_potential_term(mu, unit, point, n) for n in (2, 3, 4))
     rate = jnp.sqrt(0.5 * (2 - c2 + jnp.sqrt((c2 - 2) ** 2 + 4 * (c2 - 1) * (1 + 2 * c2))))
     w, w2 = rate, rate * rate
     k = 2 * w / (w2 + 1 - c2)
@@ -140,24 +125,13 @@ def orbit_guess(
 
 
 def _checked_amplitude(value: ScalarLike | None) -> Scalar:
-    """Return `value`, the amplitude of an orbit, as one finite number, or raise an error, also for
-    `None`.
-    """
+    """Return an amplitude as one finite number, or raise an error, also for `None`."""
     return _checks.require_finite(_checks.array_of_shape(value, (), "amplitude"), "amplitude")
 
 
-def _potential_coefficient(mu: Scalar, point_distance: Scalar, point: int, n: int) -> Scalar:
-    """Return the coefficient c_n of the power `n` of the distance from a collinear equilibrium
-    point, in the expansion of the potential about this point.
-
-    The potential is that of the two bodies of the circular restricted three-body problem. The unit
-    of length of the expansion is the distance of the equilibrium point from the nearer body.
-    Source: Richardson 1980, eq 8.
-
-    - `mu`: the mass ratio μ, the mass of the second body divided by the mass of both.
-    - `point_distance`: the distance of the point from the nearer body, in units of the distance
-      between the bodies.
-    - `point`: 1, 2 or 3 for L1, L2, L3.
+def _potential_term(mu: Scalar, point_distance: Scalar, point: int, n: int) -> Scalar:
+    """Return the coefficient c_n of the potential about a collinear point, in units of the distance
+    of the point from the nearer body (Richardson 1980, eq 8).
     """
     g = point_distance
     if point == 3:

@@ -67,10 +67,8 @@ def warn_of_slow_loops() -> None:
 
 
 def platform() -> str:
-    """Return the kind of device on which JAX computes, such as "cpu".
-
-    This is the kind of `jax.default_device`, if it is set: `jax.default_backend` ignores this
-    setting.
+    """Return the kind of device on which JAX computes, such as "cpu": that of `jax.default_device`,
+    if it is set, which `jax.default_backend` ignores.
     """
     device: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     if device is None:
@@ -80,25 +78,22 @@ def platform() -> str:
 
 def barrier(tree: Tree) -> Tree:
     """Return the arrays of `tree` unchanged, such that XLA on CPU computes each array once for all
-    its uses, and does not repeat the computation at each use.
+    its uses.
 
     This is done by `lax.optimization_barrier`, or, where XLA drops such barriers, by a division by
-    one (`prevent_recomputation`).
-
-    On a GPU each barrier would end a kernel, which costs more than computing some numbers twice; no
-    barrier is set there.
+    one. On a GPU each barrier would end a kernel, which costs more than computing some numbers
+    twice; no barrier is set there.
     """
     if platform() != "cpu" or not any(isinstance(a, Tracer) for a in jax.tree.leaves(tree)):
         return tree
     if not _DROPPED:
         return lax.optimization_barrier(tree)
     real = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
-    return jax.tree.map(lambda x: prevent_recomputation(x) if real(x) else x, tree)
+    return jax.tree.map(lambda x: computed_once(x) if real(x) else x, tree)
 
 
-def prevent_recomputation(x: Array) -> Array:
-    """Return the array `x` unchanged, such that XLA on CPU computes it once, here and in the
-    gradient.
+def computed_once(x: Array) -> Array:
+    """Return x unchanged, such that XLA on CPU computes it once, here and in the gradient.
 
     The array is divided by one, or by two where it is NaN, so that XLA cannot know the divisor and
     leave the division out. XLA on CPU computes a quotient once; XLA repeats any cheaper operation,
@@ -107,9 +102,9 @@ def prevent_recomputation(x: Array) -> Array:
     return x / jnp.where(x == x, 1, 2)
 
 
-def compiled_as_one_kernel(function: Function) -> Function:
-    """Return a function with the arguments and the result of `function`, which are trees of arrays.
-    XLA compiles the returned function as one kernel, unless `jax.vmap` batches an argument.
+def one_kernel(function: Function) -> Function:
+    """Return `function`, such that XLA compiles it as one kernel, unless `jax.vmap` batches an
+    argument.
 
     Many small kernels for one body take long to compile; XLA on CPU makes one kernel of a loop with
     a small state. Therefore `function` runs in a loop with one iteration. XLA knows neither the
@@ -156,55 +151,40 @@ def compiled_as_one_kernel(function: Function) -> Function:
 
 @jax.custom_jvp
 def match_batch_axes(tree: PyTree, reference: PyTree) -> PyTree:
-    """Return the arrays of `tree` unchanged; under `jax.vmap` every one of them has a batch axis if
-    any array of the tree `reference` has one.
+    """Return the arrays of `tree` unchanged; under `jax.vmap` each has a batch axis if any array of
+    `reference` has one.
 
-    A function from `compiled_as_one_kernel` gives all of its results a batch axis if any argument
-    has one; the rule for its derivative calls `match_batch_axes` to do the same. Under `jit`, JAX
-    takes the batch axes from the function, and the values from the rule for the derivative. If the
-    function and the rule batch differently, arrays have wrong shapes, and no error is raised.
+    A function from `one_kernel` gives all of its results a batch axis if any argument
+    has one; the rule for its derivative does the same by this function. Under `jit`, JAX takes the
+    batch axes from the function, and the values from the rule. If the two batch differently, arrays
+    have wrong shapes, and no error is raised.
     """
-    return _unchanged_with_batch_axes(tree, reference)
+    return _with_batch_axes(tree, reference)
 
 
 @match_batch_axes.defjvp
 def _match_batch_axes_jvp(
     primals: tuple[PyTree, PyTree], tangents: tuple[PyTree, PyTree]
 ) -> tuple[PyTree, PyTree]:
-    """Return two things: the first of two trees of arrays, with the batch axes that
-    `match_batch_axes` gives it; and the change of the first tree. By this rule JAX differentiates
-    `match_batch_axes`.
-
-    - `primals`: the two trees
-    - `tangents`: their changes; the change of the second tree is not used
-    """
+    """Return the first tree and its tangent."""
     return match_batch_axes(*primals), tangents[0]
 
 
 @jax.custom_batching.custom_vmap
-def _unchanged_with_batch_axes(tree: PyTree, reference: PyTree) -> PyTree:
-    """Return `tree` unchanged. Under `jax.vmap` every array of the result has a batch axis if any
-    array of `reference` or of `tree` has one.
-
-    - `tree`: a tree of arrays
-    - `reference`: another tree of arrays, whose values are not used
+def _with_batch_axes(tree: PyTree, reference: PyTree) -> PyTree:
+    """Return `tree`, under `jax.vmap` with a batch axis in every array if any array of the
+    arguments has one.
     """
     del reference
     return tree
 
 
-@_unchanged_with_batch_axes.def_vmap
-def _match_batch_axes_under_vmap(
+@_with_batch_axes.def_vmap
+def _with_batch_axes_vmap(
     size: int, batched: PyTree, tree: PyTree, reference: PyTree
 ) -> tuple[PyTree, PyTree]:
-    """Return two things: `tree`, in which every array has a batch axis in front if any array of
-    `tree` or `reference` has one; and a tree of booleans, whether each array of this result has a
-    batch axis. By this rule `jax.vmap` batches `_unchanged_with_batch_axes`.
-
-    - `size`: the number of members of the batch
-    - `batched`: a pair of trees of booleans: which arrays of `tree`, and which of `reference`, have
-      a batch axis in front
-    - `tree`, `reference`: trees of arrays; the values in `reference` are not used
+    """Return `tree` with a batch axis in front of every array, and which arrays of the result are
+    batched.
     """
     del reference
     if not any(jax.tree.leaves(batched)):

@@ -15,7 +15,7 @@ tests for the singular case.
 """
 
 import warnings
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +26,7 @@ from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, components, cross, dot, power_of_two_scale
-from rigidjax.rotation.validation import require_nonzero_and_finite, require_turn_not_too_large
+from rigidjax.rotation.validation import require_direction, require_turn
 
 _MANY_TURNS = 8 * np.pi
 
@@ -41,10 +41,8 @@ def to_quaternion(angles: Vec3Like, sequence: str = "ZXZ") -> Quat:
     >>> to_quaternion(jnp.array([0.0, jnp.pi, 0.0])).round(12).tolist()
     [0.0, 1.0, 0.0, 0.0]
     """
-    axes, reverse = _axes_of_sequence(sequence)
-    first, second, third = map(
-        _rotation_about, axes, _components_in_order(_checked_angles(angles), reverse)
-    )
+    axes, reverse = _turns(sequence)
+    first, second, third = map(_turn, axes, _in_order(_checked_angles(angles), reverse))
     return quaternion.multiply(quaternion.multiply(first, second), third)
 
 
@@ -88,12 +86,12 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     >>> from_quaternion(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
     [0.0, 0.0, 0.0]
     """
-    (i, j, k), reverse = _axes_of_sequence(sequence)
-    q = quaternion.canonical(require_nonzero_and_finite(_checks.array_of_shape(q, (4,), "q"), "q"))
+    (i, j, k), reverse = _turns(sequence)
+    q = quaternion.canonical(require_direction(_checks.array_of_shape(q, (4,), "q"), "q"))
     q = power_of_two_scale(*components(q)) * q
     symmetric = i == k
     last = 3 - i - j
-    handed = _cross_product_sign(i, j)
+    handed = _handedness(i, j)
     w, x, y, z = q[0], q[1 + i], q[1 + j], q[1 + last]
     if symmetric:
         z = handed * z
@@ -116,9 +114,9 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     s, c = jnp.where(low, 0, s), jnp.where(high, 0, c)
     middle = 2 * jnp.arctan2(s, c) if symmetric else handed * 2 * jnp.arctan2(c - s, c + s)
     angles = [
-        _wrap_to_half_turn(half_sum + half_difference),
+        _wrapped(half_sum + half_difference),
         middle,
-        _wrap_to_half_turn(half_sum - half_difference),
+        _wrapped(half_sum - half_difference),
     ]
     return jnp.stack(angles[::-1] if reverse else angles)
 
@@ -133,8 +131,8 @@ def is_singular(angles: Vec3Like, sequence: str = "ZXZ") -> Bool[Array, ""]:
     >>> bool(is_singular(jnp.array([0.1, 0.0, 0.0]), "ZXZ"))
     True
     """
-    axes, _ = _axes_of_sequence(sequence)
-    return _triple_product_and_singularity(_checked_angles(angles)[1], axes)[1]
+    axes, _ = _turns(sequence)
+    return _reach(_checked_angles(angles)[1], axes)[1]
 
 
 def rates_to_omega(
@@ -154,10 +152,10 @@ def rates_to_omega(
     [0.0, 0.0, 2.0]
     """
     _checks.require_option(frame, ("body", "world"), "frame")
-    axes, reverse = _axes_of_sequence(sequence)
+    axes, reverse = _turns(sequence)
     angles, rates = _checked_angles(angles), _checks.array_of_shape(rates, (3,), "rates")
-    first, second, third = _turn_axes_in_body(axes, _components_in_order(angles, reverse))
-    a, b, c = _components_in_order(rates, reverse)
+    first, second, third = _body_axes(axes, _in_order(angles, reverse))
+    a, b, c = _in_order(rates, reverse)
     omega = a * first + b * second + c * third
     return omega if frame == "body" else apply(to_matrix(angles, sequence), omega)
 
@@ -179,12 +177,12 @@ def omega_to_rates(
     [0.0, 0.0, 2.0]
     """
     _checks.require_option(frame, ("body", "world"), "frame")
-    axes, reverse = _axes_of_sequence(sequence)
+    axes, reverse = _turns(sequence)
     angles, omega = _checked_angles(angles), _checks.array_of_shape(omega, (3,), "omega")
     if frame == "world":
         omega = apply(to_matrix(angles, sequence).T, omega)
-    first, second, third = _turn_axes_in_body(axes, _components_in_order(angles, reverse))
-    reach, singular = _triple_product_and_singularity(angles[1], axes)
+    first, second, third = _body_axes(axes, _in_order(angles, reverse))
+    reach, singular = _reach(angles[1], axes)
     # `second` is normal to `first` and `third`, so that `aside`, `second` and `third` are an
     # orthonormal frame: the rates follow from the components of `omega` in this frame.
     aside, along = cross(third, second), dot(first, third)
@@ -195,110 +193,87 @@ def omega_to_rates(
     return jnp.stack([c, b, a] if reverse else [a, b, c])
 
 
-def _axes_of_sequence(sequence: str) -> tuple[tuple[int, int, int], bool]:
-    """Return two things about a sequence of Euler angles: the axis numbers (0 for x, 1 for y, 2 for
-    z) of the three intrinsic turns, each about the axis that the turns before it have moved; and
-    whether the user lists the angles in the order opposite to these turns, as in an extrinsic
-    sequence (lower case). **Raises:** `ValueError` for an unknown sequence.
+class _Turns(NamedTuple):
+    """Hold three intrinsic turns, each about the axis that the turns before it have moved."""
 
-    - `sequence`: three letters such as "ZXZ" or "xyz"
+    axes: tuple[int, int, int]  # 0 for x, 1 for y, 2 for z
+    reverse: bool  # whether the user lists the angles in the opposite order, as in lower case
+
+
+def _turns(sequence: str) -> _Turns:
+    """Return the turns of a sequence such as "ZXZ" or "xyz"; raise a `ValueError` for an unknown
+    one.
     """
     extrinsic = isinstance(sequence, str) and sequence.islower()
     letters = "xyz" if extrinsic else "XYZ"
+    reason = ""
     if not isinstance(sequence, str) or len(sequence) != 3 or not set(sequence) <= set(letters):
+        reason = "three letters of one case are wanted"
+    elif sequence[1] in (sequence[0], sequence[2]):
+        reason = "two turns in a row are about one axis"
+    if reason:
         raise ValueError(
-            _unknown_sequence_message(sequence, "three letters of one case are wanted")
+            f"sequence: unknown {sequence!r}, {reason}; capitals are intrinsic (moving axes) as in "
+            "'ZXZ' or 'ZYX', lower case is extrinsic (fixed axes) as in 'xyz'"
         )
     i, j, k = (letters.index(letter) for letter in sequence)
-    if i == j or j == k:
-        raise ValueError(
-            _unknown_sequence_message(sequence, "two turns in a row are about one axis")
-        )
-    return ((k, j, i) if extrinsic else (i, j, k)), extrinsic
-
-
-def _unknown_sequence_message(sequence: object, reason: str) -> str:
-    """Return the message of the error for a `sequence` that is no sequence of Euler angles; the
-    text `reason` says why it is none.
-    """
-    return (
-        f"sequence: unknown {sequence!r}, {reason}; capitals are intrinsic (moving axes) as in "
-        "'ZXZ' or 'ZYX', lower case is extrinsic (fixed axes) as in 'xyz'"
-    )
+    return _Turns((k, j, i) if extrinsic else (i, j, k), extrinsic)
 
 
 def _checked_angles(angles: Vec3Like) -> Vec3:
-    """Return three Euler angles (3,), rad, as an array. **Warns** if an angle that JAX does not
-    trace is beyond four turns: it may be in degrees.
+    """Return three Euler angles, rad, and warn if a known one is beyond four turns: it may be in
+    degrees.
     """
-    angles = require_turn_not_too_large(_checks.array_of_shape(angles, (3,), "angles"), "angles")
+    angles = require_turn(_checks.array_of_shape(angles, (3,), "angles"), "angles")
     if _checks.is_known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
         words = "are over four turns: are they degrees? use jnp.deg2rad"
         warnings.warn(f"angles {angles.tolist()} rad {words}", stacklevel=3)
     return angles
 
 
-def _components_in_order(numbers: Vec3, reverse: bool) -> tuple[Scalar, Scalar, Scalar]:
-    """Return the components of the vector `numbers` (3,) as a tuple of scalars, in the opposite
-    order if `reverse` is true.
-    """
+def _in_order(numbers: Vec3, reverse: bool) -> tuple[Scalar, Scalar, Scalar]:
+    """Return the components of a vector, in the opposite order if `reverse` is true."""
     a, b, c = numbers
     return (c, b, a) if reverse else (a, b, c)
 
 
-def _cross_product_sign(i: int, j: int) -> int:
-    """Return the sign s of the cross product e_i × e_j = s e_k of two basis vectors: +1 or −1, for
-    two axis numbers `i` ≠ `j` (0 for x, 1 for y, 2 for z), where k is the third axis.
-    """
+def _handedness(i: int, j: int) -> int:
+    """Return the sign s of e_i × e_j = s e_k for two axes i ≠ j."""
     return 1 if (j - i) % 3 == 1 else -1
 
 
-def _rotation_about(axis: int, angle: Scalar) -> Quat:
-    """Return the unit quaternion of a turn by `angle`, rad, about the basis vector number `axis` (0
-    for x, 1 for y, 2 for z).
-    """
+def _turn(axis: int, angle: Scalar) -> Quat:
+    """Return the unit quaternion of a turn by `angle`, rad, about a basis vector."""
     parts = [jnp.cos(0.5 * angle)] + [jnp.zeros_like(angle)] * 3
     parts[1 + axis] = jnp.sin(0.5 * angle)
     return jnp.stack(parts)
 
 
-def _wrap_to_half_turn(angle: Scalar) -> Scalar:
-    """Return `angle`, rad, shifted by a full turn into the interval (−π, π] if it is outside this
-    interval. The angle must be between −2π and 2π.
-    """
+def _wrapped(angle: Scalar) -> Scalar:
+    """Return an angle between −2π and 2π, rad, shifted into the interval (−π, π]."""
     angle = jnp.where(angle > np.pi, angle - 2 * np.pi, angle)
     return jnp.where(angle <= -np.pi, angle + 2 * np.pi, angle)
 
 
-def _turn_axes_in_body(
+def _body_axes(
     axes: tuple[int, int, int], angles: tuple[Scalar, Scalar, Scalar]
 ) -> tuple[Vec3, Vec3, Vec3]:
-    """Return the axes of the three turns of Euler angles as unit vectors (3,) in the body frame.
-    The angular velocity of the body is the sum of the three axes, each multiplied by the rate of
-    its angle.
-
-    - `axes`: the axis numbers of the three intrinsic turns (0 for x, 1 for y, 2 for z)
-    - `angles`: the three angles of these turns, rad
+    """Return the axes of the three turns in the body frame: the angular velocity is the sum of the
+    axes, each times the rate of its angle.
     """
     _, j, k = axes
     first, second, third = (jnp.eye(3, dtype=angles[0].dtype)[axis] for axis in axes)
-    middle, last = _rotation_about(j, angles[1]), _rotation_about(k, angles[2])
+    middle, last = _turn(j, angles[1]), _turn(k, angles[2])
     first = quaternion.rotate_inverse(last, quaternion.rotate_inverse(middle, first))
     return first, quaternion.rotate_inverse(last, second), third
 
 
-def _triple_product_and_singularity(
-    middle_angle: Scalar, axes: tuple[int, int, int]
-) -> tuple[Scalar, Bool[Array, ""]]:
-    """Return two things that tell how near Euler angles are to the singular case ("gimbal lock"),
-    in which the axes of the first and the third turn are parallel: the product first · (third ×
-    second) of the unit axes of the three turns; and whether this product is zero to round-off.
-
-    - `middle_angle`: rad
-    - `axes`: the axis numbers of the three intrinsic turns (0 for x, 1 for y, 2 for z)
+def _reach(middle_angle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
+    """Return the product first · (third × second) of the axes of the turns, which vanishes in the
+    singular case, and whether it is zero to round-off.
     """
     i, j, k = axes
-    size = jnp.sin(middle_angle) if i == k else -_cross_product_sign(i, j) * jnp.cos(middle_angle)
+    size = jnp.sin(middle_angle) if i == k else -_handedness(i, j) * jnp.cos(middle_angle)
     return size, jnp.abs(size) < 4 * jnp.finfo(middle_angle.dtype).eps
 
 

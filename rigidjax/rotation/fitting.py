@@ -9,6 +9,7 @@ is unique.
 """
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,9 +33,9 @@ from rigidjax.rotation.linalg3 import (
     vee,
 )
 from rigidjax.rotation.validation import (
-    require_nonzero_and_finite,
-    require_rotation_matrix,
-    require_unit_quaternion,
+    require_direction,
+    require_rotation,
+    require_unit,
 )
 
 # Newton's method of `wahba` takes three to six steps where the directions fix the rotation well.
@@ -56,7 +57,7 @@ def project(matrix: Mat3Like) -> Mat3:
     matrix = _checks.array_of_shape(matrix, (3, 3), "matrix")
     if _checks.is_known(matrix):
         _checks.require_finite(matrix, "matrix")
-        require_nonzero_and_finite(matrix.reshape(9), "matrix")
+        require_direction(matrix.reshape(9), "matrix")
         size = np.max(np.abs(np.asarray(matrix)))
         scaled = np.asarray(matrix) / size
         # The determinant is that of the matrix divided by its largest entry: without the division
@@ -96,11 +97,11 @@ def wahba(
     world = _checks.array_of_shape(world, body.shape, "world")
     w = checked_weights(weights, body[:, 0], "body")
     for name, rows in (("body", body), ("world", world)):
-        require_nonzero_and_finite(rows.reshape(-1), name)
-    w, world, body = (scale_to_order_one(x) for x in (w, world, body))
+        require_direction(rows.reshape(-1), name)
+    w, world, body = (of_order_one(x) for x in (w, world, body))
     words = "wahba: these directions do not fix the attitude; two that are not parallel are needed"
     heavy, those, these = lax.stop_gradient((w, world, body))
-    best, last = _newton_of_wahba(w, world, body)
+    best, last = _newton(w, world, body)
     # The determinant `firmness` in the loop below is (σ1 + σ2)(σ2 + σ3)(σ3 + σ1) with the singular
     # values σ of b, a sum of products of directions; σ3 has the sign of det b. The determinant is 0
     # if the directions leave the turn about some axis free.
@@ -110,51 +111,48 @@ def wahba(
     # weights. They use the identity, the best rotation from these directions to themselves; the
     # third row tests the weighted pairs, which `best` fits.
     for turn, b, least in (
-        (one, _weighted_outer_products(seen, those, those), 4 * eps**0.5),
-        (one, _weighted_outer_products(seen, these, these), 4 * eps**0.5),
-        (lax.stop_gradient(best), _weighted_outer_products(heavy, those, these), 64 * eps),
+        (one, _outer_sum(seen, those, those), 4 * eps**0.5),
+        (one, _outer_sum(seen, these, these), 4 * eps**0.5),
+        (lax.stop_gradient(best), _outer_sum(heavy, those, these), 64 * eps),
     ):
-        firmness = determinant(_curvature_of_rotation_fit(turn, b / jnp.sqrt((b * b).sum())))
+        firmness = determinant(_curvature(turn, b / jnp.sqrt((b * b).sum())))
         loose = loose | ~(firmness > least)
     best = _checks.error_if(best, loose, words)
-    words = (
-        f"wahba: Newton's method did not arrive in {_MOST_STEPS} steps: the directions contradict "
-    )
-    words += (
-        "each other so that two attitudes fit about equally well; look at them and their weights"
-    )
+    words = f"wahba: Newton's method did not arrive in {_MOST_STEPS} steps: the directions "
+    words += "contradict each other so that two attitudes fit about equally well; look at them and "
+    words += "their weights"
     return _checks.error_if(best, ~(last <= eps**0.5), words)
 
 
-# `_newton_of_wahba` is compiled once: outside of `jit` its loop would be compiled at each call.
+# `_newton` is compiled once: outside of `jit` its loop would be compiled at each call.
 @partial(jax.jit, inline=True)
-def _newton_of_wahba(
+def _newton(
     weights: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
 ) -> tuple[Mat3, Scalar]:
-    """Return the rotation matrix (3, 3) that solves Wahba's problem, and the size of the last step
-    of the search, rad, which is small if Newton's method has arrived.
+    """Return the rotation that solves Wahba's problem, and the size of the last step, rad, which is
+    small if Newton's method has arrived.
     """
     fixed = lax.stop_gradient((weights, world, body))
 
     def step(state: tuple[Array, Mat3, Scalar]) -> tuple[Array, Mat3, Scalar]:
         count, rotation, _ = state
-        turn = _newton_turn_of_wahba(rotation, *fixed)
+        turn = _newton_turn(rotation, *fixed)
         rotation = product(quaternion.to_matrix(quaternion.exp(turn)), rotation)
         return count + 1, rotation, jnp.max(jnp.abs(turn))
 
     # A step smaller than this leaves an error of round-off, as Newton's method squares errors.
     least = float(jnp.finfo(weights.dtype).eps) ** 0.5
-    begin = jnp.asarray(0), _first_estimate_of_wahba(*fixed), jnp.ones((), weights.dtype)
+    begin = jnp.asarray(0), _estimate(*fixed), jnp.ones((), weights.dtype)
     _, best, last = lax.while_loop(lambda s: ~(s[2] <= least) & (s[0] < _MOST_STEPS), step, begin)
     # Only these last two Newton steps are differentiated: after one step the first derivatives
     # are right, after two steps the second derivatives, too.
     for _ in range(2):
-        turn = _newton_turn_of_wahba(best, weights, world, body)
+        turn = _newton_turn(best, weights, world, body)
         best = product(quaternion.to_matrix(quaternion.exp(turn)), best)
     return best, last
 
 
-def _first_estimate_of_wahba(
+def _estimate(
     weights: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
 ) -> Mat3:
     """Return the better of two rotations near the solution of Wahba's problem.
@@ -174,19 +172,27 @@ def _first_estimate_of_wahba(
     around = (jax.vmap(cross)(moved, world) * axis[None]).sum(-1)
     angle = jnp.arctan2((light * around).sum(), (light * across).sum())
     limit = product(quaternion.to_matrix(quaternion.exp(angle * axis)), aligned)
-    both = nearest_rotation(_weighted_outer_products(weights, world, body)), limit
+    both = nearest_rotation(_outer_sum(weights, world, body)), limit
     misfits = []
     for rotation in both:
-        _, ratio, apart = _apart_from_world(rotation, world, body)
+        _, ratio, apart = _turned(rotation, world, body)
         misfits.append((weights * (apart * apart).sum(-1) / jnp.where(ratio > 0, ratio, 1)).sum())
     return jnp.where(misfits[1] < misfits[0], *reversed(both))
 
 
-def _apart_from_world(
-    rotation: Mat3, world: Float[Array, "n 3"], body: Float[Array, "n 3"]
-) -> tuple[Float[Array, "n 3"], Float[Array, "n"], Float[Array, "n 3"]]:
-    """Return the turned directions M bᵢ (n, 3), their lengths over those of aᵢ (n,), and M bᵢ minus
-    aᵢ times this ratio (n, 3): small numbers where M fits, so that their round-off is small, too.
+class Turned(NamedTuple):
+    """Hold the directions bᵢ of the body, turned by a rotation M, beside the directions aᵢ of the
+    world.
+    """
+
+    moved: Float[Array, "n 3"]  # M bᵢ
+    ratio: Float[Array, "n"]  # |M bᵢ|/|aᵢ|
+    apart: Float[Array, "n 3"]  # M bᵢ minus aᵢ times the ratio
+
+
+def _turned(rotation: Mat3, world: Float[Array, "n 3"], body: Float[Array, "n 3"]) -> Turned:
+    """Return the turned directions; `apart` has small numbers where M fits, so that their round-off
+    is small, too.
     """
     moved = (rotation[None] * body[:, None, :]).sum(-1)
     # The derivative of the ratio of the lengths makes the derivative of the difference small, too,
@@ -194,39 +200,33 @@ def _apart_from_world(
     squares = [(x * x).sum(-1) for x in (moved, world)]
     lengths = [jnp.sqrt(jnp.where(square > 0, square, 1)) for square in squares]
     ratio = lengths[0] / lengths[1]
-    return moved, ratio, moved - ratio[:, None] * world
+    return Turned(moved, ratio, moved - ratio[:, None] * world)
 
 
-def _weighted_outer_products(
+def _outer_sum(
     weights: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
 ) -> Mat3:
-    """Return the matrix Σ wᵢ aᵢ bᵢᵀ (3, 3), a sum over n pairs of directions aᵢ and bᵢ with the
-    weights wᵢ.
-
-    - `weights`: w (n,)
-    - `world`: a (n, 3), each direction in the world frame
-    - `body`: b (n, 3), the same direction in the body frame
-    """
+    """Return the matrix Σ wᵢ aᵢ bᵢᵀ of directions aᵢ in the world and bᵢ in the body."""
     return (weights[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
 
 
-def _newton_turn_of_wahba(
+def _newton_turn(
     rotation: Mat3,
     weights: Float[Array, "n"],
     world: Float[Array, "n 3"],
     body: Float[Array, "n 3"],
 ) -> Vec3:
-    """Return one step of Newton's method for Wahba's problem, a rotation vector (3,) in the world
-    frame: to find the M with the largest Σ wᵢ aᵢ · M bᵢ, from the M given as `rotation`.
+    """Return one step of Newton's method for the M with the largest Σ wᵢ aᵢ · M bᵢ, a rotation
+    vector in the world frame.
 
     The cross product of aᵢ and M bᵢ is computed from the small difference of these two vectors:
     otherwise the rounding of a direction with a large weight would turn the body about it.
     """
-    moved, _, apart = _apart_from_world(rotation, world, body)
+    moved, _, apart = _turned(rotation, world, body)
     moment = (weights[:, None] * jax.vmap(cross)(apart, world)).sum(0)
     one = jnp.eye(3, dtype=weights.dtype)
-    outer = _weighted_outer_products(weights, moved, world)
-    return solve(_curvature_of_rotation_fit(one, outer), moment)
+    outer = _outer_sum(weights, moved, world)
+    return solve(_curvature(one, outer), moment)
 
 
 def align(a: Vec3Like, b: Vec3Like) -> Mat3:
@@ -242,9 +242,7 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     [0.0, 1.0, 0.0]
     """
     a, b = _checks.array_of_shape(a, (3,), "a"), _checks.array_of_shape(b, (3,), "b")
-    a, b = (
-        scale_to_order_one(require_nonzero_and_finite(x, name)) for x, name in ((a, "a"), (b, "b"))
-    )
+    a, b = (of_order_one(require_direction(x, name)) for x, name in ((a, "a"), (b, "b")))
     a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
     middle = a + b
     n2, normal = dot(middle, middle), cross(a, middle)
@@ -274,7 +272,7 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     matrices = _checks.array_of_rows(matrices, (3, 3), "matrices")
-    _checks.check_if_known(require_rotation_matrix, matrices, "matrices")
+    _checks.check_if_known(require_rotation, matrices, "matrices")
     checked_weights(weights, matrices[:, 0, 0], "matrices")
     return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
 
@@ -291,18 +289,15 @@ def mean_quaternion(
     [1.0, 0.0, 0.0, 0.0]
     """
     q = _checks.array_of_rows(quaternions, (4,), "quaternions")
-    _checks.check_if_known(require_unit_quaternion, q, "quaternions")
-    return _karcher_mean(q, scale_to_order_one(checked_weights(weights, q[:, 0], "quaternions")))
+    _checks.check_if_known(require_unit, q, "quaternions")
+    return _karcher_mean(q, of_order_one(checked_weights(weights, q[:, 0], "quaternions")))
 
 
 # `_karcher_mean` is compiled once: outside of `jit` its loop would be compiled again at each call.
 @partial(jax.jit, inline=True)
 def _karcher_mean(quaternions: Float[Array, "n 4"], weights: Float[Array, "n"]) -> Quat:
-    """Return the Karcher mean of n rotations, by Newton's method: the unit quaternion (4,) with the
-    least weighted sum of the squared angles from its rotation to each of the n rotations.
-
-    - `quaternions`: (n, 4), unit, each of either sign
-    - `weights`: (n,), not negative
+    """Return the Karcher mean of rotations by Newton's method; each quaternion may have either
+    sign.
     """
 
     def newton(_: Array | int, start: Quat, q: Array, w: Array) -> Quat:
@@ -322,23 +317,16 @@ def _karcher_mean(quaternions: Float[Array, "n 4"], weights: Float[Array, "n"]) 
     return quaternion.canonical(quaternion.normalise(start))
 
 
-def scale_to_order_one(x: Array) -> Array:
-    """Return an array `x` of any shape, multiplied by a power of two so that its largest entry is
-    near 1.
-
-    A formula in which the scale cancels uses this function, so that no product overflows.
+def of_order_one(x: Array) -> Array:
+    """Return x times a power of two so that its largest entry is near 1, for a formula in which the
+    scale cancels and a product could overflow.
     """
     return power_of_two_scale(jnp.max(jnp.abs(x))) * x
 
 
 def checked_weights(weights: ArrayLike | None, rows: Array, description: str) -> Array:
-    """Return the weights (n,) of n items. **Raises:** `ValueError` if there is no item, and if
-    weights that JAX does not trace are negative or all zero.
-
-    - `weights`: (n,), or `None` for weights of 1
-    - `rows`: (n,), an array with one entry for each item and with the dtype that the weights get if
-      they are `None`; only its length and dtype are used
-    - `description`: the name of the items, for messages
+    """Return the weights of the items in `rows`, or ones in their dtype for `None`, after checks;
+    `description` names the items in messages.
     """
     if rows.shape[0] == 0:
         raise ValueError(f"{description}: wanted at least one row, got none")
@@ -347,20 +335,17 @@ def checked_weights(weights: ArrayLike | None, rows: Array, description: str) ->
     w = _checks.array_of_shape(weights, rows.shape, "weights")
     if _checks.is_known(w):
         words = "numbers ≥ 0, at least one of them positive"
-        _checks.require_positive(
-            _checks.require_finite(w, "weights"), "weights", words, allow_zero=True
-        )
+        _checks.require_finite(w, "weights")
+        _checks.require_positive(w, "weights", words, allow_zero=True)
         _checks.error_if(w, ~(w > 0).any(), f"weights: wanted {words}")
     return w
 
 
-def _signed_singular_value_sum_and_zeta(b: Mat3) -> tuple[Scalar, Scalar]:
-    """Return two scalars from which the rotation nearest to a matrix b follows (Markley 1993): λ,
-    the sum of the singular values of b, in which the least one is negative if det b is negative;
-    and ζ = ½ (λ² − 1) λ − det b. λ is the largest root of a quartic equation, found by Newton's
-    method.
+def _root_and_zeta(b: Mat3) -> tuple[Scalar, Scalar]:
+    """Return λ, the sum of the singular values of b, of Frobenius norm 1, in which the least one is
+    negative if det b is; and ζ = ½ (λ² − 1) λ − det b (Markley 1993).
 
-    - `b`: (3, 3), of Frobenius norm 1
+    λ is the largest root of a quartic equation, found by Newton's method.
     """
     det, adjugate = determinant(b), cofactors(b)
     flat = 4 * (adjugate * adjugate).sum()
@@ -376,15 +361,9 @@ def _signed_singular_value_sum_and_zeta(b: Mat3) -> tuple[Scalar, Scalar]:
     return root, 0.5 * (root * root - 1) * root - det
 
 
-def _curvature_of_rotation_fit(rotation: Mat3, b: Mat3) -> Mat3:
-    """Return the matrix Tr(S) 1 − S (3, 3), where S is the symmetric part of Rᵀb, and 1 the unit
-    matrix: minus the second derivative of Tr((R exp(x))ᵀ b) with respect to a rotation vector x, at
-    x = 0.
-
-    The rotation R nearest to b has the largest Tr(Rᵀb); Newton's method for R needs this curvature.
-
-    - `rotation`: R (3, 3)
-    - `b`: (3, 3), any matrix
+def _curvature(rotation: Mat3, b: Mat3) -> Mat3:
+    """Return the matrix Tr(S) 1 − S, where S is the symmetric part of Rᵀb: minus the second
+    derivative of Tr((R exp(x))ᵀ b) by a rotation vector x, at x = 0.
     """
     m = product(rotation.T, b)
     s = 0.5 * (m + m.T)
@@ -393,12 +372,12 @@ def _curvature_of_rotation_fit(rotation: Mat3, b: Mat3) -> Mat3:
 
 @jax.custom_jvp
 def nearest_rotation(b: Mat3) -> Mat3:
-    """Return the rotation matrix R (3, 3) nearest to a matrix b (3, 3), whose entries may be of any
-    size: the R with the largest Tr(Rᵀb).
+    """Return the rotation R nearest to a matrix b with entries of any size: the R with the largest
+    Tr(Rᵀb).
     """
-    b = scale_to_order_one(b)
+    b = of_order_one(b)
     b = b / jnp.sqrt((b * b).sum())
-    root, zeta = _signed_singular_value_sum_and_zeta(b)
+    root, zeta = _root_and_zeta(b)
     kappa = 0.5 * (root * root - 1)
     rough = ((kappa + 1) * b + root * cofactors(b) - product(b, product(b.T, b))) / zeta
     q = matrix_to_quaternion(rough)
@@ -406,7 +385,7 @@ def nearest_rotation(b: Mat3) -> Mat3:
     # rotation group then give all digits of the rotation.
     for _ in range(3):
         r = quaternion.to_matrix(q)
-        turn = solve(_curvature_of_rotation_fit(r, b), 2 * vee(product(r.T, b)))
+        turn = solve(_curvature(r, b), 2 * vee(product(r.T, b)))
         q = quaternion.normalise(quaternion.multiply(q, quaternion.exp(turn)))
     # The matrix of a quaternion is orthogonal to ten units of round-off. The first term of the
     # series of (RᵀR)^(−½) makes it orthogonal to two.
@@ -416,20 +395,11 @@ def nearest_rotation(b: Mat3) -> Mat3:
 
 @nearest_rotation.defjvp
 def _nearest_rotation_jvp(primals: tuple[Mat3], tangents: tuple[PyTree, ...]) -> tuple[Mat3, Mat3]:
-    """Return the rotation matrix R (3, 3) nearest to a matrix b, and its change for a change db of
-    b. By this rule JAX differentiates `nearest_rotation`.
-
-    - `primals`: a tuple of one item, b (3, 3)
-    - `tangents`: a tuple of one item, db (3, 3)
-
-    The change is R hat(x), where hat(x) is the matrix of the cross product with x. The rotation
-    vector x solves (Tr(S) 1 − S) x = 2 vee(Rᵀ db), where S is the symmetric part of Rᵀb, and vee
-    gives the vector of the antisymmetric part of a matrix.
-    """
+    """Return the nearest rotation and its tangent, by the equation in the head of this module."""
     (b,), (db,) = primals, tangents
     r = nearest_rotation(b)
     # The entries of `b` may have any size: `b` and `db` are multiplied by a common factor, which
     # does not change the rotation or its derivative.
     scale = power_of_two_scale(jnp.max(jnp.abs(b)))
     b, db = scale * b, scale * db
-    return r, product(r, hat(solve(_curvature_of_rotation_fit(r, b), 2 * vee(product(r.T, db)))))
+    return r, product(r, hat(solve(_curvature(r, b), 2 * vee(product(r.T, db)))))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
-from rigidjax.rotation.barrier import prevent_recomputation
+from rigidjax.rotation.barrier import computed_once
 from rigidjax.rotation.linalg3 import (
     components,
     cross_components,
@@ -20,7 +20,7 @@ from rigidjax.rotation.linalg3 import (
     power_of_two_scale,
     squared_length,
 )
-from rigidjax.rotation.stumpff import arctan_ratio_of_square, inverse_jacobian_coefficient, stumpff
+from rigidjax.rotation.stumpff import arctan_ratio, inverse_coefficient, stumpff
 
 # Each function below that `_compiled` wraps is inlined where another function that is being traced
 # calls it, so that XLA and `jax.grad` see no boundary between the two.
@@ -29,8 +29,8 @@ _compiled = partial(jax.jit, inline=True)
 
 @_compiled
 def vector_to_quaternion(v: Vec3) -> Quat:
-    """Return the unit quaternion (4,) of a rotation vector v (3,), rad: (cos θ/2, ½ v
-    sin(θ/2)/(θ/2)), with the angle θ = |v|.
+    """Return the unit quaternion of a rotation vector, rad: (cos θ/2, ½ v sin(θ/2)/(θ/2)), with the
+    angle θ = |v|.
     """
     x, y, z = parts = components(v)
     s = 0.25 * squared_length(parts)
@@ -40,22 +40,21 @@ def vector_to_quaternion(v: Vec3) -> Quat:
 
 @_compiled
 def vector_to_matrix(v: Vec3) -> Mat3:
-    """Return the rotation matrix (3, 3) of a rotation vector v (3,), rad: 1 + A hat v + B (hat v)²,
-    with A = sin θ/θ, B = (1 − cos θ)/θ² and the angle θ = |v|; hat v is the matrix of the cross
-    product, (hat v) y = v × y.
+    """Return the rotation matrix of a rotation vector, rad: 1 + A hat v + B (hat v)², with A = sin
+    θ/θ, B = (1 − cos θ)/θ² and θ = |v|.
     """
     parts = components(v)
     s = 0.25 * squared_length(parts)
     half = stumpff(1, s)
     return hat_polynomial(
-        parts, prevent_recomputation(stumpff(0, s) * half), prevent_recomputation(0.5 * half * half)
+        parts, computed_once(stumpff(0, s) * half), computed_once(0.5 * half * half)
     )
 
 
 @_compiled
 def matrix_to_quaternion(m: Mat3) -> Quat:
-    """Return the unit quaternion q (w, x, y, z) of a rotation matrix m (3, 3), with its first
-    nonzero component positive, computed from the largest row of the matrix 4 q qᵀ (4, 4).
+    """Return the canonical unit quaternion q of a rotation matrix, from the largest row of 4 q
+    qᵀ.
     """
     a, b, c, d, e, f, g, h, i = entries(m)
     w, x, y, z = 1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i
@@ -71,9 +70,9 @@ def matrix_to_quaternion(m: Mat3) -> Quat:
 
 
 @jax.custom_jvp
-def _log_of_quaternion(q: Quat) -> Vec3:
-    """Return the rotation vector (3,), rad, of the shortest turn that a quaternion q (4,), of any
-    length, describes; −q has the same rotation vector.
+def _log(q: Quat) -> Vec3:
+    """Return the rotation vector, rad, of the shortest turn that q, of any length, describes; it is
+    that of −q, too.
     """
     w, x, y, z = parts = components(power_of_two_scale(*components(q)) * q)
     n2 = x * x + y * y + z * z
@@ -82,58 +81,45 @@ def _log_of_quaternion(q: Quat) -> Vec3:
     # so nothing cancels.
     a = jnp.abs(w) + jnp.sqrt(n2 + w * w)
     inverse = 1 / (a + jnp.sqrt(n2 + a * a))
-    scale = 8 * inverse * arctan_ratio_of_square(n2 * inverse * inverse)
+    scale = 8 * inverse * arctan_ratio(n2 * inverse * inverse)
     scale = jnp.where(is_noncanonical(parts), -scale, scale)
     return jnp.stack([scale * x, scale * y, scale * z])
 
 
-@_log_of_quaternion.defjvp
-def _log_of_quaternion_jvp(primals: tuple[Quat], tangents: tuple[PyTree, ...]) -> tuple[Vec3, Vec3]:
-    """Return two things for a quaternion q of any length: its rotation vector (3,), rad; and the
-    change of the rotation vector for a change dq of q. By this rule JAX differentiates
-    `_log_of_quaternion`.
-
-    The right Jacobian is the matrix that gives the small turn in the body frame for a change of the
-    rotation vector; its inverse gives the change for a turn.
-
-    - `primals`: a tuple of one item, q (4,)
-    - `tangents`: a tuple of one item, dq (4,)
-    """
+@_log.defjvp
+def _log_jvp(primals: tuple[Quat], tangents: tuple[PyTree, ...]) -> tuple[Vec3, Vec3]:
+    """Return the rotation vector and its tangent."""
     (q,), (dq,) = primals, tangents
-    v = _log_of_quaternion(q)
+    v = _log(q)
     # q may have any length: q and dq are multiplied by a common factor, which does not change the
     # derivative.
     scale = power_of_two_scale(*components(q))
     w, *u = parts = components(scale * q)
     dw, *du = components(scale * dq)
     # `turn` is the small turn in the body frame, 2 vec(q̄ dq)/|q|², with the conjugate q̄ of q and
-    # the vector part vec. The inverse right Jacobian is applied to it below.
-    scale, aside = 2 / squared_quaternion_length(parts), cross_components(u, du)
+    # the vector part vec. The inverse right Jacobian, which is applied to it below, gives the
+    # tangent of the rotation vector.
+    scale, aside = 2 / squared_norm(parts), cross_components(u, du)
     turn = [scale * (w * du[i] - dw * u[i] - aside[i]) for i in range(3)]
     vs = components(v)
     across = cross_components(vs, turn)
     twice = cross_components(vs, across)
-    g = inverse_jacobian_coefficient(dot_components(vs, vs))
+    g = inverse_coefficient(dot_components(vs, vs))
     return v, jnp.stack([turn[i] + 0.5 * across[i] + g * twice[i] for i in range(3)])
 
 
-quaternion_to_vector = _compiled(_log_of_quaternion)
+quaternion_to_vector = _compiled(_log)
 
 
 @_compiled
 def to_unit_length(q: Quat) -> Quat:
-    """Return the quaternion q (4,), of any length but zero, scaled to length 1."""
+    """Return a quaternion of any length but zero, scaled to length 1."""
     q = power_of_two_scale(*components(q)) * q
-    return q / jnp.sqrt(squared_quaternion_length(components(q)))
+    return q / jnp.sqrt(squared_norm(components(q)))
 
 
 def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar | float) -> Mat3:
-    """Return the matrix 1 + a hat v + b (hat v)², (3, 3), where hat v is the matrix with hat(v) y =
-    v × y.
-
-    - `v`: three scalars
-    - `a`, `b`: the two coefficients
-    """
+    """Return the matrix 1 + a hat v + b (hat v)², where hat(v) y = v × y."""
     x, y, z = v
     xx, yy, zz = b * x * x, b * y * y, b * z * z
     xy, yz, zx = b * x * y, b * y * z, b * z * x
@@ -143,24 +129,20 @@ def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar | float) -> Mat3:
 
 
 def left_jacobian_inverse(v: Vec3) -> Mat3:
-    """Return the inverse (3, 3) of the left Jacobian of a rotation vector v (3,), rad: 1 − ½ hat v
-    + g (hat v)², with g = (1 − (θ/2) cot(θ/2))/θ² and θ = |v|; hat v is the matrix of the cross
-    product, (hat v) y = v × y.
+    """Return the inverse of the left Jacobian of a rotation vector, rad: 1 − ½ hat v + g (hat v)²,
+    with g of `inverse_coefficient`.
     """
     t = squared_length(parts := components(v))
-    return hat_polynomial(parts, jnp.full_like(t, -0.5), inverse_jacobian_coefficient(t))
+    return hat_polynomial(parts, jnp.full_like(t, -0.5), inverse_coefficient(t))
 
 
-def squared_quaternion_length(q: Sequence[Scalar]) -> Scalar:
-    """Return the squared length of a quaternion `q`, given as four scalars."""
+def squared_norm(q: Sequence[Scalar]) -> Scalar:
+    """Return |q|²."""
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
 
 
 def quaternion_product(p: Iterable[Any], q: Iterable[Any]) -> tuple[Any, ...]:
-    """Return the product p q of two quaternions as a tuple of four scalars.
-
-    - `p`, `q`: four scalars each, (w, x, y, z), of JAX or NumPy
-    """
+    """Return the product p q of two quaternions, of scalars of JAX or NumPy."""
     a, b, c, d = p
     e, f, g, h = q
     return (
@@ -172,9 +154,8 @@ def quaternion_product(p: Iterable[Any], q: Iterable[Any]) -> tuple[Any, ...]:
 
 
 def is_noncanonical(q: Sequence[Scalar]) -> Array:
-    """Return whether the first nonzero component of a quaternion `q`, given as four scalars, is
-    negative. The quaternions q and −q are one rotation; the one whose first nonzero component is
-    positive is called canonical.
+    """Return whether the first nonzero component of q is negative: of q and −q, which are one
+    rotation, the other one is called canonical.
     """
     w, x, y, z = q
     lead = jnp.where(w != 0, w, jnp.where(x != 0, x, jnp.where(y != 0, y, z)))

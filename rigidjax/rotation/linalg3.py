@@ -16,18 +16,18 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3, Vec3Like
-from rigidjax.rotation.barrier import prevent_recomputation
+from rigidjax.rotation.barrier import computed_once
 
 
 def components(v: Float[Array, "n"]) -> tuple[Scalar, ...]:
-    """Return the n entries of a vector `v` (n,) as a tuple of scalars. They come from one
-    `lax.split`, which is faster in gradients than indices.
+    """Return the entries of a vector as scalars, by one `lax.split`, which is faster in gradients
+    than indices.
     """
     return tuple(part.reshape(()) for part in lax.split(v, (1,) * v.shape[0]))
 
 
 def entries(m: Float[Array, "3 3"]) -> tuple[Scalar, ...]:
-    """Return the nine entries of a 3×3 matrix, row by row, as scalars."""
+    """Return the nine entries of a matrix, row by row, as scalars."""
     return components(m.reshape(9))
 
 
@@ -42,31 +42,29 @@ def cross(a: Vec3Like, b: Vec3Like) -> Vec3:
 
 
 def cross_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> tuple[Scalar, ...]:
-    """Return the vector product a × b as a tuple of three scalars, for `a` and `b` given as three
-    scalars each.
-    """
+    """Return a × b."""
     (ax, ay, az), (bx, by, bz) = a, b
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
 def dot_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
-    """Return the scalar product a · b, for `a` and `b` given as three scalars each."""
+    """Return a · b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def squared_length(v: Sequence[Scalar]) -> Scalar:
-    """Return the squared length of a vector `v`, given as three scalars. XLA computes it once for
-    all its uses, because costly functions depend on it.
+    """Return |v|², which XLA computes once for all its uses, because costly functions depend on
+    it.
     """
-    return prevent_recomputation(dot_components(v, v))
+    return computed_once(dot_components(v, v))
 
 
 def power_of_two_scale(*parts: Scalar) -> Scalar:
-    """Return the power of two by which the largest of the scalars `parts`, in absolute value, must
-    be multiplied to be near 1. The derivative of the result is zero.
+    """Return the power of two by which the scalars must be multiplied so that the largest is near
+    1, with a derivative of zero.
 
-    A formula that does not depend on the length of a vector first multiplies the vector by this
-    power of two: no digit is lost, and the squares of its components do not overflow.
+    A formula that does not depend on the length of a vector first multiplies the vector by it: no
+    digit is lost, and no square overflows.
     """
     sizes = [jnp.abs(lax.stop_gradient(part)) for part in parts]
     info = jnp.finfo(sizes[0].dtype)
@@ -160,9 +158,7 @@ def determinant(a: Mat3Like) -> Scalar:
 
 
 def cofactors(a: Mat3) -> Mat3:
-    """Return the matrix of cofactors (3, 3) of any matrix `a` (3, 3); if a has an inverse, the
-    cofactors are det a · a⁻ᵀ.
-    """
+    """Return the matrix of cofactors of any matrix a, det a · a⁻ᵀ if a has an inverse."""
     m = entries(a)
     p, q, r = m[:3], m[3:6], m[6:]
     return jnp.stack([jnp.stack(cross_components(*two)) for two in ((q, r), (r, p), (p, q))])

@@ -14,7 +14,7 @@ from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import components, cross, dot, power_of_two_scale
-from rigidjax.rotation.validation import require_nonzero_and_finite
+from rigidjax.rotation.validation import require_direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
@@ -74,9 +74,7 @@ def shadow(sigma: Vec3Like) -> Vec3:
     >>> shadow(jnp.array([0.0, 0.5, 0.0])).tolist()
     [-0.0, -2.0, -0.0]
     """
-    return _shadow_unchecked(
-        require_nonzero_and_finite(_checks.array_of_shape(sigma, (3,), "sigma"), "sigma")
-    )
+    return _shadow(require_direction(_checks.array_of_shape(sigma, (3,), "sigma"), "sigma"))
 
 
 def switch(sigma: Vec3Like) -> Vec3:
@@ -89,12 +87,12 @@ def switch(sigma: Vec3Like) -> Vec3:
     """
     sigma = _checks.array_of_shape(sigma, (3,), "sigma")
     beyond = dot(sigma, sigma) > 1
-    return jnp.where(beyond, _shadow_unchecked(jnp.where(beyond, sigma, 1)), sigma)
+    return jnp.where(beyond, _shadow(jnp.where(beyond, sigma, 1)), sigma)
 
 
-def _shadow_unchecked(sigma: Vec3) -> Vec3:
-    """Return the shadow −σ/|σ|² of modified Rodrigues parameters `sigma` (3,), not zero: the other
-    parameters of the same rotation.
+def _shadow(sigma: Vec3) -> Vec3:
+    """Return the shadow −σ/|σ|² of parameters that are not zero: the other parameters of the same
+    rotation.
     """
     scale = power_of_two_scale(*components(sigma))
     near = scale * sigma

@@ -52,10 +52,10 @@ from rigidjax.rotation.linalg3 import (
     power_of_two_scale,
 )
 from rigidjax.rotation.validation import (
-    require_nonzero_and_finite,
-    require_rotation_matrix,
-    require_turn_not_too_large,
-    require_unit_quaternion,
+    require_direction,
+    require_rotation,
+    require_turn,
+    require_unit,
 )
 
 _HINT = "one quaternion is (w, x, y, z), scalar first; batch with jax.vmap"
@@ -72,9 +72,7 @@ def exp(v: Vec3Like) -> Quat:
     >>> exp(jnp.array([0.0, 0.0, jnp.pi])).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    return vector_to_quaternion(
-        require_turn_not_too_large(_checks.array_of_shape(v, (3,), "v"), "v")
-    )
+    return vector_to_quaternion(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
 
 
 def log(q: QuatLike) -> Vec3:
@@ -90,7 +88,7 @@ def log(q: QuatLike) -> Vec3:
     [0.0, 0.0, 3.141593]
     """
     return quaternion_to_vector(
-        require_nonzero_and_finite(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
+        require_direction(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
     )
 
 
@@ -127,7 +125,7 @@ def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
     [-1.0, -2.0, 3.0]
     """
     w, *u = components(_checks.array_of_shape(q, (4,), "q", hint=_HINT))
-    return _rotate_components(w, u, components(_checks.array_of_shape(y, (3,), "y")))
+    return _rotated(w, u, components(_checks.array_of_shape(y, (3,), "y")))
 
 
 def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
@@ -138,7 +136,7 @@ def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
     [-1.0, -2.0, 3.0]
     """
     w, *u = components(_checks.array_of_shape(q, (4,), "q", hint=_HINT))
-    return _rotate_components(-w, u, components(_checks.array_of_shape(y, (3,), "y")))
+    return _rotated(-w, u, components(_checks.array_of_shape(y, (3,), "y")))
 
 
 def check(
@@ -154,9 +152,7 @@ def check(
     >>> check(jnp.array([1.0, 0.0, 0.0, 1e-9])).tolist()[0]
     1.0
     """
-    return require_unit_quaternion(
-        _checks.array_of_shape(q, (4,), name, hint=_HINT, batched=True), name
-    )
+    return require_unit(_checks.array_of_shape(q, (4,), name, hint=_HINT, batched=True), name)
 
 
 def from_xyzw(xyzw: Float[ArrayLike, "4"]) -> Quat:
@@ -194,8 +190,8 @@ def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
     >>> about_axis(jnp.array([0.0, 0.0, 2.0]), jnp.pi).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    axis = require_nonzero_and_finite(_checks.array_of_shape(axis, (3,), "axis"), "axis")
-    half = 0.5 * require_turn_not_too_large(
+    axis = require_direction(_checks.array_of_shape(axis, (3,), "axis"), "axis")
+    half = 0.5 * require_turn(
         _checks.array_of_shape(angle, (), "angle").astype(axis.dtype), "angle"
     )
     axis = power_of_two_scale(*components(axis)) * axis
@@ -215,7 +211,7 @@ def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
     q = _checks.array_of_shape(q, (4,), "q", hint=_HINT)
     omega = _checks.array_of_shape(omega, (3,), "omega")
     dt = _checks.array_of_shape(dt, (), "dt").astype(omega.dtype)
-    return multiply(q, vector_to_quaternion(require_turn_not_too_large(dt * omega, "dt * omega")))
+    return multiply(q, vector_to_quaternion(require_turn(dt * omega, "dt * omega")))
 
 
 def rate(q: QuatLike, omega: Vec3Like) -> Quat:
@@ -245,10 +241,8 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
     True
     """
     p = _checks.array_of_shape(p, (4,), "p", hint=_HINT)
-    v = quaternion_to_vector(require_nonzero_and_finite(multiply(conjugate(p), q), "p̄ q"))
-    part = require_turn_not_too_large(
-        _checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn"
-    )
+    v = quaternion_to_vector(require_direction(multiply(conjugate(p), q), "p̄ q"))
+    part = require_turn(_checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn")
     return multiply(p, vector_to_quaternion(part))
 
 
@@ -270,9 +264,7 @@ def normalise(q: QuatLike) -> Quat:
     >>> normalise(jnp.array([0.0, 4.0, 0.0, 0.0])).tolist()
     [0.0, 1.0, 0.0, 0.0]
     """
-    return to_unit_length(
-        require_nonzero_and_finite(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
-    )
+    return to_unit_length(require_direction(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q"))
 
 
 def canonical(q: QuatLike) -> Quat:
@@ -295,7 +287,7 @@ def angle(q: QuatLike) -> Scalar:
     >>> round(float(angle(exp(jnp.array([0.0, 1e-9, 0.0]))) * 1e9), 9)
     1.0
     """
-    q = require_nonzero_and_finite(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
+    q = require_direction(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
     w, *u = components(power_of_two_scale(*components(q)) * q)
     n2 = dot_components(u, u)
     # At the identity the arguments of atan2 and of the root are replaced by ones: at zero the
@@ -328,15 +320,11 @@ def from_matrix(matrix: Mat3Like) -> Quat:
     [0.0, 0.0, 0.0, 1.0]
     """
     matrix = _checks.array_of_shape(matrix, (3, 3), "matrix", hint="a rotation matrix is wanted")
-    return matrix_to_quaternion(_checks.check_if_known(require_rotation_matrix, matrix, "matrix"))
+    return matrix_to_quaternion(_checks.check_if_known(require_rotation, matrix, "matrix"))
 
 
-def _rotate_components(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
-    """Return a vector turned by a unit quaternion, y + 2 (w u × y + u × (u × y)), (3,).
-
-    - `w`, `u`: the scalar part of the quaternion, and the three scalars of its vector part
-    - `y`: the three components of the vector, any unit
-    """
+def _rotated(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
+    """Return a vector turned by a unit quaternion (w, u), y + 2 (w u × y + u × (u × y))."""
     across = cross_components(u, y)
     again = cross_components(u, across)
     # The barrier makes XLA compute each component once: otherwise a torque that uses the turned

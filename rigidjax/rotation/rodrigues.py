@@ -15,7 +15,7 @@ from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import components, cross, dot, power_of_two_scale
-from rigidjax.rotation.validation import require_nonzero_and_finite
+from rigidjax.rotation.validation import require_direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
@@ -28,7 +28,7 @@ def from_quaternion(q: QuatLike) -> Vec3:
     >>> from_quaternion(jnp.array([2.0, 0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 1.0]
     """
-    q = require_nonzero_and_finite(quaternion.canonical(q), "q")
+    q = require_direction(quaternion.canonical(q), "q")
     # The derivative of g = q_v/q_w divides by q_w²: q, which may have any length, is scaled first,
     # so that nothing overflows.
     q = power_of_two_scale(*components(q)) * q

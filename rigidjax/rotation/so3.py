@@ -35,7 +35,7 @@ from rigidjax.rotation.linalg3 import (
     vee as vee,
 )
 from rigidjax.rotation.stumpff import stumpff
-from rigidjax.rotation.validation import require_rotation_matrix, require_turn_not_too_large
+from rigidjax.rotation.validation import require_rotation, require_turn
 
 
 def exp(v: Vec3Like) -> Mat3:
@@ -48,7 +48,7 @@ def exp(v: Vec3Like) -> Mat3:
     >>> exp(jnp.array([0.0, 0.0, jnp.pi / 2])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
     """
-    return vector_to_matrix(require_turn_not_too_large(_checks.array_of_shape(v, (3,), "v"), "v"))
+    return vector_to_matrix(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
 
 
 def log(matrix: Mat3Like) -> Vec3:
@@ -75,7 +75,7 @@ def left_jacobian(v: Vec3Like) -> Mat3:
     >>> left_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    parts = components(require_turn_not_too_large(_checks.array_of_shape(v, (3,), "v"), "v"))
+    parts = components(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
     t = squared_length(parts)
     return hat_polynomial(parts, stumpff(2, t), stumpff(3, t))
 
@@ -100,9 +100,7 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
     >>> left_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    return kernels.left_jacobian_inverse(
-        require_turn_not_too_large(_checks.array_of_shape(v, (3,), "v"), "v")
-    )
+    return kernels.left_jacobian_inverse(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
 
 
 def right_jacobian_inverse(v: Vec3Like) -> Mat3:
@@ -128,14 +126,11 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
     3.0
     """
     a, b = _checks.array_of_shape(a, (3, 3), "a"), _checks.array_of_shape(b, (3, 3), "b")
-    return quaternion.angle(matrix_to_quaternion(_relative_rotation(a, b)))
+    return quaternion.angle(matrix_to_quaternion(_between(a, b)))
 
 
-def _relative_rotation(a: Mat3, b: Mat3) -> Mat3:
-    """Return the rotation matrix aᵀb (3, 3), which leads from the rotation `a` to the rotation `b`,
-    both (3, 3). **Raises:** `ValueError` if the product is not finite or far from a rotation,
-    unless JAX traces the matrices.
-    """
+def _between(a: Mat3, b: Mat3) -> Mat3:
+    """Return aᵀb, or raise a `ValueError` if it is known and not finite or far from a rotation."""
     between = product(a.T, b)
     if _checks.is_known(between):
         _checks.require_finite(between, "aᵀb")
@@ -249,10 +244,8 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     [0.540302, -0.841471, 0.0]
     """
     a, b = _checks.array_of_shape(a, (3, 3), "a"), _checks.array_of_shape(b, (3, 3), "b")
-    v = quaternion.log(matrix_to_quaternion(_relative_rotation(a, b)))
-    part = require_turn_not_too_large(
-        _checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn"
-    )
+    v = quaternion.log(matrix_to_quaternion(_between(a, b)))
+    part = require_turn(_checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn")
     return product(a, vector_to_matrix(part))
 
 
@@ -280,7 +273,7 @@ def check(
     >>> check(jnp.eye(3)).shape
     (3, 3)
     """
-    return require_rotation_matrix(_checks.array_of_shape(matrix, (3, 3), name, batched=True), name)
+    return require_rotation(_checks.array_of_shape(matrix, (3, 3), name, batched=True), name)
 
 
 __all__ = [

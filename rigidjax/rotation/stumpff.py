@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-# The largest argument of `arctan_ratio_of_square`, tan²(π/8).
+# The largest argument of `arctan_ratio`, tan²(π/8).
 _REACH = math.tan(math.pi / 8) ** 2
 # π as the sum of three numbers. The first two have only 28 (float64) or 10 (float32) bits, so that
 # their products with a number of half turns are exact.
@@ -27,23 +27,22 @@ _PI_PARTS = {
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, a sum over n = 0, 1, 2, …, of the
-    order k = 0, 1, 2, …, for t = θ² ≥ 0, any shape (Battin 1999, eq 4.80).
+    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)! for t = θ² ≥ 0 (Battin 1999, eq 4.80).
 
     c_0 is cos θ, c_1 sin θ/θ, c_2 (1 − cos θ)/θ², c_3 (θ − sin θ)/θ³. Values and derivatives of
     every order are right to a few units of round-off of 1/k!.
     """
     if k < 2:
-        return _cosine_or_sinc_of_square(k, t)
+        return _cos_or_sinc(k, t)
     # For t > π² the recurrence c_{j+2} = (1/j! − c_j)/t is used, which loses no digit that matters
     # there; for a smaller t it would, and the series of c_k is summed.
     limit = math.pi**2
     far = t > limit
     divisor = jnp.where(far, t, 1)
-    value = _cosine_or_sinc_of_square(k % 2, t)
+    value = _cos_or_sinc(k % 2, t)
     for j in range(k % 2, k - 2, 2):
         value = (1 / math.factorial(j) - value) / divisor
-    near = _stumpff_series(k, jnp.where(far, 0, t), limit)
+    near = _series(k, jnp.where(far, 0, t), limit)
     return jnp.where(far, 1 / math.factorial(k - 2) - value, near) / divisor
 
 
@@ -51,48 +50,31 @@ def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
 def _stumpff_jvp(
     k: int, primals: tuple[Float[Array, "..."]], tangents: tuple[PyTree, ...]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, a sum over n = 0, 1, 2, …, and its
-    change for a change dt of t, from the derivative ½ (k c_{k+2} − c_{k+1}). By this rule JAX
-    differentiates `stumpff`.
-
-    - `k`: the order, 0, 1, 2, …
-    - `primals`: a tuple of one item, t
-    - `tangents`: a tuple of one item, dt
-    """
+    """Return c_k and its tangent, by c_k' = ½ (k c_{k+2} − c_{k+1})."""
     (t,), (dt,) = primals, tangents
     slope = k * stumpff(k + 2, t) - stumpff(k + 1, t) if k else -stumpff(1, t)
     return stumpff(k, t), 0.5 * slope * dt
 
 
-def inverse_jacobian_coefficient(t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the coefficient g = (1 − (θ/2) cot(θ/2))/θ² of (hat v)² in the inverse of the left or
-    right Jacobian of a rotation vector v, as a smooth function of `t`; it is 1/12 at 0.
-
-    - `t`: θ² = |v|², below (2π)², any shape
+def inverse_coefficient(t: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return g = (1 − (θ/2) cot(θ/2))/θ² of t = θ² < (2π)², the coefficient of (hat v)² in the
+    inverse Jacobian of a rotation vector v; it is 1/12 at 0.
     """
     return (stumpff(3, t) - 2 * stumpff(4, t)) / stumpff(1, 0.25 * t) ** 2
 
 
-def arctan_ratio_of_square(square: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return arctan(x)/x of a number x that is given by its square, by the Taylor series
-    (Abramowitz & Stegun 4.4.42).
-
-    - `square`: x², from 0 to tan²(π/8), any shape
+def arctan_ratio(square: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return arctan(x)/x from x², from 0 to tan²(π/8), by the Taylor series (Abramowitz & Stegun
+    4.4.42).
     """
     tiny = jnp.finfo(square.dtype).eps / 4
     terms = next(n for n in range(1, 40) if _REACH**n / (2 * n + 1) < tiny)
-    return _evaluate_polynomial([(-1) ** n / (2 * n + 1) for n in range(terms)], square)
+    return _polynomial([(-1) ** n / (2 * n + 1) for n in range(terms)], square)
 
 
-def _cosine_or_sinc_of_square(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return cos θ (for k = 0) or sin θ/θ (for k = 1) of an angle θ, rad, that is given by its
-    square.
-
-    The value is that of a polynomial. An angle θ above π/2 is first reduced by half turns to a
-    remainder between −π/2 and π/2.
-
-    - `k`: 0 or 1
-    - `t`: θ² ≥ 0, any shape
+def _cos_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return cos θ (k = 0) or sin θ/θ (k = 1) from t = θ² ≥ 0, by a polynomial, after half turns
+    are subtracted from an angle above π/2.
     """
     limit = (math.pi / 2) ** 2
     far = t > limit
@@ -101,7 +83,7 @@ def _cosine_or_sinc_of_square(k: int, t: Float[Array, "..."]) -> Float[Array, ".
     # An angle θ beyond 1/ε, where ε is the unit of round-off, has no correct digit; its remainder
     # must still stay in the range of the polynomials.
     remainder = jnp.clip(remainder, -2.0, 2.0)
-    value = _stumpff_series(k, jnp.where(far, remainder * remainder, t), limit)
+    value = _series(k, jnp.where(far, remainder * remainder, t), limit)
     value = value * jnp.where(far, remainder, 1) if k else value
     # The value is divided by the sign, not multiplied: XLA on CPU computes a quotient once, but
     # repeats a polynomial for each use.
@@ -110,8 +92,8 @@ def _cosine_or_sinc_of_square(k: int, t: Float[Array, "..."]) -> Float[Array, ".
 
 
 def split_half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Return n and r, in the shape of `angle` (rad), with angle = nπ + r, an integer n and |r| ≤
-    π/2; in derivatives n is constant.
+    """Return n and r with angle = nπ + r, an integer n and |r| ≤ π/2; in derivatives n is
+    constant.
     """
     turns = jax.lax.stop_gradient(jnp.round(angle * (1 / math.pi)))
     # π is the sum of three parts. The number n of half turns (`turns`) times `head`, and times
@@ -121,30 +103,20 @@ def split_half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], F
 
 
 def power_of_minus_one(n: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return (−1)ⁿ for integers `n`, given as floating-point numbers of any shape."""
+    """Return (−1)ⁿ for integers n, given as floating-point numbers."""
     return 1 - 2 * (n - 2 * jnp.floor(0.5 * n))
 
 
-def _stumpff_series(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, "..."]:
-    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, a sum over n = 0, 1, 2, …, by its
-    first terms; later terms are below round-off.
-
-    - `k`: the order, 0, 1, 2, …
-    - `t`: from 0 to `limit`, any shape
-    - `limit`: the largest t, which determines how many terms are summed
-    """
+def _series(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, "..."]:
+    """Return c_k(t) for 0 ≤ t ≤ `limit` by as many terms as the limit needs."""
     tiny = jnp.finfo(t.dtype).eps / 8
     size = 1 / math.factorial(k)
     terms = next(n for n in range(1, 40) if limit**n / math.factorial(k + 2 * n) < tiny * size)
-    return _evaluate_polynomial([(-1) ** n / math.factorial(k + 2 * n) for n in range(terms)], t)
+    return _polynomial([(-1) ** n / math.factorial(k + 2 * n) for n in range(terms)], t)
 
 
-def _evaluate_polynomial(coefficients: list[float], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the value of a polynomial c₀ + c₁ x + c₂ x² + … at `x`, an array of any shape, by
-    Horner's scheme.
-
-    - `coefficients`: c₀, c₁, c₂, …
-    """
+def _polynomial(coefficients: list[float], x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return c₀ + c₁ x + c₂ x² + … by Horner's scheme."""
     value = jnp.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         value = value * x + coefficient

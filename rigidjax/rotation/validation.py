@@ -13,66 +13,52 @@ from rigidjax import _checks
 
 
 def rotation_tolerance(dtype: object) -> float:
-    """Return the largest error that checks of a rotation tolerate: 1e-6 for the `dtype` float64,
-    1e-3 for float32. It is the error of the length of a quaternion, or of an entry of MᵀM for a
-    matrix M.
+    """Return the largest error that checks of a rotation tolerate, of the length of a quaternion or
+    of an entry of MᵀM for a matrix M.
     """
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
-def require_nonzero_and_finite(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
-    """Return the vector `v` (n,), any unit. **Raises:** `ValueError`, unless JAX traces `v`, if `v`
-    has no direction, that is, for zero, NaN and infinity. The text `name` names the vector in the
-    message.
+def require_direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
+    """Return the vector `v`, or raise a `ValueError` if it is known and has no direction: for zero,
+    NaN and infinity.
 
     Entries that are all below the least normal number of the dtype, 2e-308 in float64, count as
     zero, because XLA on some machines takes such numbers for zero.
     """
     if (
         _checks.is_known(v)
-        and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest_absolute_entry(v) < np.inf
+        and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest(v) < np.inf
     ):
         _checks.require_finite(v, name)
-        got = (
-            "zero"
-            if _largest_absolute_entry(v) == 0
-            else f"less than the least normal number, {least:.2g}"
-        )
+        got = "zero" if _largest(v) == 0 else f"less than the least normal number, {least:.2g}"
         raise ValueError(f"{name}: wanted a direction, got {got}")
     return v
 
 
-def require_turn_not_too_large(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
-    """Return the rotation vector or the angle `v`, rad. **Raises:** `ValueError`, unless JAX traces
-    `v`, if it is so large (4.5e15 rad; in float32 8.4e6 rad) that no digit of the rotation is
-    correct. The text `name` names `v` in the message.
+def require_turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
+    """Return the rotation vector or angle `v`, rad, or raise a `ValueError` if it is known and so
+    large that no digit of the rotation is correct.
     """
-    if _checks.is_known(v) and not _largest_absolute_entry(v) <= (
-        limit := 1 / float(jnp.finfo(v.dtype).eps)
-    ):
+    if _checks.is_known(v) and not _largest(v) <= (limit := 1 / float(jnp.finfo(v.dtype).eps)):
         _checks.require_finite(v, name)
         raise ValueError(
-            f"{name}: a turn by {_largest_absolute_entry(v):.3g} rad; beyond {limit:.2g} rad "
+            f"{name}: a turn by {_largest(v):.3g} rad; beyond {limit:.2g} rad "
             f"neighbouring {v.dtype} numbers are more than half a radian apart: the attitude is "
             "unknown"
         )
     return v
 
 
-def _largest_absolute_entry(v: Float[Array, "*n"]) -> float:
-    """Return the largest absolute value of the entries of an array `v` that JAX does not trace; NaN
-    if an entry is NaN.
-    """
+def _largest(v: Float[Array, "*n"]) -> float:
+    """Return the largest absolute value of the entries of a known array."""
     # The result is NaN if an entry is NaN. The function makes one call of NumPy only, because it
     # runs before every conversion that is called outside of `jit`.
     return float(np.abs(np.asarray(v)).max())
 
 
-def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
-    """Return the matrices m (..., 3, 3). **Raises:** `ValueError` (under `jit` `equinox.error_if`)
-    if any of them is no rotation. For known matrices the message contains the determinant or the
-    largest entry of |mᵀm − 1|. The text `name` names the matrices in the message.
-    """
+def require_rotation(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
+    """Return the matrices, or raise an error, also under `jit`, if any of them is no rotation."""
     m = _checks.require_finite(m, name)
     known = _checks.is_known(m)
     xp, values = (np, np.asarray(m)) if known else (jnp, m)
@@ -93,8 +79,8 @@ def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[A
 
 
 def require_near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"]:
-    """Return the quaternion `q` (4,). **Raises:** `ValueError` if its length differs from 1 by more
-    than `limit`, unless JAX traces it; the text `name` names the quaternion in the message.
+    """Return the quaternion, or raise a `ValueError` if it is known and its length differs from 1
+    by more than `limit`.
     """
     if _checks.is_known(q):
         length = float(np.linalg.norm(np.asarray(q, float)))
@@ -104,10 +90,9 @@ def require_near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Ar
     return q
 
 
-def require_unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
-    """Return quaternions `q` (..., 4) scaled to length 1. **Raises:** `ValueError` (under `jit`
-    `equinox.error_if`) if a length is not nearly 1; the text `name` names the quaternion in the
-    message.
+def require_unit(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
+    """Return quaternions scaled to length 1, or raise an error, also under `jit`, if a length is
+    not nearly 1.
     """
     q = _checks.require_finite(q, name)
     # Known numbers are checked by NumPy: under `jit`, JAX would trace also what is computed from

@@ -22,16 +22,16 @@ from rigidjax.exact.components3 import (
     Triple,
     add,
     adjugate,
-    change_by_inverse_rotation,
+    change_unrotated,
     determinant,
     matvec,
 )
-from rigidjax.exact.derivatives import free_momentum_and_rotation
+from rigidjax.exact.derivatives import free_motion
 from rigidjax.exact.diffrax_solver import field_and_direction
 from rigidjax.exact.principal_axes import (
     combine_columns,
     components_along,
-    principal_tensor_and_axes,
+    principal_axes,
 )
 from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations
@@ -117,7 +117,7 @@ def principal_frame_of_tensor(tensor: Array) -> PrincipalFrame:
 
     `tensor` (3, 3) is the inertia in body axes, kg m².
     """
-    six, axes = principal_tensor_and_axes(tensor)
+    six, axes = principal_axes(tensor)
     # The tensor is divided by its trace before it is inverted, because the determinant of an
     # inertia of 1e37 kg m² would overflow.
     size = six[0] + six[1] + six[2]
@@ -329,11 +329,11 @@ def change_in_splitting_step(
         drift, kick = weights
         length = drift.astype(dtype)
         momentum = add(state[1], change)
-        _, (w, x, y, z) = free_momentum_and_rotation(frame.moments, momentum, length)
+        _, (w, x, y, z) = free_motion(frame.moments, momentum, length)
         # The components of the momentum along the body axes change, because the axes turn. Only the
         # change is computed and added, so that the rounding error of |Π| is that of the change,
         # which is small.
-        change = add(change, change_by_inverse_rotation((w, x, y, z), momentum))
+        change = add(change, change_unrotated((w, x, y, z), momentum))
         turn = jnp.stack(
             [-(x * x + y * y + z * z) / (1 + w), *combine_columns(frame.axes, (x, y, z))]
         )

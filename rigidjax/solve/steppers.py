@@ -27,7 +27,7 @@ from rigidjax.motion.torques.base import evaluate_torque, may_read_attitude
 from rigidjax.motion.torques.inputs import bind, delays_of
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.barrier import barrier
-from rigidjax.rotation.kernels import quaternion_product, squared_quaternion_length
+from rigidjax.rotation.kernels import quaternion_product, squared_norm
 from rigidjax.rotation.linalg3 import components
 from rigidjax.solve import splitting
 from rigidjax.solve.components import Atoms, join_scalars, split_into_scalars
@@ -376,7 +376,7 @@ def _change_to_unit_length(y: Atoms, change: Atoms, example_state: Any) -> Atoms
     # q is the quaternion after the step. The difference |q|² − 1, the excess, has few correct
     # digits. Its rounding error is harmless, because it only changes the length of q and does not
     # turn the body.
-    excess = jnp.minimum(squared_quaternion_length(after) - 1.0, 1.0)
+    excess = jnp.minimum(squared_norm(after) - 1.0, 1.0)
     # 1 − 1/√(1 + e), with the excess e, is computed by a series, because on a GPU a root and a
     # quotient take a third of the time of a step. The error e⁴/4 of the series is below round-off
     # for steps that turn the body by less than half a radian; after a longer step the following

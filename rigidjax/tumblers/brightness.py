@@ -13,7 +13,7 @@ from rigidjax import _checks
 from rigidjax._names import define_dir_and_getattr
 from rigidjax._types import Numbers, Scalar, Vector
 from rigidjax.body.meshes import checked_faces
-from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
+from rigidjax.body.scaling import binary_exponent, times_power_of_two
 from rigidjax.tumblers.scattering import (
     AbstractScattering as AbstractScattering,
     Geometric as Geometric,
@@ -51,11 +51,11 @@ def ellipsoid(
     a = _checks.array_of_shape(semi_axes, (3,), "semi_axes", unit="m")
     a = _checks.require_positive(a, "semi_axes", "three positive lengths, m")
     s, o = (
-        unit_direction(sun, "sun").astype(a.dtype),
-        unit_direction(observer, "observer").astype(a.dtype),
+        unit_direction(v, name).astype(a.dtype)
+        for v, name in ((sun, "sun"), (observer, "observer"))
     )
     # The axes are scaled by a power of two, since their fourth powers could overflow.
-    size = largest_binary_exponent(a)
+    size = binary_exponent(a)
     a = times_power_of_two(a, -size)
     return times_power_of_two(law.of_ellipsoid(jnp.diag(a * a), s, o), 2 * size)
 

@@ -4,7 +4,7 @@ curve.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -34,12 +34,12 @@ from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot
 from rigidjax.tumblers.search import (
     MAGNITUDE,
+    fluxes_of,
     noise_of,
-    search_all_then_best_starts,
-    starts_from_frequency_pairs,
-    times_fluxes_and_noise,
+    search_starts,
+    starts_of_pairs,
 )
-from rigidjax.tumblers.sensor import Brightness, sun_observer_bisector
+from rigidjax.tumblers.sensor import Brightness, bisector_at
 from rigidjax.tumblers.two_frequencies import TwoFrequencies, two_frequencies
 
 # Two motions count as the same if their rotation periods, precession periods and two ratios of
@@ -62,27 +62,15 @@ LEAST, ABOVE = 12, 40.0
 
 
 class Alias(eqx.Module):
-    """Hold a motion that a search found.
+    """Hold a motion that a search found."""
 
-    **Fields:**
-
-    - `x`: (n,) the free numbers.
-    - `cost`: half of χ², the sum over the readings of the squares of error divided by noise.
-    - `rotation`: the body period, s (`rigidjax.exact.body_period`).
-    - `precession`: the mean precession period, s (`rigidjax.exact.precession_period`).
-    - `mode`: `"long"` or `"short"`, for a momentum that circulates in the body about the axis of
-      the smallest or of the largest moment.
-    - `ratios`: (2,) the two smaller moments of inertia divided by the largest.
-    - `explains`: whether this motion explains the data nearly as well as the best motion.
-    """
-
-    x: Float[Array, " n"]
-    cost: float
-    rotation: float
-    precession: float
-    mode: str
-    ratios: np.ndarray
-    explains: bool
+    x: Float[Array, " n"]  # the parameters
+    cost: float  # half of χ²
+    rotation: float  # s, of `rigidjax.exact.body_period`
+    precession: float  # s, of `rigidjax.exact.precession_period`
+    mode: str  # "long" or "short": the momentum circulates about the smallest or largest moment
+    ratios: Float[np.ndarray, "2"]  # the two smaller moments of inertia divided by the largest
+    explains: bool  # whether the motion explains the data nearly as well as the best motion
 
     def __str__(self) -> str:
         return (
@@ -189,24 +177,20 @@ def fit_light_curve(
     say = lambda line: None  # noqa: E731
     if progress is not None:
         say = _checks.require_function(progress, "progress", "of a line of text, such as print")
-    t, flux, noise = times_fluxes_and_noise(model, reading)
+    t, flux, noise = fluxes_of(model, reading)
     squares, sigma = flux**2, None if noise is None else 2.0 * flux * noise
     pairs = two_frequencies(t, squares, sigma, shortest=shortest, count=count)
     above = ABOVE * max(1.0, float(pairs.misfits[0]) / pairs.dof)
     used = max(LEAST, int((pairs.misfits <= pairs.misfits[0] + above).sum()))
-    starts = starts_from_frequency_pairs(
-        model, reading, t, squares, sigma, pairs.frequencies[:used]
-    )
+    starts = starts_of_pairs(model, reading, t, squares, sigma, pairs.frequencies[:used])
     say(f"{used} pairs of frequencies, χ² {pairs.misfits[0]:.6g} of {pairs.dof}")
     say(f"{len(starts)} starts")
     whole = stacking.pad_to_few(model)
-    ends = search_all_then_best_starts(
-        whole, starts, noise_of(reading, flux, pairs.scatter), tolerance
-    )
-    aliases = _distinct_motions(whole, ends)
+    ends = search_starts(whole, starts, noise_of(reading, flux, pairs.scatter), tolerance)
+    aliases = _distinct(whole, ends)
     say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
     best = fit(whole, starts=1, initial=aliases[0].x, tolerance=tolerance)
-    result = _light_curve_of_fit(best, aliases, pairs, used >= count)
+    result = _result(best, aliases, pairs, used >= count)
     # The result has the readings without the padding that the search added.
     own = eqx.tree_at(lambda m: m.slots, model, best.model.slots)
     linear = best.linear and best.linear.first_times(model.records.t.shape[1])
@@ -214,11 +198,8 @@ def fit_light_curve(
 
 
 def _require_one_brightness(model: Model) -> Reading:
-    """Return the readings of the model's only sensor, a `Brightness`, without the leading axis of
-    length 1 that counts recordings.
-
-    Raise `TypeError` for traced numbers, as within `jax.jit`, and `ValueError` for a model with
-    another sensor, several sensors, recordings or bodies, or a torque.
+    """Return the readings of the model's only sensor, a `Brightness`, without the axis that counts
+    recordings; refuse any other model.
     """
     require_single(model)
     if not _checks.is_known(model):
@@ -240,81 +221,50 @@ def _require_one_brightness(model: Model) -> Reading:
     return stacking.pick(readings[0], 0)
 
 
+class Nature(NamedTuple):
+    """Hold what tells one free motion from another."""
+
+    logarithms: Float[Array, "4"]  # of both periods, s, and of the ratios of `Alias`
+    energy: Scalar  # h²/2T over the middle moment, below 1 in the long-axis mode
+
+
 @eqx.filter_jit
-def _log_periods_moment_ratios_and_mode_number(
-    x: Float[Array, " n"], model: Model
-) -> tuple[Float[Array, "4"], Scalar]:
-    """Return two things: the logarithms (4,) of the rotation period, s, of the precession period,
-    s, and of the two smaller moments divided by the largest; and the number h²/2T divided by the
-    middle moment.
-
-    Here h is the angular momentum and T the kinetic energy. If the second result is below 1, the
-    momentum circulates in the body about the axis of the smallest moment (long-axis mode), else
-    about the axis of the largest moment (short-axis mode).
-
-    - `x`: (n,) the free numbers of the model, which determine the body and its initial state.
-    - `model`: a model of one recording of a free body.
-    """
+def _nature(x: Float[Array, " n"], model: Model) -> Nature:
+    """Return what tells the motion with the parameters x from another."""
     body: Any = model.bodies(x)
     inertia = Inertia(tensor_of(body))
     omega = x[model.index.start[0, -3:]] * model.reference.rate[0]
     moments, momentum = inertia.moments, apply(inertia.tensor, omega)
     both = exact.body_period(inertia, omega), exact.precession_period(inertia, omega)
     numbers = jnp.log(jnp.concatenate([jnp.stack(both), moments[:2] / moments[2]]))
-    return numbers, dot(momentum, momentum) / dot(omega, momentum) / moments[1]
+    return Nature(numbers, dot(momentum, momentum) / dot(omega, momentum) / moments[1])
 
 
 @eqx.filter_jit
-def _derivatives_of_log_periods_and_ratios(
-    x: Float[Array, " n"], model: Model
-) -> Float[Array, "4 n"]:
-    """Return the derivatives (4, n) of the logarithms of the two periods and the two ratios of
-    moments with respect to the n free numbers.
-
-    The periods are the rotation period and the precession period; the ratios are the two smaller
-    moments divided by the largest.
-
-    - `x`: (n,) the free numbers of the model, at which the derivatives are taken.
-    - `model`: a model of one recording of a free body.
-    """
-    return jax.jacfwd(lambda x: _log_periods_moment_ratios_and_mode_number(x, model)[0])(x)
+def _slopes(x: Float[Array, " n"], model: Model) -> Float[Array, "4 n"]:
+    """Return the derivatives of the logarithms in a `Nature` by the parameters."""
+    return jax.jacfwd(lambda x: _nature(x, model)[0])(x)
 
 
-def _motion_of_free_numbers(model: Model, x: Array, cost: float) -> Alias:
-    """Return the motion with the free numbers `x` as an `Alias`.
-
-    The `Alias` also holds the two periods of the motion, its mode, and the two smaller moments
-    divided by the largest. The mode is `"long"` or `"short"`, for a momentum that circulates in the
-    body about the axis of the smallest or of the largest moment.
-
-    - `model`: the model of the light curve.
-    - `x`: (n,) the free numbers.
-    - `cost`: half of χ² of the motion. χ² is a sum over the readings, of the squares of error
-      divided by noise.
-    """
-    numbers, middle = (np.asarray(v) for v in _log_periods_moment_ratios_and_mode_number(x, model))
+def _alias(model: Model, x: Array, cost: float) -> Alias:
+    """Return the motion with the parameters x as an `Alias`."""
+    numbers, middle = (np.asarray(v) for v in _nature(x, model))
     rotation, precession, *ratios = np.exp(numbers)
     mode = "long" if middle < 1 else "short"
     motion = float(rotation), float(precession), mode, np.array(ratios)
     return Alias(x, cost, *motion, explains=False)
 
 
-def _distinct_motions(model: Model, ends: list[Attempt]) -> list[Alias]:
-    """Return the different motions among the results of searches, each as an `Alias`, the smallest
-    misfit first.
-
-    Results whose misfit is not finite are left out; `ValueError` is raised if no result is left.
-
-    - `model`: the model of the light curve.
-    - `ends`: the results of the searches, each with its free numbers `x` and its misfit `cost`. The
-      misfit is half of χ², a sum over the readings of the squares of error divided by noise.
+def _distinct(model: Model, ends: list[Attempt]) -> list[Alias]:
+    """Return the different motions among the results of searches with a finite cost, the smallest
+    first.
     """
     out: list[Alias] = []
     for end in sorted(ends, key=lambda one: float(one.cost)):
         if not np.isfinite(float(end.cost)):
             continue
-        alias = _motion_of_free_numbers(model, end.x, float(end.cost))
-        if not any(_is_same_motion(alias, other, SAME) for other in out):
+        alias = _alias(model, end.x, float(end.cost))
+        if not any(_same(alias, other, SAME) for other in out):
             out.append(alias)
     if not out:
         raise ValueError(
@@ -324,54 +274,40 @@ def _distinct_motions(model: Model, ends: list[Attempt]) -> list[Alias]:
     return out
 
 
-def _is_same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
-    """Return whether the motions `a` and `b` have the same mode, and nearly the same periods and
-    ratios of moments.
-
-    The mode is the axis about which the momentum circulates in the body. The ratios are the two
-    smaller moments divided by the largest.
-
-    `tolerance` (4,) has the largest differences of the logarithms of the rotation period, the
-    precession period and the two ratios of moments.
+def _same(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
+    """Return whether two motions have the same mode, and logarithms of the periods and ratios that
+    differ by less than `tolerance` (4,).
     """
     one, other = (np.log([m.rotation, m.precession, *m.ratios]) for m in (a, b))
     return a.mode == b.mode and bool((np.abs(one - other) < tolerance).all())
 
 
 @eqx.filter_jit
-def _bisectors_in_body_frame(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
-    """Return the unit vectors (T, 3) half way between the directions to sun and observer, at the T
-    times of the readings, in the axes of the moving body.
-
-    - `x`: (n,) the free numbers of the model, which determine the body and its motion.
-    - `model`: a model of one recording of a free body with a `Brightness` sensor.
+def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
+    """Return the unit vectors half way between sun and observer at the times of the readings, in
+    the axes of the moving body.
     """
     point = model.unpack(x)
     body, state0 = point.body, point.state0
     motion, t = exact.FreeBody(Inertia(tensor_of(body)), state0), model.records.t[0]
     sensor = stacking.pick(model.records.readings[0], 0).sensor
 
-    def bisector_at(now: Array) -> Array:
+    def in_body(now: Array) -> Array:
         state: Any = motion(now - t[0])
-        return quaternion.rotate_inverse(state.q, sun_observer_bisector(sensor, now))
+        return quaternion.rotate_inverse(state.q, bisector_at(sensor, now))
 
-    return jax.vmap(bisector_at)(t)
+    return jax.vmap(in_body)(t)
 
 
-def _widen_covariance_for_shape_errors(best: Fit) -> Fit:
-    """Return the fit `best` of a light curve with a larger covariance, which allows for a body that
-    is not an ellipsoid.
-
-    The errors of the shape are not estimated, but their uncertainty is added to the covariance: the
-    brightness is multiplied by 1 + n·S n, where n (3,) is the direction half way between sun and
-    observer in the body frame, and the entries of S (3, 3) are independent random numbers with the
-    standard deviation `SHAPE`. All quantities of the fit get new, wider intervals.
+def _widened(best: Fit) -> Fit:
+    """Return the fit of a light curve with a larger covariance, which allows for a body that is not
+    an ellipsoid (see `fit_light_curve`), and wider intervals.
     """
     linear: Any = best.linear
     reading, weight = stacking.pick(best.model.records.readings[0], 0), linear.weights[0][0]
     flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
     size = np.full(weight.shape, 1.0 / MAGNITUDE) if reading.sensor.unit == "mag" else flux
-    n = np.asarray(_bisectors_in_body_frame(best.x, best.model))
+    n = np.asarray(_bisectors(best.x, best.model))
     change = SHAPE / float(best.noises[0][0, 0]) * size[:, None, None] * n[:, :, None] * n[:, None]
     slopes = linear.slopes[0][0, :, 0] * weight[:, None]
     kept = weight > 0
@@ -392,23 +328,14 @@ def _widen_covariance_for_shape_errors(best: Fit) -> Fit:
     )
 
 
-def _light_curve_of_fit(
+def _result(
     best: Fit, aliases: list[Alias], pairs: TwoFrequencies, is_incomplete: bool
 ) -> LightCurve:
-    """Return the `LightCurve` that holds the best fit and all motions, each marked whether it
-    explains the readings nearly as well as the best motion.
-
-    - `best`: the fit of the motion with the smallest misfit.
-    - `aliases`: all motions that the search found, the best first.
-    - `pairs`: the pairs of frequencies that fit the light curve; the search started from the best
-      of them.
-    - `is_incomplete`: whether as many pairs were tried as the user allowed (`count`), so that
-      further pairs may fit.
+    """Return the result that holds the fit of the best motion, and all motions, the best first;
+    more pairs of frequencies may fit if `is_incomplete`.
     """
-    slopes, wider = (
-        np.asarray(_derivatives_of_log_periods_and_ratios(best.derivative_point, best.model)),
-        _widen_covariance_for_shape_errors(best),
-    )
+    slopes = np.asarray(_slopes(best.derivative_point, best.model))
+    wider = _widened(best)
     own, deviations = (
         standard_deviations(
             slopes, np.asarray(one.determined_covariance), np.asarray(one.null_directions)
@@ -420,8 +347,8 @@ def _light_curve_of_fit(
     near = np.fmax(SAME, REACH * own)
     # The best motion keeps the cost that the search gave it, since the costs of the search all
     # belong to the same noise; the fit may have estimated another noise.
-    first = _motion_of_free_numbers(best.model, best.x, aliases[0].cost)
-    others = [alias for alias in aliases if not _is_same_motion(alias, first, near)]
+    first = _alias(best.model, best.x, aliases[0].cost)
+    others = [alias for alias in aliases if not _same(alias, first, near)]
     # A motion whose misfit exceeds that of the best motion by less than a margin explains the data
     # nearly as well. The margin is wider if the errors of the best motion are larger than the
     # noise, or autocorrelated.

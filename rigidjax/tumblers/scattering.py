@@ -10,6 +10,7 @@ so that the formulas are regular for a sphere.
 
 import abc
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,10 +20,10 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Numbers, Scalar, Vec3, Vec3Like
-from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
+from rigidjax.body.scaling import binary_exponent, times_power_of_two
 from rigidjax.rotation.linalg3 import apply, cofactors, cross, determinant, dot
 
-# For arguments below _SMALL the function `_artanh_sqrt_ratio_minus_one_over_w` is computed by a
+# For arguments below _SMALL the function `_artanh_excess` is computed by a
 # series of _TERMS terms.
 _SMALL, _TERMS = 0.1, 16
 # Each of the two integrals of Lambert's law has this number of Gauss–Legendre points.
@@ -78,8 +79,8 @@ class Geometric(AbstractScattering):
         return emission
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-        p, _, more, _, _ = _scalars_of_ellipsoid_brightness(shape, sun, observer)
-        return 0.5 * math.pi * _ratio_or_zero(more, p)
+        facing = _facing(shape, sun, observer)
+        return 0.5 * math.pi * _ratio_or_zero(facing.more, facing.p)
 
 
 class LommelSeeliger(AbstractScattering):
@@ -104,12 +105,8 @@ class LommelSeeliger(AbstractScattering):
         return 2.0 * incidence * emission / (incidence + emission)
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-        p, q, more, w, rest = _scalars_of_ellipsoid_brightness(shape, sun, observer)
-        return (
-            math.pi
-            * _ratio_or_zero(more, p + q)
-            * (1.0 - rest * _artanh_sqrt_ratio_minus_one_over_w(w, rest))
-        )
+        p, q, more, w, rest = _facing(shape, sun, observer)
+        return math.pi * _ratio_or_zero(more, p + q) * (1.0 - rest * _artanh_excess(w, rest))
 
 
 class Lambert(AbstractScattering):
@@ -134,9 +131,7 @@ class Lambert(AbstractScattering):
 
 
 def scattering_or_default(scattering: AbstractScattering | None) -> AbstractScattering:
-    """Return the law `scattering`, or the law of Lommel and Seeliger for `None`; raise `TypeError`
-    for other objects.
-    """
+    """Return the law `scattering`, or the law of Lommel and Seeliger for `None`."""
     if scattering is None:
         return LommelSeeliger()
     wanted = "LommelSeeliger(), Geometric() or Lambert()"
@@ -146,33 +141,32 @@ def scattering_or_default(scattering: AbstractScattering | None) -> AbstractScat
 
 
 def unit_direction(value: Vec3Like | Numbers, name: str) -> Vec3:
-    """Return the unit vector along `value` (3,).
-
-    It raises `ValueError` for a length of zero, NaN or a wrong shape; `name` stands in the message.
-    """
+    """Return the unit vector along `value` after checks; `name` stands in their messages."""
     v = _checks.require_finite(_checks.array_of_shape(value, (3,), name), name)
     words = f"{name}: wanted a direction, got a vector of length zero"
     v = _checks.error_if(v, ~(jnp.abs(v) > 0).any(), words)
     # The vector is scaled by a power of two, since the square of a distance of 1e200 m would
     # overflow.
-    v = times_power_of_two(v, -largest_binary_exponent(v))
+    v = times_power_of_two(v, -binary_exponent(v))
     return v / jnp.sqrt(dot(v, v))
 
 
-def _scalars_of_ellipsoid_brightness(
-    shape: Mat3, sun: Vec3, observer: Vec3
-) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar]:
-    """Return the five scalars that determine the brightness of an ellipsoid: |p|, |q|, |p||q| +
-    p·q, z² and 1 − z².
+class Facing(NamedTuple):
+    """Hold the scalars that determine the brightness of an ellipsoid.
 
-    Here p = D A⁻¹ s and q = D A⁻¹ o, where s and o are the unit vectors to sun and observer, A is
-    the symmetric root of `shape`, D = det A is the product of the semi-axes, and z = |p + q|/(|p| +
-    |q|). The five scalars are computed without a loss of digits, whatever the angle between s and
-    o.
-
-    - `shape`: (3, 3) m², the tensor A², whose eigenvalues are the squared semi-axes.
-    - `sun`, `observer`: (3,) the unit vectors s and o, body axes.
+    Here p = D A⁻¹ s and q = D A⁻¹ o, where s and o are the unit vectors to sun and observer, A² is
+    the tensor `shape` of the ellipsoid, and D = det A is the product of the semi-axes.
     """
+
+    p: Scalar  # |p|
+    q: Scalar  # |q|
+    more: Scalar  # |p||q| + p·q
+    w: Scalar  # z², with z = |p + q|/(|p| + |q|)
+    rest: Scalar  # 1 − z²
+
+
+def _facing(shape: Mat3, sun: Vec3, observer: Vec3) -> Facing:
+    """Return these scalars without a loss of digits, whatever the angle of the unit vectors."""
     minors = cofactors(shape)
     of_sun, turned = apply(minors, sun), cross(sun, observer)
     pq = dot(observer, of_sun)
@@ -187,15 +181,12 @@ def _scalars_of_ellipsoid_brightness(
     small = _ratio_or_zero(across, large)
     more, less = jnp.where(same_side, large, small), jnp.where(same_side, small, large)
     rest = _ratio_or_zero(2.0 * less, (p + q) * (p + q))
-    return p, q, more, 1.0 - rest, rest
+    return Facing(p, q, more, 1.0 - rest, rest)
 
 
-def _artanh_sqrt_ratio_minus_one_over_w(w: Array, one_minus_w: Array) -> Array:
-    """Return `(artanh(√w)/√w − 1)/w` of an array of numbers `w`, also at w = 0, where the value is
-    1/3.
-
-    `one_minus_w` is 1 − w, given separately since a subtraction would lose its digits near w = 1.
-    The two arrays may be complex.
+def _artanh_excess(w: Array, one_minus_w: Array) -> Array:
+    """Return `(artanh(√w)/√w − 1)/w` of real or complex numbers w, also at w = 0, where the value
+    is 1/3; 1 − w is given separately since a subtraction would lose its digits near w = 1.
     """
     near = jnp.abs(w) < _SMALL
     few = jnp.where(near, w, 0.0)
@@ -213,12 +204,8 @@ def _artanh_sqrt_ratio_minus_one_over_w(w: Array, one_minus_w: Array) -> Array:
 
 
 def _lambert_integral(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """Return `∫ μ₀ μ dA`, m², over the lit and visible part of an ellipsoid, where μ₀ and μ are the
-    cosines of the angles of incidence and emission.
-
-    - `shape`: (3, 3) m², the tensor E of the ellipsoid `r·E⁻¹r = 1`, whose eigenvalues are the
-      squared semi-axes.
-    - `sun`, `observer`: (3,) unit vectors from the body, body axes.
+    """Return `∫ μ₀ μ dA`, m², over the lit and visible part of an ellipsoid with the tensor E =
+    `shape`, where μ₀ and μ are the cosines of the angles of incidence and emission.
 
     The integral is computed over the unit normals n of the surface, with dA = det E/(n·En)² dn. The
     integral over the whole lit part is `sun·T observer`; there μ is negative where the observer
@@ -243,21 +230,14 @@ def _lambert_integral(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
     below = size + square * (second + square * (total + square))
     whole = math.pi * size * jnp.sqrt(middle) * jnp.sum(w * top / (below * jnp.sqrt(below)))
     is_large = whole > 0
-    lune = _integral_over_lune_of_normals(
-        shape, minors, sun, jnp.where(is_large, -observer, observer)
-    )
+    lune = _lune_integral(shape, minors, sun, jnp.where(is_large, -observer, observer))
     return jnp.where(is_large, whole, 0.0) + size * lune
 
 
-def _integral_over_lune_of_normals(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
+def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
     """Return `∫ (n·sun)(n·observer)/(n·En)² dn` over the lune of the unit sphere in which both
-    n·sun and n·observer are positive.
-
-    Here E is the tensor `shape` of an ellipsoid.
-
-    - `shape`: (3, 3) m², the tensor E of an ellipsoid, whose eigenvalues are the squared semi-axes.
-    - `minors`: (3, 3) the matrix of cofactors of E.
-    - `sun`, `observer`: (3,) unit vectors, body axes.
+    n·sun and n·observer are positive, where E is the tensor `shape` of an ellipsoid and `minors`
+    its matrix of cofactors.
     """
     pole = cross(sun, observer)
     sine, apart = _sqrt_or_zero(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
@@ -301,25 +281,21 @@ def _integral_over_lune_of_normals(shape: Mat3, minors: Mat3, sun: Vec3, observe
     root = jnp.sqrt(d)
     e = jax.lax.complex(root / along, -tilt / along)
     square = e * e
-    excess = _artanh_sqrt_ratio_minus_one_over_w(1.0 - square, square)
+    excess = _artanh_excess(1.0 - square, square)
     inner = (e + e * (1.0 - square) * excess).real * dot(pole, e_pole) / root
     inner = inner + (square * excess).real
     return jnp.sum(weight * s * jnp.sin(width - angle) * inner / d)
 
 
 def _sqrt_or_zero(x: Scalar) -> Scalar:
-    """Return √x of a number x ≥ 0, with the derivative 0 at x = 0, where the derivative of √x is
-    infinite.
-
-    The number x is zero if an ellipsoid without thickness is seen edge on.
+    """Return √x of a number x ≥ 0, with the derivative 0 at x = 0 in place of an infinite one: x is
+    zero if an ellipsoid without thickness is seen edge on.
     """
     is_positive = x > 0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
 def _ratio_or_zero(x: Scalar, y: Scalar) -> Scalar:
-    """Return the quotient x/y of two scalars, or 0 with finite derivatives if the divisor y ≥ 0 is
-    0.
-    """
+    """Return x/y for y ≥ 0, or 0 with finite derivatives at y = 0."""
     is_positive = y > 0
     return jnp.where(is_positive, x / jnp.where(is_positive, y, 1.0), 0.0)

@@ -91,14 +91,10 @@ class Brightness(AbstractSensor):
         semi_axes: NumbersLike | None = None,
         offset: NumbersLike | None = None,
     ):
-        self.sun, self.observer = (
-            _checked_direction(sun, "sun"),
-            _checked_direction(observer, "observer"),
-        )
-        self.scattering, self.noise = (
-            scattering_or_default(scattering),
-            base.deviations_field(1)(noise),
-        )
+        self.sun = _checked_direction(sun, "sun")
+        self.observer = _checked_direction(observer, "observer")
+        self.scattering = scattering_or_default(scattering)
+        self.noise = base.deviations_field(1)(noise)
         self.unit = _checks.require_option(unit, UNITS, "unit")
         usual = 1.0 if unit == "flux" else 0.0
         checked_level = base.array_field("level", ())(usual if level is None else level)
@@ -116,17 +112,14 @@ class Brightness(AbstractSensor):
         return (reading - self.predict(motion))[None]
 
     def predict(self, motion: SensorInput) -> Scalar:
-        """Return the predicted flux or magnitude, without noise, for a `motion`: the time, the
-        attitude at this time, and the body.
-        """
+        """Return the predicted flux or magnitude, without noise."""
         shape = motion.body.second_moment
         if self.semi_axes is not None:
             shape = jnp.diag(self.semi_axes * self.semi_axes)
         shape = shape / jnp.trace(shape)
         q = motion.state.q
         sun, observer = (
-            quaternion.rotate_inverse(q, v)
-            for v in sun_and_observer_directions(self, motion.t, q.dtype)
+            quaternion.rotate_inverse(q, v) for v in directions_at(self, motion.t, q.dtype)
         )
         area = self.scattering.of_ellipsoid(shape, sun, observer)
         relative = area / (math.pi * jnp.cbrt(determinant(shape)))
@@ -139,10 +132,8 @@ class Brightness(AbstractSensor):
 
     def typical_rate(self, t: np.ndarray, values: np.ndarray) -> float:
         """Return a rough rate of the body, rad/s: half of the angular frequency of the strongest
-        line in the spectrum of the first 1000 readings.
-
-        The arguments are the times `t` (T,), s, and the readings `values` (T,). The factor is one
-        half, because the brightness of an ellipsoid has two maxima in a turn.
+        line in the spectrum of the first 1000 readings, because the brightness of an ellipsoid has
+        two maxima in a turn.
         """
         t, values = t[:1000], values[:1000]
         if t.size < 10 or np.ptp(values) == 0:
@@ -155,8 +146,9 @@ class Brightness(AbstractSensor):
         return 0.5 * float(turns[np.argmax(power)])
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return two things: a mask (T,), true for each of the `values` that is a flux below −10
-        times the noise, and must be refused; and a message with the reason.
+        """Return a mask of the `values` that must be refused, and a message with the reason: those
+        that are a flux below −10 times the noise, or the standard deviation of `values` if no noise
+        is given.
         """
         noise = np.std(values) if self.noise is None else np.asarray(self.noise)[0]
         wrong = values < 0 if self.unit == "flux" else np.zeros(values.shape, bool)
@@ -165,43 +157,29 @@ class Brightness(AbstractSensor):
         return wrong, words
 
 
-def sun_and_observer_directions(
-    sensor: Brightness, t: ScalarLike, dtype: DTypeLike | None = None
-) -> list[Vec3]:
-    """Return two unit vectors (3,), the directions from the body to the sun and to the observer at
-    the time `t`, s, in the world frame.
-
-    If `dtype` is not `None`, the vectors are converted to this type.
+def directions_at(sensor: Brightness, t: ScalarLike, dtype: DTypeLike | None = None) -> list[Vec3]:
+    """Return the unit vectors from the body to the sun and to the observer at the time `t`, s,
+    world frame.
     """
     vectors = vector_at(sensor.sun, t, "sun"), vector_at(sensor.observer, t, "observer")
-    return [_normalise_vector(v if dtype is None else v.astype(dtype)) for v in vectors]
+    return [_unit(v if dtype is None else v.astype(dtype)) for v in vectors]
 
 
-def sun_observer_bisector(sensor: Brightness, t: ScalarLike) -> Vec3:
-    """Return the unit vector half way between sun and observer at the time `t`, in the world
-    frame.
-    """
-    sun, observer = sun_and_observer_directions(sensor, t)
-    return _normalise_vector(sun + observer)
+def bisector_at(sensor: Brightness, t: ScalarLike) -> Vec3:
+    """Return the unit vector half way between sun and observer, world frame."""
+    sun, observer = directions_at(sensor, t)
+    return _unit(sun + observer)
 
 
-def _normalise_vector(v: Vec3) -> Vec3:
-    """Return the unit vector (3,) along the vector `v` (3,), which is not zero."""
+def _unit(v: Vec3) -> Vec3:
+    """Return the unit vector along a vector that is not zero."""
     return v / jnp.sqrt(dot(v, v))
 
 
 def _checked_direction(
     source: NumbersLike | Callable[..., Any], name: str
 ) -> Vec3 | Callable[..., Any]:
-    """Return the direction of a sensor after a check: a vector (3,) as its unit vector, or a
-    function of time unchanged.
-
-    Raise an error for other objects.
-
-    - `source`: a vector (3,) of any length, world frame; or a function that returns one at a time
-      t, s.
-    - `name`: the name of the argument in the message.
-    """
+    """Return a direction of any length as its unit vector, or a function of time, after a check."""
     if callable(source):
         return _checks.require_function(source, name, "of time to (3,)")
     shape = _checks.numeric_array(source, name).shape

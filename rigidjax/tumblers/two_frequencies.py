@@ -13,12 +13,13 @@ from rigidjax._types import Scalar
 from rigidjax.tumblers.lattice_series import (
     BATCH,
     FIRST,
+    Light,
     Sums,
-    fourier_chi2_of_pairs,
-    fourier_sum_table,
-    least_squares_remainder,
+    chi2_of_pairs,
+    highest_side_peaks,
     pad_rows,
-    side_peaks_of_window,
+    remainder,
+    sum_table,
 )
 
 # A line is a peak of the spectrum. One of the LINES strongest lines must be a combination of the
@@ -152,17 +153,27 @@ def two_frequencies(
             f"{least:.3g} s, wanted at most {MOST:.0e} periods in it; give a longer period"
         )
     light = pad_light_curve((t - t[0]) / span, y / sigma, 1.0 / sigma)
-    lines = strongest_spectral_lines(light, span / least, 2 * LINES)
+    lines = strongest_lines(light, span / least, 2 * LINES)
     highest = SECOND * float(lines[:LINES].max())
     # The table covers all combinations of multiples of the two frequencies of a pair, also after
     # the refinement has moved a pair beyond the highest frequency.
-    table = fourier_sum_table(light, 2 * (FIRST + order) * (highest + 1.0))
-    pairs, misfits = _pairs_and_chi2_with_strong_line(table, lines, order)
-    pairs, misfits = refine_pairs(
-        table, pairs[distinct_pairs(pairs, misfits, count * TRIED)], order
-    )
+    table = sum_table(light, 2 * (FIRST + order) * (highest + 1.0))
+    # Try all pairs on a grid of which a strong line is a sum or difference of small multiples.
+    grid = np.arange(0.5, 0.8 * float(lines[:LINES].max()) + 0.5, STEP)
+    whole = np.arange(0.5, highest, STEP)
+    rows = []
+    for line in lines[:LINES]:
+        rows.append(np.stack([grid, np.full(grid.shape, line)], axis=1))
+        for j in (1, 2):
+            rows.append(np.stack([np.full(whole.shape, line / j), whole], axis=1))
+            for second in (line - j * grid, j * grid - line, line + j * grid):
+                rows.append(np.stack([grid, second], axis=1))
+    pairs = np.concatenate(rows)
+    pairs = pairs[(pairs[:, 1] > 0.5) & (pairs[:, 1] < highest)]
+    misfits = chi2_of_pairs(table, pairs, order)
+    pairs, misfits = refined(table, pairs[distinct(pairs, misfits, count * TRIED)], order)
     pairs, misfits = with_aliases(table, pairs, misfits, highest, order)
-    keep = distinct_pairs(pairs, misfits, count)
+    keep = distinct(pairs, misfits, count)
     dof = t.size - unknowns
     best = max(float(misfits[keep[0]]), 1e-300)
     scatter = float(np.sqrt(best / dof / np.mean(1.0 / sigma**2)))
@@ -170,33 +181,19 @@ def two_frequencies(
     return TwoFrequencies(pairs[keep] / span, misfits[keep] * scale, dof, scatter, lines / span)
 
 
-def pad_light_curve(
-    x: np.ndarray, z: np.ndarray, w: np.ndarray
-) -> tuple[Float[Array, " padded"], Float[Array, " padded"], Float[Array, " padded"]]:
-    """Return the three arrays (T,) of a light curve, padded with zeros to a multiple of `BLOCK`, so
-    that few programs are compiled.
-
-    - `x`: the times of the readings divided by the span (the time from the first to the last
-      reading).
-    - `z`: the values divided by their noise.
-    - `w`: one over the noise; it is zero in the padding, so that the padding has no weight.
+def pad_light_curve(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> Light:
+    """Return the arrays padded with zeros to a multiple of `BLOCK`, so that few programs are
+    compiled.
     """
     more = -x.size % BLOCK
-    return tuple(jnp.asarray(np.pad(v, (0, more))) for v in (x, z, w))  # pyright: ignore
+    return Light(*(jnp.asarray(np.pad(v, (0, more))) for v in (x, z, w)))
 
 
-def strongest_spectral_lines(
-    light: tuple[Array, Array, Array], highest: float, count: int
-) -> np.ndarray:
-    """Return the frequencies (`count`,), in 1/span, of the strongest lines of the spectrum of a
-    light curve, the strongest first.
+def strongest_lines(light: Light, highest: float, count: int) -> np.ndarray:
+    """Return the frequencies of the strongest lines of the spectrum up to `highest`, all in 1/span,
+    the strongest first.
 
-    A line is a sinusoid plus a constant. Each line is subtracted from the light curve before the
-    next one is sought.
-
-    - `light`: three arrays (T,): the times divided by the span (the time from the first to the last
-      reading); the values divided by their noise; and one over the noise.
-    - `highest`: the highest frequency that is sought, 1/span.
+    A line is a sinusoid plus a constant. Each is subtracted before the next one is sought.
     """
     grid = np.arange(0.5, max(highest, 2.0), 0.2)
     x, z, w = (np.asarray(v) for v in light)
@@ -212,14 +209,8 @@ def strongest_spectral_lines(
 def _best_sinusoid(
     grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike
 ) -> tuple[Scalar, Float[Array, " times"]]:
-    """Return two things: the frequency of `grid` whose sinusoid plus a constant fits the readings
-    of a light curve best; and the fitted sinusoid plus constant (T,) at the times of the readings.
-
-    - `grid`: (F,) the F frequencies that are tried, 1/span, where the span is the time from the
-      first to the last reading.
-    - `x`: (T,) the times of the T readings divided by the span.
-    - `z`: (T,) the values divided by their noise.
-    - `w`: (T,) one over the noise.
+    """Return the frequency of `grid`, 1/span, whose sinusoid plus a constant fits the readings
+    best, and that curve at the times of the readings.
     """
     x, z, w = jnp.asarray(x), jnp.asarray(z), jnp.asarray(w)
 
@@ -228,51 +219,17 @@ def _best_sinusoid(
         return jnp.stack([jnp.ones_like(x), jnp.cos(angle), jnp.sin(angle)])
 
     left, c = jax.lax.map(
-        lambda f: least_squares_remainder(sinusoid_rows(f) * w[None], z), grid, batch_size=BATCH
+        lambda f: remainder(sinusoid_rows(f) * w[None], z), grid, batch_size=BATCH
     )
     best = jnp.argmin(left)
     return grid[best], c[best] @ sinusoid_rows(grid[best])
 
 
-def _pairs_and_chi2_with_strong_line(
-    table: Sums, lines: np.ndarray, order: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return two things: the pairs of frequencies (P, 2), on a grid, that explain one of the
-    strongest lines; and χ² (P,) of the best Fourier series in each of the P pairs.
-
-    A line is a peak of the spectrum of the light curve. A pair explains a line if the frequency of
-    the line is a sum or a difference of small multiples of the two frequencies.
-
-    - `table`: sums over the readings at evenly spaced frequencies, from which χ² is computed.
-    - `lines`: the frequencies of the strongest lines, the strongest first, in 1/span, where the
-      span is the time from the first to the last reading.
-    - `order`: the largest multiple of the second frequency in the series.
-    """
-    highest = float(lines[:LINES].max())
-    grid = np.arange(0.5, 0.8 * highest + 0.5, STEP)
-    whole = np.arange(0.5, SECOND * highest, STEP)
-    rows = []
-    for line in lines[:LINES]:
-        rows.append(np.stack([grid, np.full(grid.shape, line)], axis=1))
-        for j in (1, 2):
-            rows.append(np.stack([np.full(whole.shape, line / j), whole], axis=1))
-            for second in (line - j * grid, j * grid - line, line + j * grid):
-                rows.append(np.stack([grid, second], axis=1))
-    pairs = np.concatenate(rows)
-    pairs = pairs[(pairs[:, 1] > 0.5) & (pairs[:, 1] < SECOND * highest)]
-    return pairs, fourier_chi2_of_pairs(table, pairs, order)
-
-
-def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
-    """Return the pairs of frequencies (M, 2) that may fit the same readings as the `pairs` (P, 2)
-    do, all in 1/span.
-
-    The returned pairs differ from the given pairs in one of three ways: one or both frequencies are
-    shifted by the position of a side peak of the spectral window, or by half of this position; one
-    frequency is halved or doubled; or the first frequency is added to the second or subtracted from
-    it.
-
-    - `peaks`: (k,) the positions of the side peaks, 1/span.
+def aliases_of(
+    pairs: Float[np.ndarray, "pairs 2"], peaks: Float[np.ndarray, " peaks"]
+) -> Float[np.ndarray, "aliases 2"]:
+    """Return the aliases of the pairs of frequencies (see `two_frequencies`), for given positions
+    of side `peaks`, all in 1/span.
     """
     moves = np.unique(np.concatenate([[0.0], *((p, -p, p / 2, -p / 2) for p in peaks)]))
     first, second = pairs.T[:, :, None]
@@ -290,28 +247,18 @@ def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
 def with_aliases(
     table: Sums, pairs: np.ndarray, misfits: np.ndarray, highest: float, order: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return two things: the `pairs` of frequencies together with aliases of the best pairs; and χ²
-    of all of these.
-
-    An alias is a pair that may fit the same readings (`aliases_of`). Aliases are sought in rounds
-    until no alias is better than the best pair.
-
-    - `table`: the sums over the readings, as `fourier_sum_table` returns them.
-    - `pairs`: (P, 2) in 1/span.
-    - `misfits`: (P,) χ² of the pairs.
-    - `highest`: the highest frequency of an alias, 1/span; the span is the time from the first to
-      the last reading.
-    - `order`: the largest multiple of the second frequency.
+    """Return the pairs of frequencies together with aliases of the best pairs up to `highest`,
+    1/span, and χ² of all, after rounds that end when no alias is better than the best pair.
     """
-    peaks = side_peaks_of_window(table, highest)
+    peaks = highest_side_peaks(table, highest)
     for _ in range(ROUNDS):
-        seeds = pairs[distinct_pairs(pairs, misfits, SEEDS)]
+        seeds = pairs[distinct(pairs, misfits, SEEDS)]
         more = (aliases_of(seeds, peaks)[:, None] + 0.2 * AROUND).reshape(-1, 2)
         more = more[((more > 0.5) & (more < highest)).all(axis=1)]
         if not len(more):
             break
-        best = distinct_pairs(more, fourier_chi2_of_pairs(table, more, order), 2 * SEEDS)
-        more, new = refine_pairs(table, more[best], order)
+        best = distinct(more, chi2_of_pairs(table, more, order), 2 * SEEDS)
+        more, new = refined(table, more[best], order)
         before = misfits.min()
         pairs, misfits = np.concatenate([pairs, more]), np.concatenate([misfits, new])
         if not new.min() < before * (1 - 1e-3):
@@ -319,15 +266,9 @@ def with_aliases(
     return pairs, misfits
 
 
-def distinct_pairs(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
-    """Return the indices of the best different pairs of frequencies, at most `count` of them, in
-    the order of their misfits.
-
-    Two pairs are different if the first or the second frequency differs by more than 1/4 (`NEAR`),
-    in 1/span, where the span is the time from the first to the last reading.
-
-    - `pairs`: (P, 2) the two frequencies of each pair, 1/span.
-    - `misfits`: (P,) χ² of the pairs.
+def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
+    """Return the indices of the best pairs whose first or second frequencies differ by more than
+    `NEAR`, in the order of their misfits.
     """
     chosen: list[int] = []
     for index in np.argsort(misfits)[:20_000]:
@@ -338,25 +279,18 @@ def distinct_pairs(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[i
     return chosen
 
 
-def refine_pairs(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return two things: the pairs of frequencies (P, 2), each moved towards a minimum of χ²; and
-    χ² (P,) there, of the best Fourier series in the two frequencies.
+def refined(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pairs of frequencies, each moved towards a minimum of χ², and χ² there.
 
     Each pair moves nine times, to the best of its neighbours on a square grid. Where no neighbour
     has a lower χ², the pair stays and its grid becomes finer.
-
-    - `table`: the sums over the readings, as `fourier_sum_table` returns them.
-    - `pairs`: (P, 2) the pairs from which the refinement starts, 1/span, where the span is the time
-      from the first to the last reading.
-    - `order`: the largest multiple of the second frequency.
     """
     size = np.full(len(pairs), 0.08)
     least = np.full(len(pairs), np.inf)
     for _ in range(9):
         neighbours = pairs[:, None] + size[:, None, None] * AROUND
-        misfits = fourier_chi2_of_pairs(table, neighbours.reshape(-1, 2), order).reshape(
-            len(pairs), -1
-        )
+        misfits = chi2_of_pairs(table, neighbours.reshape(-1, 2), order)
+        misfits = misfits.reshape(len(pairs), -1)
         best, least = misfits.argmin(axis=1), misfits.min(axis=1)
         pairs = pairs + size[:, None] * AROUND[best]
         size = np.where(best == 4, 0.4 * size, size)

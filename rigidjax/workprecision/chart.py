@@ -51,14 +51,14 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
     labels = list(dict.fromkeys((r.label, r.group) for r in records))
     for row, name in zip(axes, names, strict=True):
         if asked:
-            _draw_error_against_tolerance(row[-1], [r for r in asked if r.scene == name], labels)
+            _draw_tolerance(row[-1], [r for r in asked if r.scene == name], labels)
             row[-1].set_title(escape_formulas(f"{name}: asked and reached"), fontsize=10)
         for axis, (kind, words, times) in zip(row, panels, strict=False):
             of = [r for r in times if (r.scene, r.kind) == (name, kind)]
             if not of:
                 axis.set_axis_off()
                 continue
-            _draw_time_against_error(axis, of, labels)
+            _draw_time(axis, of, labels)
             what = "error of the attitude, rad" if kind == "value" else "relative error"
             if name in ("foucault", "arenstorf") and kind == "value":
                 what = "relative error of the place"
@@ -70,23 +70,17 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
 
 
 def _errors_and_times(records: list[Measurement]) -> tuple[list[float], list[float]]:
-    """Return two lists, one entry for each of the `records` of measurements: the errors, where an
-    error below 1e-16 becomes 1e-16, since it is drawn on a logarithmic axis; and the median times
-    of a run, ms.
+    """Return the errors, at least 1e-16 since they are drawn on a logarithmic axis, and the median
+    times of a run, ms.
     """
     return [max(r.error, 1e-16) for r in records], [1e3 * r.time for r in records]
 
 
-def _records_and_style_of_methods(
+def _styled(
     records: list[Measurement], labels: list[tuple[str, str]]
 ) -> Iterator[tuple[list[Measurement], dict[str, Any]]]:
-    """Yield, for each method that was measured, two things: its measurements in the order of their
-    settings; and the style of its curve, as arguments of matplotlib.
-
-    - `records`: measurements on one scene, each with the error and the time of one method at one
-      setting.
-    - `labels`: the label and the group (`ours`, `jax` or `peer`) of each method, in the order of
-      the charts.
+    """Yield, for each method (by its label and group), its measurements in the order of their
+    settings, and the style of its curve, as arguments of matplotlib.
     """
     import matplotlib as mpl
 
@@ -106,37 +100,23 @@ def _records_and_style_of_methods(
         )  # fmt: skip
 
 
-def _draw_error_against_tolerance(
+def _draw_tolerance(
     axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]
 ) -> None:
-    """Draw the error that each method reached against the tolerance or accuracy that was asked for,
-    on matplotlib axes.
-
-    - `axis`: the axes.
-    - `records`: measurements on one scene, each with the error and the time of one method at one
-      setting.
-    - `labels`: the label and the group (`ours`, `jax` or `peer`) of each method.
+    """Draw the error that each method reached against the tolerance or accuracy that was asked
+    for.
     """
-    for of, how in _records_and_style_of_methods(records, labels):
+    for of, how in _styled(records, labels):
         axis.plot([r.setting for r in of], [max(r.error, 1e-16) for r in of], **how)
     wanted = sorted(r.setting for r in records)
     axis.plot(wanted, wanted, color="0.6", linewidth=6, alpha=0.3, zorder=0, label="as asked")
     axis.set(xlabel="tolerance or accuracy asked for", ylabel="error reached")
-    _set_logarithmic_scales(axis)
+    _log_scales(axis)
 
 
-def _draw_time_against_error(
-    axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]
-) -> None:
-    """Draw the time of a run against the error for each method, on matplotlib axes, with the Pareto
-    fronts (measurements that no other one beats in both error and time).
-
-    - `axis`: the axes.
-    - `records`: measurements on one scene, each with the error and the time of one method at one
-      setting; all are of values, or all of gradients.
-    - `labels`: the label and the group (`ours`, `jax` or `peer`) of each method.
-    """
-    for of, how in _records_and_style_of_methods(records, labels):
+def _draw_time(axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]) -> None:
+    """Draw the time of a run against the error for each method, with the Pareto fronts."""
+    for of, how in _styled(records, labels):
         bars = [
             [max(1e3 * (r.time - r.time_low), 0.0) for r in of],
             [max(1e3 * (r.time_high - r.time), 0.0) for r in of],
@@ -146,24 +126,15 @@ def _draw_time_against_error(
         (pareto_front(records), "0.6", "front"),
         (pareto_front(r for r in records if r.group != "peer"), "tab:cyan", "front in JAX"),
     ):
-        axis.plot(
-            *_errors_and_times(best),
-            "-",
-            color=colour,
-            linewidth=6,
-            alpha=0.3,
-            zorder=0,
-            label=what,
-        )
+        band: dict[str, Any] = dict(color=colour, linewidth=6, alpha=0.3, zorder=0, label=what)
+        axis.plot(*_errors_and_times(best), "-", **band)
     ringed: dict[str, Any] = dict(color="k", markerfacecolor="none", markersize=9, zorder=5)
     axis.plot(*_errors_and_times(pareto_front(records)), "o", **ringed)
-    _set_logarithmic_scales(axis)
+    _log_scales(axis)
 
 
-def _set_logarithmic_scales(axis: "Axes") -> None:
-    """Set logarithmic scales on matplotlib axes, with smaller errors to the right, and add a grid
-    and a legend.
-    """
+def _log_scales(axis: "Axes") -> None:
+    """Set logarithmic scales, with smaller errors to the right, and add a grid and a legend."""
     axis.set(xscale="log", yscale="log")
     # The error axis is reversed: a better method is further to the right and further down.
     axis.invert_xaxis()

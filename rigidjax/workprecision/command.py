@@ -13,9 +13,9 @@ from rigidjax.workprecision.measurement import long_drift, measure, to_float32
 from rigidjax.workprecision.peers import methods
 from rigidjax.workprecision.record import (
     Measurement,
+    changes,
+    in_base_time,
     read_csv,
-    records_in_units_of_base_time,
-    sentences_about_changes,
     write_csv,
 )
 from rigidjax.workprecision.standard_scenes import scenes
@@ -76,8 +76,7 @@ def add_subcommand(commands: argparse._SubParsersAction) -> None:
 
 
 def run_subcommand(options: argparse.Namespace) -> int:
-    """Run the subcommand `workprecision` with the `options` of the command line, and **return** its
-    exit code.
+    """Run the subcommand `workprecision` and return its exit code.
 
     The code is 0 for success; 1 if, with `--check`, an error or a number of steps differs from the
     stored table of measurements; and 2 for wrong options or files.
@@ -97,7 +96,7 @@ def run_subcommand(options: argparse.Namespace) -> int:
             write_csv(records, options.csv)
             print(f"records: {options.csv}")
         if options.keep is not None:
-            write_csv(records_in_units_of_base_time(records), options.keep)
+            write_csv(in_base_time(records), options.keep)
             print(f"kept: {options.keep}")
         print(summary(records))
         timed = [r for r in records if not r.scene.startswith(DRIFT)]
@@ -111,16 +110,15 @@ def run_subcommand(options: argparse.Namespace) -> int:
         return 2
     if before is None:
         return 0
-    wrong, paced = sentences_about_changes(records, before)
-    lines = [*(f"moved: {line}" for line in wrong), *(f"time: {line}" for line in paced)]
+    moved = changes(records, before)
+    lines = [*(f"moved: {line}" for line in moved.accuracy)]
+    lines += [f"time: {line}" for line in moved.speed]
     print("\n".join(lines or ["nothing moved"]))
-    return 1 if wrong else 0
+    return 1 if moved.accuracy else 0
 
 
 def _measure_scenes(options: argparse.Namespace) -> list[Measurement]:
-    """Measure the methods on the scenes (the motions to run) that the options of the command line
-    name, and return the measurements.
-    """
+    """Measure the methods on the scenes that the options name."""
     quick = options.quick or options.check is not None or options.keep is not None
     names = options.scene or (QUICK if quick else [n for n, m in scenes().items() if not m().slow])
     records: list[Measurement] = []
@@ -148,11 +146,8 @@ def _measure_scenes(options: argparse.Namespace) -> list[Measurement]:
 
 def summary(records: Iterable[Measurement]) -> str:
     """Return a text with a table for each scene, for values and for gradients: a line for each
-    method has the times, µs, in which the method reaches the errors `pareto.WANTED`, its least
-    error, and its compile time, s.
-
-    - `records`: measurements; for those of the long run (`long_drift`) the drifts are shown
-      instead.
+    method has the times, µs, in which it reaches the errors `pareto.WANTED`, its least error, and
+    its compile time, s; for `long_drift` it has the drifts.
 
     A * marks the methods on the Pareto front of error and time; a + marks the methods on the front
     of the methods in JAX alone.
@@ -161,7 +156,13 @@ def summary(records: Iterable[Measurement]) -> str:
     lines: list[str] = []
     for scene in dict.fromkeys(r.scene for r in records):
         if scene.startswith(DRIFT):
-            lines += _text_lines_of_drifts(scene, [r for r in records if r.scene == scene])
+            lines.append(f"\n{scene}: largest drift of energy, of momentum along gravity; s")
+            lines += [
+                f"  {r.label:38s} h = {r.setting:<5g} {r.energy:10.1e} {r.momentum:10.1e} "
+                f"{r.time:10.2f}"
+                for r in records
+                if r.scene == scene
+            ]
             continue
         for kind in ("value", "gradient"):
             of = [r for r in records if (r.scene, r.kind) == (scene, kind)]
@@ -179,17 +180,3 @@ def summary(records: Iterable[Measurement]) -> str:
                 mark = "*" if label in best else "+" if label in near else " "
                 lines.append(f"{mark} {label:38s}{spent}   {least:10.1e}  {mine[0].compile:10.1f}")
     return "\n".join(lines)
-
-
-def _text_lines_of_drifts(scene: str, records: list[Measurement]) -> list[str]:
-    """Return lines of text that show, for each method, the largest drift of the energy and the
-    largest drift of the momentum along gravity in a long run.
-
-    - `scene`: the name of the long run, for the heading.
-    - `records`: the measurements of this run, one for each method.
-    """
-    head = f"\n{scene}: largest drift of energy, of momentum along gravity; s"
-    return [head] + [
-        f"  {r.label:38s} h = {r.setting:<5g} {r.energy:10.1e} {r.momentum:10.1e} {r.time:10.2f}"
-        for r in records
-    ]

@@ -9,7 +9,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 Number = Any
+# A function of the time, the quaternion of the attitude and the body rate: the torque, body axes.
 Torque = Callable[[Number, Any, Any], tuple[Number, Number, Number]]
+# A function of the time and the state y: dy/dt.
+Field = Callable[[Number, Any], Any]
 
 
 def heavy_top_torque(
@@ -19,14 +22,8 @@ def heavy_top_torque(
     cos: Callable[[Number], Number],
     to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
-    """Return a function that gives the torque of the weight in body axes, `τ = m c × Rᵀg`, for a
-    time, the quaternion of the attitude R, and a body rate.
-
-    - `constants`: six numbers, the mass m times the centre of mass c (3), body axes, and gravity g
-      (3), world axes.
-    - `to_body`: a function (q, x, y, z) that returns the vector (x, y, z) of the world in body
-      axes, for the quaternion q.
-    - `inertia`, `sin`, `cos`: not used here; all torques of this module have the same arguments.
+    """Return the torque of the weight, `τ = m c × Rᵀg`, from the six constants m c, body axes, and
+    g, world axes; `to_body(q, x, y, z)` returns a vector of the world in body axes.
     """
     cx, cy, cz, gx, gy, gz = constants
 
@@ -44,18 +41,8 @@ def gravity_gradient_torque(
     cos: Callable[[Number], Number],
     to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
-    """Return a function that gives the torque of gravity on a body on a circular orbit about a
-    planet, `τ = 3n² r × I r`, for a time, the quaternion of the attitude, and a body rate.
-
-    Here n is the orbital rate, I the inertia tensor, and r the unit vector along the line between
-    the planet and the body; τ and r are in body axes.
-
-    - `inertia`: the entries Ixx, Iyy, Izz, Ixy, Ixz, Iyz of the inertia tensor I.
-    - `constants`: one number, the orbital rate n, rad/s.
-    - `sin`, `cos`: the sine and the cosine for the kind of number that is used (floats, numbers of
-      high precision, or symbols of another package).
-    - `to_body`: a function (q, x, y, z) that returns the vector (x, y, z) of the world in body
-      axes, for the quaternion q.
+    """Return the torque of gravity on a circular orbit, `τ = 3n² r × I r`, from the orbital rate n,
+    rad/s, with the unit vector r along the line between the planet and the body.
     """
     (n,) = constants
     ixx, iyy, izz, ixy, ixz, iyz = inertia
@@ -78,13 +65,8 @@ def gyrostat_torque(
     cos: Callable[[Number], Number],
     to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
-    """Return a function that gives the torque of a wheel at constant speed and of damping, `τ = h ×
-    Ω − c Ω`, in body axes, for a time, the quaternion of the attitude, and the body rate Ω.
-
-    - `constants`: six numbers, the angular momentum h (3) of the wheel and the damping coefficients
-      c (3), one for each body axis.
-    - `inertia`, `sin`, `cos`, `to_body`: not used here; all torques of this module have the same
-      arguments.
+    """Return the torque of a wheel at constant speed and of damping, `τ = h × Ω − c Ω`, from the
+    six constants h and c.
     """
     hx, hy, hz, cx, cy, cz = constants
 
@@ -100,9 +82,7 @@ def gyrostat_torque(
 
 
 def to_body_axes(q, x, y, z):
-    """Return the vector (x, y, z) of the world in body axes, Rᵀ(x, y, z), as three numbers, where R
-    is the rotation matrix, body → world, of the unit quaternion q.
-    """
+    """Return Rᵀ(x, y, z) for the rotation matrix R, body → world, of the unit quaternion q."""
     a, b, c, d = q
     return (
         (1 - 2 * (c * c + d * d)) * x + 2 * (b * c + a * d) * y + 2 * (b * d - a * c) * z,
@@ -111,15 +91,9 @@ def to_body_axes(q, x, y, z):
     )
 
 
-def body_vector_field(
-    inertia: Sequence[Number], torque: Torque | None
-) -> Callable[[Number, Any], Any]:
-    """Return the vector field `(t, y) → dy/dt` of a body, where y has 7 numbers: the quaternion q
-    (w, x, y, z) of the attitude, and the body rate Ω.
-
-    - `inertia`: the entries Ixx, Iyy, Izz, Ixy, Ixz, Iyz of the inertia tensor.
-    - `torque`: a function of t, q and Ω that returns the torque in body axes, or `None` for a free
-      body.
+def body_vector_field(inertia: Sequence[Number], torque: Torque | None) -> Field:
+    """Return the vector field of a body, whose state is the quaternion of the attitude and the body
+    rate; the inertia is Ixx, Iyy, Izz, Ixy, Ixz, Iyz.
     """
     ixx, iyy, izz, ixy, ixz, iyz = inertia
     kxx, kyy, kzz = iyy * izz - iyz * iyz, ixx * izz - ixz * ixz, ixx * iyy - ixy * ixy
@@ -149,15 +123,10 @@ def body_vector_field(
     return rates
 
 
-def foucault_vector_field(
-    constants: Sequence[Number], sqrt: Callable[[Number], Number]
-) -> Callable[[Number, Any], Any]:
-    """Return the vector field `(t, y) → dy/dt` of a pendulum on the turning Earth, where y has 6
-    numbers: the position of the bob from the pivot, and its velocity, in the axes east, north, up.
-
-    - `constants`: three numbers, the gravity g, and the components of the angular velocity of the
-      Earth along north and up.
-    - `sqrt`: not used here; the other vector field of a point in this module needs a square root.
+def foucault_vector_field(constants: Sequence[Number], sqrt: Callable[[Number], Number]) -> Field:
+    """Return the vector field of a pendulum on the turning Earth, for the position from the pivot
+    and the velocity of the bob (east, north, up), from gravity and the Earth's rate along north and
+    up.
     """
     g, wn, wu = constants
 
@@ -174,16 +143,10 @@ def foucault_vector_field(
     return rates
 
 
-def three_body_vector_field(
-    constants: Sequence[Number], sqrt: Callable[[Number], Number]
-) -> Callable[[Number, Any], Any]:
-    """Return the vector field `(t, y) → dy/dt` of the circular restricted three-body problem, where
-    y has 6 numbers: the position and the velocity in the rotating frame, in the usual units (the
-    distance of the two large bodies, their total mass and the rate of the frame are 1).
-
-    - `constants`: one number μ, the mass of the smaller of the two large bodies.
-    - `sqrt`: the square root for the kind of number that is used (floats, numbers of high
-      precision, or symbols of another package).
+def three_body_vector_field(constants: Sequence[Number], sqrt: Callable[[Number], Number]) -> Field:
+    """Return the vector field of the circular restricted three-body problem, for position and
+    velocity in the rotating frame, in the usual units, from the mass μ of the smaller of the large
+    bodies.
     """
     (mu,) = constants
     nu = 1 - mu

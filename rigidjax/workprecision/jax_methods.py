@@ -36,12 +36,8 @@ MakeFlow = Callable[[BenchmarkScene], Flow | None]
 
 
 def compile_flow(scene: BenchmarkScene, flow: Flow) -> PreparedMethod:
-    """Return a flow compiled for a scene, once for all settings.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `flow`: a function of the scene's numbers and of a setting that returns two things: the last
-      state, or a gradient, as one vector; and the number of steps. Both arguments are traced, as if
-      a user gave new numbers at each call.
+    """Return a flow (of the last state or of a gradient) compiled for a scene, once for all
+    settings: both arguments are traced, as if a user gave new numbers at each call.
     """
     numbers = scene.numbers
     start = time.perf_counter()
@@ -64,14 +60,8 @@ def compile_flow(scene: BenchmarkScene, flow: Flow) -> PreparedMethod:
 def flow_from_run(
     scene: BenchmarkScene, run: Callable[[Any, PyTree, Array, Array], tuple[PyTree, Any]]
 ) -> Flow:
-    """Return the flow of a scene (a motion to run) that calls `run`.
-
-    A flow is a function of the scene's numbers (inertia, initial rate and attitude; or position and
-    velocity of a point) and of a setting (a tolerance or a number of steps); it returns two things:
-    the last state as a vector; and the number of steps.
-
-    `run(body, state0, ts, setting)` returns two things: the states at `ts`, which are the first and
-    the last time, s; and the number of steps.
+    """Return the flow of a scene that calls `run(body, state0, ts, setting)`, which returns the
+    states at `ts`, the first and the last time, and the number of steps.
     """
 
     def flow(numbers: Array, setting: Array) -> tuple[Any, Any]:
@@ -82,13 +72,9 @@ def flow_from_run(
     return flow
 
 
-def _flow_of_closed_form(scene: BenchmarkScene) -> Flow | None:
-    """Return the flow of the closed form of the free body, or `None` for a `scene` (a motion to
-    run) with a torque or without a body, for which there is no closed form.
-
-    A flow is a function of the scene's numbers (inertia, initial rate and attitude; or position and
-    velocity of a point) and of a setting, which the closed form does not need; it returns two
-    things: the last state as a vector; and the number of steps, here 0.
+def _closed_flow(scene: BenchmarkScene) -> Flow | None:
+    """Return the flow of the closed form of the free body, which needs no setting and takes no
+    steps, or `None` for any other scene.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -98,15 +84,10 @@ def _flow_of_closed_form(scene: BenchmarkScene) -> Flow | None:
     return flow_from_run(scene, run) if scene.torque is None and scene.body is not None else None
 
 
-def _flow_of_simulate(scene: BenchmarkScene, setting_is_accuracy: bool = False) -> Flow | None:
-    """Return the flow of `simulate` with its defaults, or `None` for a `scene` (a motion to run)
-    without a torque: there `simulate` applies the closed form, which is measured by itself.
-
-    A flow is a function of the scene's numbers (inertia, initial rate and attitude; or position and
-    velocity of a point) and of a setting, here the tolerance; it returns two things: the last state
-    as a vector; and the number of steps. The tolerance is traced, so that one compiled program
-    serves all settings. If `setting_is_accuracy` is true, the setting is not the tolerance but the
-    argument `accuracy` of `simulate`, the wanted error of the result.
+def _simulate_flow(scene: BenchmarkScene, setting_is_accuracy: bool = False) -> Flow | None:
+    """Return the flow of `simulate`, with the setting as tolerance, or as `accuracy`, in place of
+    the defaults, and with more steps allowed; or `None` for a scene without a torque: its closed
+    form is measured by itself.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -118,13 +99,9 @@ def _flow_of_simulate(scene: BenchmarkScene, setting_is_accuracy: bool = False) 
     return None if scene.torque is None else flow_from_run(scene, run)
 
 
-def _flow_with_adaptive_steps(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
-    """Return the flow of the Runge–Kutta method `solver` in the loop of `simulate` with adaptive
-    steps, differentiable in forward and reverse mode.
-
-    A flow is a function of the numbers of the `scene` (inertia, initial rate and attitude; or
-    position and velocity of a point) and of a setting, here the relative tolerance; it returns two
-    things: the last state as a vector; and the number of steps.
+def _adaptive_flow(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
+    """Return the flow of a Runge–Kutta method in the loop of `simulate`, with the setting as
+    relative tolerance, differentiable in forward and reverse mode.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -135,15 +112,8 @@ def _flow_with_adaptive_steps(scene: BenchmarkScene, solver: AbstractExplicit) -
     return flow_from_run(scene, run)
 
 
-def flow_with_equal_steps(
-    scene: BenchmarkScene, solver: AbstractExplicit | AbstractSplitting
-) -> Flow:
-    """Return the flow of `solver` with equal steps.
-
-    A flow is a function of the numbers of the `scene` (inertia, initial rate and attitude; or
-    position and velocity of a point) and of a setting, here the number of steps; it returns two
-    things: the last state as a vector; and the number of steps.
-    """
+def equal_flow(scene: BenchmarkScene, solver: AbstractExplicit | AbstractSplitting) -> Flow:
+    """Return the flow of `solver` with equal steps, whose number is the setting."""
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         field, count = equations_of_motion(body, start, scene.torque), setting.astype(int)
@@ -152,40 +122,29 @@ def flow_with_equal_steps(
     return flow_from_run(scene, run)
 
 
-def _flow_of_diffrax_loop(
+def _diffrax_flow(
     scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
-    """Return the flow of our equations of motion and our state, solved by diffrax's `solver` in
-    diffrax's own loop.
-
-    A flow is a function of the numbers of the `scene` (inertia, initial rate and attitude; or
-    position and velocity of a point) and of a setting, here the relative tolerance; it returns two
-    things: the last state as a vector; and the number of steps. `adjoint` is an object of diffrax
-    that differentiates the solution; `None` takes diffrax's default.
+    """Return the flow of our equations in diffrax's own loop, with the setting as relative
+    tolerance.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         field = equations_of_motion(body, start, scene.torque)
-        return _solve_with_diffrax(field, None, start, solver, adjoint, setting, scene.end)
+        return _diffeqsolve(field, None, start, solver, adjoint, setting, scene.end)
 
     return flow_from_run(scene, run)
 
 
-def _flow_of_handwritten_equations(
+def _plain_flow(
     scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
-    """Return the flow of the equations that a user would write by hand, solved by `solver` in
-    diffrax; for a scene (a motion to run) without such equations our own equations are solved.
-
-    A flow is a function of the numbers of the `scene` (inertia, initial rate and attitude; or
-    position and velocity of a point) and of a setting, here the relative tolerance; it returns two
-    things: the last state as a vector; and the number of steps. The state is one array, and the
-    constants are computed once, before the run. `adjoint` is an object of diffrax that
-    differentiates the solution; `None` takes diffrax's default.
+    """Return the flow in diffrax of the equations that a user would write by hand (of ours, if the
+    scene has none): the state is one array, and the constants are computed before the run.
     """
     plain = scene.plain
     if plain is None:
-        return _flow_of_diffrax_loop(scene, solver, adjoint)
+        return _diffrax_flow(scene, solver, adjoint)
 
     def flow(numbers: Array, setting: Array) -> tuple[Any, Any]:
         start = scene.flatten(scene.assemble(numbers)[1])
@@ -196,15 +155,13 @@ def _flow_of_handwritten_equations(
         def field(t: Array, y: PyTree, constants: Sequence[Array]) -> Any:
             return by_hand(t, y, *constants)
 
-        ys, steps = _solve_with_diffrax(
-            field, constants, start, solver, adjoint, setting, scene.end
-        )
+        ys, steps = _diffeqsolve(field, constants, start, solver, adjoint, setting, scene.end)
         return ys[-1], steps
 
     return flow
 
 
-def _solve_with_diffrax(
+def _diffeqsolve(
     field: Callable[..., PyTree],
     args: PyTree,
     start: PyTree,
@@ -213,17 +170,8 @@ def _solve_with_diffrax(
     setting: Array,
     end: float,
 ) -> tuple[PyTree, Any]:
-    """Solve an equation of motion by diffrax with adaptive steps. Return two things: the last
-    state, with a leading axis of length 1; and the number of steps.
-
-    - `field`: the vector field, a function (t, y, args).
-    - `args`: the value of the last argument of `field`.
-    - `start`: the state at t = 0.
-    - `solver`: a solver of diffrax with an error estimate.
-    - `adjoint`: an object of diffrax that differentiates the solution; `None` takes diffrax's
-      default.
-    - `setting`: the relative tolerance of a step; the absolute tolerance is a thousandth of it.
-    - `end`: the last time, s.
+    """Solve an equation of motion by diffrax, with the setting as relative tolerance; return the
+    last state, with a leading axis, and the number of steps.
     """
     # The adjoint equation of diffrax takes times of the precision of the state only.
     first, last = jnp.zeros_like(setting), jnp.asarray(end, setting.dtype)
@@ -236,19 +184,11 @@ def _solve_with_diffrax(
     return out.ys, out.stats["num_steps"]
 
 
-def _compile_value_or_gradient(
+def _compiled(
     make_flow: MakeFlow, differentiate: Callable[..., Any] | None, scene: BenchmarkScene
 ) -> PreparedMethod | None:
-    """Return a method compiled for a scene, for its value or its gradient, or `None` if the method
-    cannot do the scene.
-
-    - `make_flow`: a function of the scene that returns the flow of the method (a function of the
-      scene's numbers and of a setting that returns the last state and the number of steps), or
-      `None` if the method cannot do the scene.
-    - `differentiate`: `jax.grad` or `jax.jacfwd` for the gradient of `scene.loss`, a scalar
-      function of the last state, with respect to the scene's numbers; or `None` for the value,
-      which is the last state.
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
+    """Return a method compiled for a scene, for its value, or for the gradient of `scene.loss` by
+    `differentiate`; `None` if the method cannot do the scene.
     """
     flow = make_flow(scene)
     if flow is None:
@@ -296,80 +236,56 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Ti
     }
     slopes = {
         name: partial(
-            _compile_value_or_gradient,
-            partial(_flow_of_handwritten_equations, solver=solver, adjoint=adjoint),
+            _compiled,
+            partial(_plain_flow, solver=solver, adjoint=adjoint),
             take,
         )
         for name, (adjoint, take) in ways.items()
     }
-    value = partial(
-        _compile_value_or_gradient, partial(_flow_of_handwritten_equations, solver=solver), None
-    )
+    value = partial(_compiled, partial(_plain_flow, solver=solver), None)
     name = f"diffrax {type(solver).__name__}"
     return TimedMethod(name, "jax", TOLERANCES, value, slopes if gradients else {})
 
 
-def _own_timed_method(
+def _own(
     name: str,
     settings: Sequence[float | int],
     make_flow: MakeFlow,
     differentiation_modes: Iterable[str] = (),
     settings_are_step_counts: bool = False,
 ) -> TimedMethod:
-    """Return a method of this library in the form that `measure` takes, for its value (the last
-    state of a motion) and its gradients.
-
-    - `name`: the name of the method.
-    - `settings`: the tolerances, or the numbers of equal steps, with which the method is run.
-    - `make_flow`: a function of a scene (a motion to run) that returns the flow of the method (a
-      function of the scene's numbers and of a setting that returns the last state and the number of
-      steps), or `None` if the method cannot do the scene.
-    - `differentiation_modes`: the modes of differentiation that are measured, of `"forward"` and
-      `"reverse"`.
-    - `settings_are_step_counts`: whether the settings are numbers of equal steps.
-    """
-    slopes = {
-        mode: partial(_compile_value_or_gradient, make_flow, MODES[mode])
-        for mode in differentiation_modes
-    }
-    return TimedMethod(
-        name,
-        "ours",
-        settings,
-        partial(_compile_value_or_gradient, make_flow, None),
-        slopes,
-        settings_are_step_counts,
-    )
+    """Return a method of this library, with the modes of differentiation that are measured."""
+    slopes = {mode: partial(_compiled, make_flow, MODES[mode]) for mode in differentiation_modes}
+    value = partial(_compiled, make_flow, None)
+    return TimedMethod(name, "ours", settings, value, slopes, settings_are_step_counts)
 
 
 def methods_in_jax() -> list[TimedMethod]:
-    """Return the methods of this library and those of diffrax, in the order in which charts show
-    them.
-    """
+    """Return the methods of this library and those of diffrax, in the order of the charts."""
     eight = solvers.DormandPrince8()
     equal = ((EIGHT, eight), (FOUR, solvers.RungeKutta4()))
     equal += ((EIGHT, solvers.Splitting4()), (EIGHT, solvers.Splitting6()))
-    five, there = solvers.Tsitouras5(), partial(_flow_of_diffrax_loop, solver=eight)
+    five, there = solvers.Tsitouras5(), partial(_diffrax_flow, solver=eight)
     return [
-        _own_timed_method("closed form", (0.0,), _flow_of_closed_form, MODES),
-        _own_timed_method("simulate", TOLERANCES, _flow_of_simulate, MODES),
-        _own_timed_method(
-            "simulate, accuracy", TOLERANCES, partial(_flow_of_simulate, setting_is_accuracy=True)
+        _own("closed form", (0.0,), _closed_flow, MODES),
+        _own("simulate", TOLERANCES, _simulate_flow, MODES),
+        _own(
+            "simulate, accuracy", TOLERANCES, partial(_simulate_flow, setting_is_accuracy=True)
         ),
-        _own_timed_method(
-            "DormandPrince8", TOLERANCES, partial(_flow_with_adaptive_steps, solver=eight), MODES
+        _own(
+            "DormandPrince8", TOLERANCES, partial(_adaptive_flow, solver=eight), MODES
         ),
-        _own_timed_method(
-            "Tsitouras5", TOLERANCES, partial(_flow_with_adaptive_steps, solver=five)
+        _own(
+            "Tsitouras5", TOLERANCES, partial(_adaptive_flow, solver=five)
         ),
         *(
-            _own_timed_method(
+            _own(
                 f"{type(solver).__name__}, equal steps", counts,
-                partial(flow_with_equal_steps, solver=solver), settings_are_step_counts=True,
+                partial(equal_flow, solver=solver), settings_are_step_counts=True,
             )
             for counts, solver in equal
         ),
-        _own_timed_method("DormandPrince8 in diffeqsolve", TOLERANCES, there),
+        _own("DormandPrince8 in diffeqsolve", TOLERANCES, there),
         diffrax_method(dfx.Tsit5()),
         diffrax_method(dfx.Dopri8(), gradients=True),
     ]  # fmt: skip

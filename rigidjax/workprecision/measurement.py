@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia
@@ -21,7 +21,7 @@ from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques import HeavyTop
 from rigidjax.solve import fixed, solvers
 from rigidjax.workprecision import peers as known
-from rigidjax.workprecision.jax_methods import flow_with_equal_steps
+from rigidjax.workprecision.jax_methods import equal_flow
 from rigidjax.workprecision.record import Measurement
 from rigidjax.workprecision.scene import (
     BenchmarkScene,
@@ -55,17 +55,11 @@ _PARTS = ("body", "state0", "torque")
 
 
 class _TimedRun(NamedTuple):
-    """Hold a run that is timed: one method at one setting (tolerance or number of steps) on one
-    scene (a motion to run).
+    """Hold a run that is timed: one method at one setting on one scene."""
 
-    **Fields:** `record` the measurement, still without its times; `ready` the compiled method;
-    `times` the measured times, s. The first of them was measured when the errors were found; it
-    tells how often the run is to be repeated, and does not enter the median.
-    """
-
-    record: Measurement
+    record: Measurement  # without its times
     ready: PreparedMethod
-    times: list[float]
+    times: list[float]  # s; the first tells how often the run is repeated, and is not in the median
 
 
 def measure(
@@ -114,9 +108,9 @@ def measure(
                 continue
             if progress is not None:
                 progress(f"{scene.name}: {method.name} {adjoint or 'value'}")
-            for setting in _settings_for_scene(scene, method, thin * (2 if adjoint else 1)):
-                jobs += _run_once_for_errors(scene, method, adjoint, setting, ready, right)
-    _append_measured_times(jobs, rounds)
+            for setting in _settings(scene, method, thin * (2 if adjoint else 1)):
+                jobs += _tried(scene, method, adjoint, setting, ready, right)
+    _time_all(jobs, rounds)
     records = []
     for job in jobs:
         low, middle, high = (float(p) for p in np.percentile(job.times[1:], [25, 50, 75]))
@@ -126,16 +120,14 @@ def measure(
 
 
 def compute_reference(scene: BenchmarkScene, gradients: bool = True) -> Reference:
-    """Return a reference (the correct last state and gradient) for a scene (a motion to run) that
-    has none, from our method of order 8 with equal steps.
+    """Return a reference for a scene that has none, from our method of order 8 with equal steps.
 
     The error that the reference states for itself is its difference from a run with half as many
-    steps, but at least 100 times the machine epsilon. `gradients` tells whether the gradient is
-    computed, too.
+    steps, but at least 100 times the machine epsilon.
     """
     counts = (4000, 2000)
-    numbers, scale = scene.numbers, max(1.0, _estimated_turning_angle(scene) / 50)
-    flow = flow_with_equal_steps(scene, solvers.DormandPrince8())
+    numbers, scale = scene.numbers, max(1.0, _turning(scene) / 50)
+    flow = equal_flow(scene, solvers.DormandPrince8())
     run = jax.jit(flow)
     take = jax.jit(jax.jacfwd(lambda p, count: scene.loss(flow(p, count)[0])))
     ends, slopes = [], []
@@ -152,21 +144,14 @@ def compute_reference(scene: BenchmarkScene, gradients: bool = True) -> Referenc
 
 
 def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
-    """Return a scene (a motion to run) in single precision.
-
-    The field `plain` of the new scene is empty: it holds equations of motion that are written out
-    by hand, and they are in double precision.
-
-    The new scene has a reference (the correct last state, and, if `gradients` is true, the correct
-    gradient) that is computed in double precision from the numbers rounded to single precision.
+    """Return a scene in single precision, without `plain`, and with a reference that is computed in
+    double precision from the numbers rounded to single precision.
     """
 
     def cast(scene: BenchmarkScene, dtype: DTypeLike) -> BenchmarkScene:
-        def cast_leaf(a: PyTree) -> Any:
-            return jnp.asarray(a, dtype) if eqx.is_inexact_array(a) else a
-
-        parts = {name: jax.tree.map(cast_leaf, getattr(scene, name)) for name in _PARTS}
-        return dataclasses.replace(scene, **parts)
+        numbers, rest = eqx.partition({n: getattr(scene, n) for n in _PARTS}, eqx.is_inexact_array)
+        numbers = jax.tree.map(lambda a: jnp.asarray(a, dtype), numbers)
+        return dataclasses.replace(scene, **eqx.combine(numbers, rest))
 
     low = cast(scene, jnp.float32)
     right = compute_reference(
@@ -176,36 +161,29 @@ def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
     return dataclasses.replace(low, name=f"{scene.name}, float32", reference=right, plain=None)
 
 
-def _estimated_turning_angle(scene: BenchmarkScene) -> float:
-    """Return a rough estimate of the angle by which the body turns in the `scene`, rad, at least
-    50.
-
-    For a point, which has no attitude, the result is 50: methods state their numbers of equal steps
-    for a turn of 50 rad, and with this result the numbers are used unchanged.
+def _turning(scene: BenchmarkScene) -> float:
+    """Return a rough estimate of the angle, rad, by which the body turns, at least 50, for which
+    methods state their numbers of equal steps; for a point 50.
     """
     return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
 
 
-def _settings_for_scene(scene: BenchmarkScene, method: TimedMethod, stride: int) -> list[float]:
-    """Return the settings (tolerances, numbers of equal steps, or lengths of a step) at which a
-    method is measured on a scene.
+def _settings(scene: BenchmarkScene, method: TimedMethod, stride: int) -> list[float]:
+    """Return the settings at which a method is measured on a scene: every `stride`-th, counted from
+    the finest.
 
     Numbers of equal steps, which are stated for a turn of 50 rad, are scaled to the angle by which
     the body turns; tolerances that the precision cannot reach are left out.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `method`: the method with its settings, from coarse to fine.
-    - `stride`: every `stride`-th setting is used, counted from the finest.
     """
     settings = list(method.settings)[::-1][::stride][::-1]
     if method.equal:
-        return [float(round(s * _estimated_turning_angle(scene) / 50)) for s in settings]
+        return [float(round(s * _turning(scene) / 50)) for s in settings]
     # With a tolerance below about ten times the machine epsilon every step is rejected.
     least = 10 * float(jnp.finfo(scene.numbers.dtype).eps)
     return [float(s) for s in settings if s == 0 or s > least]
 
 
-def _run_once_for_errors(
+def _tried(
     scene: BenchmarkScene,
     method: TimedMethod,
     adjoint: str,
@@ -213,25 +191,20 @@ def _run_once_for_errors(
     prepared: PreparedMethod,
     reference: Reference,
 ) -> list[_TimedRun]:
-    """Run a prepared method to find its errors, and return a list that holds this run, to be timed
-    later. If the error of the run is NaN, or 0.5 (`WRONG`) or more, in rad or relative, the list is
-    empty, and the run is left out of the measurements.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `method`: the method, for its name and group.
-    - `adjoint`: the name of the way in which the gradient is computed, or an empty text for a value
-      (the last state).
-    - `setting`: the tolerance or the number of steps.
-    - `prepared`: the method, compiled for the scene.
-    - `reference`: the correct last state and gradient of the scene.
+    """Run a prepared method to find its errors; return the run, to be timed later, in a list that
+    is empty if the error is NaN or at least `WRONG`. `adjoint` names the way of a gradient, or is
+    empty.
     """
     prepared.run(setting)
     begin = time.perf_counter()
     end, steps = prepared.run(setting)
     first = time.perf_counter() - begin
-    errors = (_gradient_errors if adjoint else _errors_and_drifts_of_final_state)(
-        scene, end, reference
-    )
+    if adjoint:
+        errors = _gradient_errors(scene, end, reference)
+    else:
+        error, rate = state_errors(scene, end, reference.end)
+        energy, momentum = drifts(scene, np.asarray(end))
+        errors = {"error": error, "error_rate": rate, "energy": energy, "momentum": momentum}
     if not errors["error"] < WRONG:
         return []
     record = Measurement(
@@ -241,34 +214,10 @@ def _run_once_for_errors(
     return [_TimedRun(record, prepared, [first])]
 
 
-def _errors_and_drifts_of_final_state(
-    scene: BenchmarkScene, final_state: np.ndarray | Array, reference: Reference
-) -> dict[str, float]:
-    """Return, by the names of fields of `Measurement`, the errors of the last state of a run, and
-    the drifts of its energy and momentum. The error of an attitude is an angle, rad; all others are
-    relative.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `final_state`: the last state as one vector, (7,) for a body or (6,) for a point.
-    - `reference`: the correct last state.
-    """
-    error, rate = state_errors(scene, final_state, reference.end)
-    energy, momentum = energy_and_momentum_drifts(scene, np.asarray(final_state))
-    return {"error": error, "error_rate": rate, "energy": energy, "momentum": momentum}
-
-
 def _gradient_errors(
     scene: BenchmarkScene, computed_gradient: np.ndarray | Array, reference: Reference
 ) -> dict[str, float]:
-    """Return, by the names of fields of `Measurement`, the relative error of a whole gradient, and
-    the relative errors of its parts with respect to inertia, initial rate and initial attitude (for
-    a point: with respect to velocity and position).
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `computed_gradient`: the gradient of `scene.loss`, a scalar function of the last state, with
-      respect to the scene's numbers.
-    - `reference`: the correct gradient.
-    """
+    """Return the relative errors of a gradient and of its parts, by the fields of `Measurement`."""
     gradient, wanted = np.asarray(computed_gradient, float), np.asarray(reference.gradient)
 
     def relative_error(part: slice) -> float:
@@ -279,17 +228,9 @@ def _gradient_errors(
     return {"error": relative_error(slice(None)), **parts}
 
 
-def energy_and_momentum_drifts(
-    scene: BenchmarkScene, final_state: np.ndarray | Array
-) -> tuple[float, float]:
-    """Return two numbers for the change from the initial to the last state: the relative drift of
-    the energy; and the largest drift of a conserved momentum.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `final_state`: the last state as one vector, (7,) for a body or (6,) for a point.
-
-    For a point the two numbers are the relative drift of the first conserved quantity of its
-    motion, and NaN. A number is NaN, too, if the motion conserves no such quantity.
+def drifts(scene: BenchmarkScene, final_state: np.ndarray | Array) -> tuple[float, float]:
+    """Return the relative drift of the energy (of a point: of its first conserved quantity) up to
+    the last state, and the largest drift of a conserved momentum; NaN if there is none.
     """
     if scene.body is None:
         law: Any = scene_of_force(scene.torque)
@@ -309,11 +250,9 @@ def energy_and_momentum_drifts(
     return float(away.get("energy", jnp.nan)), max(momenta, default=float("nan"))
 
 
-def _append_measured_times(runs: list[_TimedRun], rounds: int) -> None:
-    """Measure the times, s, of the runs in turn, and append them to the field `times` of each run.
-
-    A run is timed in `rounds` rounds. A run that takes less than `SHORT` = 0.02 seconds is timed in
-    three times as many rounds, and a run that takes more than `LONG` = 0.5 seconds in three rounds.
+def _time_all(runs: list[_TimedRun], rounds: int) -> None:
+    """Measure the times of the runs in turn, of those of less than `SHORT` seconds in three times
+    as many rounds, and of those of more than `LONG` seconds in three.
     """
     for turn in range(3 * rounds):
         for job in runs:
@@ -338,10 +277,7 @@ def long_drift(
     progress: Callable[[str], None] | None = None,
 ) -> list[Measurement]:
     """Measure how far the energy, and the momentum along gravity, of an asymmetric heavy top drift
-    over `steps` equal steps by each method of `RUNS`, and return the measurements.
-
-    `names` are the methods to run (all by default), and `progress` is a function that is called
-    with a line of text for each method.
+    over `steps` equal steps by each method of `RUNS`, or by those in `names`.
 
     Each method has two records: one for the first hundredth of the run, one for the whole run. The
     drift is bounded if both drifts are about equal, and grows with time if the drift of the whole

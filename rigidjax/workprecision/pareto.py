@@ -14,12 +14,11 @@ WANTED = (1e-4, 1e-7, 1e-10)
 
 
 def pareto_front(records: Iterable[Measurement]) -> list[Measurement]:
-    """Return the measurements that lie on the Pareto front of error and time, in the order of
-    falling error.
+    """Return the measurements, of one scene and one kind, on the Pareto front of error and time, in
+    the order of falling error.
 
-    All `records` are of one scene and one kind (values, or gradients). A record is on the front if
-    no method reaches the error of the record in less time than the record; the time of a method is
-    interpolated log–log between its settings.
+    A record is on the front if no method reaches the error of the record in less time than the
+    record; the time of a method is interpolated log–log between its settings.
     """
     records = [r for r in require_measurements(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
@@ -37,8 +36,8 @@ def pareto_front(records: Iterable[Measurement]) -> list[Measurement]:
 
 
 def first_answers(records: Iterable[Measurement]) -> list[Measurement]:
-    """Return the measurements with the time of compilation added to the times of a run: this is the
-    time until a user has a first answer.
+    """Return the measurements with the time of compilation added: the time until a user has a first
+    answer.
     """
     return [
         dataclasses.replace(r, time=r.time + c, time_low=r.time_low + c, time_high=r.time_high + c)
@@ -48,10 +47,11 @@ def first_answers(records: Iterable[Measurement]) -> list[Measurement]:
 
 
 def time_to(records: Iterable[Measurement], error: float) -> float:
-    """Return the time, s, in which a method reaches an error, from its `records`.
+    """Return the time, s, in which a method reaches an error, interpolated log–log between its
+    settings.
 
-    The time is interpolated log–log between the settings of the method. The result is the time of
-    the quickest setting if even this setting reaches the error, and NaN if no setting reaches it.
+    The result is the time of the quickest setting if even this setting reaches the error, and NaN
+    if no setting reaches it.
     """
     error = _checks.positive_float(error, "error")
     rungs = sorted(
@@ -113,51 +113,30 @@ def choose(records: Iterable[Measurement], wanted: Sequence[float] = WANTED) -> 
     []
     """
     records = require_measurements(records)
-    scenes = dict.fromkeys(r.scene for r in records)
-    return [
-        _choose_for_scene([r for r in records if r.scene == s], s, e)
-        for s in scenes
-        for e in wanted
-    ]
+    choices = []
+    for scene, error in itertools.product(dict.fromkeys(r.scene for r in records), wanted):
+        of = [r for r in records if r.scene == scene]
+        values, slopes = (times_by_method(of, k, error) for k in ("value", "gradient"))
+        ours = {r.label for r in of if r.group == "ours"}
+
+        def quickest(
+            times: dict[str, float], own: bool = True, ours: set[str] = ours
+        ) -> tuple[str, float]:
+            return next(((n, t) for n, t in times.items() if (n in ours) == own), ("", math.nan))
+
+        best, elsewhere = quickest(values), quickest(values, own=False)
+        if elsewhere[1] >= best[1]:
+            elsewhere = "", math.nan
+        default = "closed form" if any(r.method == "closed form" for r in of) else "simulate"
+        its = [t for n, t in slopes.items() if n.split(", ")[0] == default]
+        defaults = values.get(default, math.nan), min(its, default=math.nan)
+        choices.append(Choice(scene, error, *best, *quickest(slopes), *defaults, *elsewhere))
+    return choices
 
 
-def _choose_for_scene(records: list[Measurement], scene: str, error: float) -> Choice:
-    """Return our quickest methods (for the value, and for the gradient) for one scene and one
-    wanted error, and the quickest method of other packages (diffrax included) for the value, if it
-    is quicker than ours or if none of ours reaches the error. The times of our default method (the
-    closed form if it was measured, else `simulate`) are included.
-
-    - `records`: the measurements on this scene.
-    - `scene`: the name of the scene.
-    - `error`: the wanted error, rad, or the wanted relative error of a gradient.
-    """
-    values, slopes = (
-        times_to_error_by_method(records, "value", error),
-        times_to_error_by_method(records, "gradient", error),
-    )
-    ours = {r.label for r in records if r.group == "ours"}
-
-    def quickest(times: dict[str, float], own: bool = True) -> tuple[str, float]:
-        return next(((n, t) for n, t in times.items() if (n in ours) == own), ("", math.nan))
-
-    best, elsewhere = quickest(values), quickest(values, own=False)
-    if elsewhere[1] >= best[1]:
-        elsewhere = "", math.nan
-    default = "closed form" if any(r.method == "closed form" for r in records) else "simulate"
-    its = [t for n, t in slopes.items() if n.split(", ")[0] == default]
-    defaults = values.get(default, math.nan), min(its, default=math.nan)
-    return Choice(scene, error, *best, *quickest(slopes), *defaults, *elsewhere)
-
-
-def times_to_error_by_method(
-    records: Iterable[Measurement], kind: str, error: float
-) -> dict[str, float]:
-    """Return the times, s, in which methods reach an error, by label (method and adjoint), the
-    quickest method first. Methods that do not reach the error are left out.
-
-    - `records`: measurements on one scene.
-    - `kind`: `value` or `gradient`.
-    - `error`: the error to reach, rad for an attitude, else relative.
+def times_by_method(records: Iterable[Measurement], kind: str, error: float) -> dict[str, float]:
+    """Return the times, s, in which the methods of one scene reach an error, by label, the quickest
+    first; methods that do not reach it are left out.
     """
     of = [r for r in records if r.kind == kind]
     times = {
@@ -184,17 +163,15 @@ def table(lines: Iterable[Choice]) -> str:
         raise TypeError(f"lines: wanted what choose returns, got {type(lines).__name__}")
     for c in lines:
         _checks.require_instance(c, Choice, "lines", requirement="lines of choose")
-        peer = f"{c.peer}, {_text_in_microseconds(c.peer_time)}" if c.peer else ""
+        peer = f"{c.peer}, {_micro(c.peer_time)}" if c.peer else ""
         rows.append(
-            f"| {c.scene} | {c.wanted:.0e} | {c.method or 'none'} "
-            f"| {_text_in_microseconds(c.time)} | {c.gradient or 'none'} "
-            f"| {_text_in_microseconds(c.gradient_time)} | "
-            f"{_text_in_microseconds(c.default)} "
-            f"({_text_in_microseconds(c.default_gradient)}) | {peer} |"
+            f"| {c.scene} | {c.wanted:.0e} | {c.method or 'none'} | {_micro(c.time)} "
+            f"| {c.gradient or 'none'} | {_micro(c.gradient_time)} | {_micro(c.default)} "
+            f"({_micro(c.default_gradient)}) | {peer} |"
         )
     return "\n".join(rows)
 
 
-def _text_in_microseconds(seconds: float) -> str:
-    """Return a time, given in seconds, as text in µs with three digits, or a dash for NaN."""
+def _micro(seconds: float) -> str:
+    """Return a time as text in µs with three digits, or a dash for NaN."""
     return "–" if seconds != seconds else f"{seconds * 1e6:.3g}"

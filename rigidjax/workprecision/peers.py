@@ -25,8 +25,8 @@ TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
 TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
 
-# A run is a function of a setting (a tolerance or the length of a step) that returns two things:
-# the last state, or the gradient, as one vector; and the number of steps.
+# A run is a function of a setting (a tolerance or the length of a step) that returns the last
+# state, or the gradient, as one vector, and the number of steps.
 RunAtSetting = Callable[[float], tuple[Any, Any]]
 # A function of a scene, of its numbers, of its initial state and of an imported package that
 # returns a run.
@@ -39,56 +39,26 @@ PrepareMethod = Callable[[BenchmarkScene], PreparedMethod | None]
 def _python_vector_field(
     scene: BenchmarkScene, numbers: np.ndarray, **options: Any
 ) -> Callable[..., Any]:
-    """Return the vector field of the handwritten equations of a scene, a function (t, y) that works
-    on Python's floats.
-
-    - `scene`: the motion to run; its `plain` makes the equations from its numbers and from
-      functions such as the sine.
-    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
-      position and velocity of a point).
-    - `options`: further arguments of `plain`, such as `wrap`, a function that compiles a function.
+    """Return the vector field of the handwritten equations, a function (t, y) of Python's floats;
+    `options` such as `wrap`, which compiles a function, are for `plain`.
     """
     plain: Any = scene.plain
     return plain(tuple(map(float, numbers)), math.sin, math.cos, math.sqrt, **options)
 
 
-def _has_plain_equations(scene: BenchmarkScene) -> bool:
-    """Return whether the `scene` (a motion to run) has handwritten equations without JAX, which
-    other packages need.
+def _in_double(scene: BenchmarkScene) -> bool:
+    """Return whether gradsolve can run a scene: importing it sets JAX to float64, and so it is not
+    used for another precision.
     """
-    return scene.plain is not None
-
-
-def _has_data_for_mujoco(scene: BenchmarkScene) -> bool:
-    """Return whether the `scene` (a motion to run) is of a body, and has the data that MuJoCo
-    needs: mass, centre of mass and gravity.
-    """
-    return scene.notes is not None and "com" in scene.notes and scene.body is not None
-
-
-def _has_plain_equations_in_double(scene: BenchmarkScene) -> bool:
-    """Return whether the `scene` (a motion to run) has handwritten equations without JAX and has
-    numbers in double precision.
-    """
-    # Importing gradsolve sets JAX to float64: gradsolve is not used for scenes of another
-    # precision.
     return scene.plain is not None and scene.numbers.dtype == jnp.float64
 
 
-def _method_value_of_package(
-    package: str, can_run: Callable[[BenchmarkScene], bool] = _has_plain_equations
+def _of_package(
+    package: str, can_run: Callable[[BenchmarkScene], bool] = lambda scene: scene.plain is not None
 ) -> Callable[[MakeRun], PrepareMethod]:
-    """Return a decorator that turns a function `make` into the `value` of a `TimedMethod`: a
-    function of a scene (a motion to run) that returns the `PreparedMethod`, or `None` for a scene
-    that the package cannot do.
+    """Return a decorator that turns a `MakeRun` into the `value` of a `TimedMethod`.
 
-    `make(scene, numbers, start, module)` gets the scene, its numbers as one vector, its initial
-    state and the imported module. It returns a function of the setting, which is a tolerance or a
-    number of steps. The time that `make` takes is recorded as compile time; the time to import the
-    module is not.
-
-    - `package`: the name of the package that is imported.
-    - `can_run`: a function of a scene that returns whether the package can do the scene.
+    The time that it takes is recorded as compile time; the time to import the package is not.
     """
 
     def decorate(make: MakeRun) -> PrepareMethod:
@@ -109,13 +79,7 @@ def _method_value_of_package(
 def _make_scipy_run(
     end: float, start: np.ndarray, vector_field: Callable[[float, np.ndarray], np.ndarray]
 ) -> RunAtSetting:
-    """Return a function of the tolerance that solves an equation by SciPy's DOP853, and returns the
-    last state and the number of steps.
-
-    - `end`: the last time, s; the first is 0.
-    - `start`: the initial state as one vector.
-    - `vector_field`: the vector field, a function (t, y) that returns dy/dt.
-    """
+    """Return a run of SciPy's DOP853 from time 0 to `end`, by tolerance."""
     from scipy.integrate import DOP853
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -130,36 +94,20 @@ def _make_scipy_run(
     return run
 
 
-@_method_value_of_package("scipy.integrate")
+@_of_package("scipy.integrate")
 def _prepare_scipy(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, _: ModuleType
 ) -> RunAtSetting:
-    """Return a function of the tolerance that runs the scene by SciPy's DOP853 on Python's floats,
-    and returns the last state and the number of steps.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
-      position and velocity of a point).
-    - `start`: the initial state as one vector.
-    - `_`: the module `scipy.integrate`, which is not used.
-    """
+    """Return a run of SciPy's DOP853 on Python's floats, by tolerance."""
     rates = _python_vector_field(scene, numbers)
     return _make_scipy_run(scene.end, start, lambda t, y: np.array(rates(t, y)))
 
 
-@_method_value_of_package("numba")
+@_of_package("numba")
 def _prepare_numba(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, numba: ModuleType
 ) -> RunAtSetting:
-    """Return a function of the tolerance that runs the scene by SciPy's DOP853 with a vector field
-    compiled by numba, and returns the last state and the number of steps.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
-      position and velocity of a point).
-    - `start`: the initial state as one vector.
-    - `numba`: the module numba.
-    """
+    """Return a run of SciPy's DOP853 with a vector field compiled by numba, by tolerance."""
     rates = _python_vector_field(scene, numbers, wrap=numba.njit)
 
     @numba.njit
@@ -170,21 +118,15 @@ def _prepare_numba(
     return _make_scipy_run(scene.end, start, f)
 
 
-@_method_value_of_package("mujoco", _has_data_for_mujoco)
+@_of_package("mujoco", lambda scene: "com" in (scene.notes or {}) and scene.body is not None)
 def _prepare_mujoco(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, mujoco: ModuleType
 ) -> RunAtSetting:
-    """Return a function of the length of a step, in seconds, that runs a body on a ball joint by
-    MuJoCo's own Runge–Kutta method of order 4, and returns the last state and the number of steps.
+    """Return a run of a body on a ball joint by MuJoCo's own Runge–Kutta method of order 4, by the
+    length of a step, s.
 
     The scene needs `notes` of mass, centre of mass and gravity, which only heavy tops and free
     bodies have.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
-      position and velocity of a point).
-    - `start`: the initial state as one vector.
-    - `mujoco`: the module mujoco.
     """
     notes, body = scene.notes, scene.body
     assert notes is not None and body is not None
@@ -218,13 +160,8 @@ def _prepare_mujoco(
 def _heyoka_equations(
     scene: BenchmarkScene, heyoka: ModuleType, numbers: Sequence[Any]
 ) -> list[tuple[Any, Any]]:
-    """Return the equations of a scene in heyoka's form: a list of pairs, a variable and its time
-    derivative.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `heyoka`: the module heyoka.
-    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or position and
-      velocity of a point), as floats or as parameters of heyoka.
+    """Return pairs of a variable and its time derivative for heyoka; the numbers are floats or
+    parameters of heyoka.
     """
     names = "abcdxyz" if scene.body is not None else ("px", "py", "pz", "vx", "vy", "vz")
     variables = heyoka.make_vars(*names)
@@ -236,17 +173,8 @@ def _heyoka_equations(
 def _make_heyoka_run(
     heyoka: ModuleType, end: float, start: np.ndarray, equations: Any, **options: Any
 ) -> RunAtSetting:
-    """Return a function of the tolerance that runs heyoka's Taylor method, and returns the last
-    state and the number of steps.
-
-    The order of heyoka's method and its code depend on the tolerance: each tolerance is compiled
-    once, when it is first used.
-
-    - `heyoka`: the module heyoka.
-    - `end`: the last time, s; the first is 0.
-    - `start`: the initial state as one vector.
-    - `equations`: the equations in heyoka's form.
-    - `options`: further arguments of `heyoka.taylor_adaptive`.
+    """Return a run of heyoka's Taylor method, by tolerance; its order and code depend on the
+    tolerance, and each tolerance is compiled once, when it is first used.
     """
     made: dict[float, Any] = {}
 
@@ -263,40 +191,25 @@ def _make_heyoka_run(
     return run
 
 
-@_method_value_of_package("heyoka")
+@_of_package("heyoka")
 def _prepare_heyoka(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, heyoka: ModuleType
 ) -> RunAtSetting:
-    """Return a function of the tolerance that runs the scene by heyoka's Taylor method, and returns
-    the last state and the number of steps.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
-      position and velocity of a point).
-    - `start`: the initial state as one vector.
-    - `heyoka`: the module heyoka.
-    """
+    """Return a run of heyoka's Taylor method, by tolerance."""
     system = _heyoka_equations(scene, heyoka, list(map(float, numbers)))
     return _make_heyoka_run(heyoka, scene.end, start, system)
 
 
-@_method_value_of_package("heyoka")
+@_of_package("heyoka")
 def _prepare_heyoka_gradient(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, heyoka: ModuleType
 ) -> RunAtSetting:
-    """Return a function of the tolerance that computes the gradient of `scene.loss`, a scalar
-    function of the last state, by heyoka's variational equations, and returns the gradient and the
-    number of steps.
+    """Return a run that computes the gradient of `scene.loss` by heyoka's variational equations, by
+    tolerance.
 
     The variational equations give the derivatives of the last state with respect to the initial
     state and the inertia; these derivatives are multiplied by the gradient of the scalar with
     respect to the last state.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
-      position and velocity of a point).
-    - `start`: the initial state as one vector.
-    - `heyoka`: the module heyoka.
     """
     size = 6 if scene.body is not None else 0
     symbols = [heyoka.par[i] for i in range(size)] or list(numbers)
@@ -323,11 +236,8 @@ def _prepare_heyoka_gradient(
 
 
 class _GradsolveEnsemble:
-    """Present a scene (a motion to run) as an ensemble of one member, because the package gradsolve
-    solves ensembles of equations.
-
-    The parameters of the member are the numbers of the scene (inertia, initial rate and attitude;
-    or position and velocity of a point).
+    """Present a scene as an ensemble of one member, with its numbers as parameters, because
+    gradsolve solves ensembles of equations.
     """
 
     is_stiff, t0 = False, 0.0
@@ -352,19 +262,11 @@ class _GradsolveEnsemble:
         return getattr(self.module, name)(self, self.start, self.numbers, **options)
 
 
-@_method_value_of_package("gradsolve", _has_plain_equations_in_double)
+@_of_package("gradsolve", _in_double)
 def _prepare_gradsolve(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, gradsolve: ModuleType
 ) -> RunAtSetting:
-    """Return a function of the tolerance that runs the scene by gradsolve's method of order 7, and
-    returns the last state and the number of steps.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
-      position and velocity of a point).
-    - `start`: the initial state as one vector.
-    - `gradsolve`: the module gradsolve.
-    """
+    """Return a run of gradsolve's method of order 7, by tolerance."""
     ensemble = _GradsolveEnsemble(scene, numbers, start, gradsolve)
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -381,21 +283,12 @@ def _prepare_gradsolve(
     return run
 
 
-@_method_value_of_package("gradsolve", _has_plain_equations_in_double)
+@_of_package("gradsolve", _in_double)
 def _prepare_gradsolve_gradient(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, gradsolve: ModuleType
 ) -> RunAtSetting:
-    """Return a function of the tolerance that computes the gradient of `scene.loss`, a scalar
-    function of the last state, by gradsolve, which differentiates a solution whose steps it has
-    recorded before, and returns the gradient and the number of steps.
-
-    The steps are recorded once for each tolerance, and this recording is not timed.
-
-    - `scene`: the motion to run: a body or a point, its initial state, torque and last time.
-    - `numbers`: the numbers of the scene (inertia, initial rate and attitude; or the initial
-      position and velocity of a point).
-    - `start`: the initial state as one vector.
-    - `gradsolve`: the module gradsolve.
+    """Return a run that computes the gradient of `scene.loss` by gradsolve, which differentiates a
+    solution whose steps it has recorded once for each tolerance (which is not timed).
     """
     ensemble = _GradsolveEnsemble(scene, numbers, start, gradsolve)
     made: dict[float, Any] = {}
@@ -420,9 +313,8 @@ def _prepare_gradsolve_gradient(
     return run
 
 
-def methods_of_other_packages() -> list[TimedMethod]:
-    """Return the methods of SciPy, numba, MuJoCo, heyoka and gradsolve, as far as these packages
-    are installed.
+def other_methods() -> list[TimedMethod]:
+    """Return the methods of SciPy, numba, MuJoCo, heyoka and gradsolve that are installed.
 
     Sources: for the adaptive Taylor method of heyoka, Biscani and Izzo 2021,
     doi:10.1093/mnras/stab1032; for gradsolve, which takes gradients of recorded steps of Verner's
@@ -433,21 +325,14 @@ def methods_of_other_packages() -> list[TimedMethod]:
         "numba": TimedMethod("scipy DOP853, numba", "peer", TOLERANCES, _prepare_numba),
         "mujoco": TimedMethod("MuJoCo RK4", "peer", STEPS, _prepare_mujoco),
         "heyoka": TimedMethod(
-            "heyoka Taylor",
-            "peer",
-            TAYLOR,
-            _prepare_heyoka,
+            "heyoka Taylor", "peer", TAYLOR, _prepare_heyoka,
             {"variational": _prepare_heyoka_gradient},
         ),
-    }
-    replay = TimedMethod(
-        "gradsolve Vern7",
-        "peer",
-        TOLERANCES,
-        _prepare_gradsolve,
-        {"replay": _prepare_gradsolve_gradient},
-    )
-    peers["gradsolve"] = replay
+        "gradsolve": TimedMethod(
+            "gradsolve Vern7", "peer", TOLERANCES, _prepare_gradsolve,
+            {"replay": _prepare_gradsolve_gradient},
+        ),
+    }  # fmt: skip
     return [method for name, method in peers.items() if importlib.util.find_spec(name)]
 
 
@@ -462,5 +347,5 @@ def methods(group: str | None = None) -> list[TimedMethod]:
     """
     if group is not None:
         _checks.require_option(group, ("ours", "jax", "peer"), "group")
-    available = [*methods_in_jax(), *methods_of_other_packages()]
+    available = [*methods_in_jax(), *other_methods()]
     return [method for method in available if group in (None, method.group)]

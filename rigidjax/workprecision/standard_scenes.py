@@ -64,10 +64,7 @@ BODIES: dict[str, tuple[str, Any, Any, float, Any, Any]] = {
 
 
 class Circle(eqx.Module):
-    """Compute the position (3,) on a circular orbit in the xy-plane as a function of time.
-
-    `radius` is the radius of the orbit, and `rate` the angular rate, rad/s.
-    """
+    """Compute the position on a circular orbit in the xy-plane, with the angular rate in rad/s."""
 
     radius: Float[Array, ""]
     rate: Float[Array, ""]
@@ -78,30 +75,9 @@ class Circle(eqx.Module):
         return self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), zero])
 
 
-def _return_unchanged(x: Any) -> Any:
-    """Return `x` unchanged; it stands for a conversion or a compilation that is not needed."""
+def _unchanged(x: Any) -> Any:
+    """Return x; this stands for a conversion or a compilation that is not needed."""
     return x
-
-
-def _library_torque(
-    handwritten_torque: Callable[..., Any] | None, constants: Sequence[float]
-) -> HeavyTop | Sum | GravityGradient | None:
-    """Return the torque of this library that equals a handwritten torque, or `None` for a free
-    body.
-
-    - `handwritten_torque`: the handwritten torque, a function of `workprecision.equations`, or
-      `None`.
-    - `constants`: the constants of this torque, such as centre of mass and gravity.
-    """
-    if handwritten_torque is equations.heavy_top_torque:
-        return HeavyTop(1.0, constants[:3], constants[3:])
-    if handwritten_torque is equations.gyrostat_torque:
-        return Sum(Flywheel(constants[:3]), Damping(constants[3:]))
-    if handwritten_torque is equations.gravity_gradient_torque:
-        (rate,) = constants
-        circle = Circle(jnp.asarray(RADIUS), jnp.asarray(rate))
-        return GravityGradient(rate**2 * RADIUS**3, circle)
-    return None
 
 
 def _scene_of_body(
@@ -113,26 +89,15 @@ def _scene_of_body(
     handwritten_torque: Callable[..., Any] | None,
     constants: Sequence[float],
 ) -> BenchmarkScene:
-    """Return a standard scene, a motion to compare methods on, of a rigid body.
-
-    - `name`: the name of the scene, by which its stored reference (the correct last state and
-      gradient) is found.
-    - `title`: the name in words.
-    - `moments`: the three principal moments of inertia, kg m².
-    - `omega`: the initial rate (3,), rad/s, body axes.
-    - `end`: the last time, s.
-    - `handwritten_torque`: the handwritten torque, a function of `workprecision.equations`, or
-      `None` for a free body.
-    - `constants`: the constants of the torque.
-    """
+    """Return a standard scene of a rigid body, from a row of `BODIES`."""
 
     def plain(
         numbers: Sequence[Any],
         sin: Callable[..., Any],
         cos: Callable[..., Any],
         sqrt: Callable[..., Any],
-        wrap: Callable[..., Any] = _return_unchanged,
-        number: Callable[..., Any] = _return_unchanged,
+        wrap: Callable[..., Any] = _unchanged,
+        number: Callable[..., Any] = _unchanged,
     ) -> Any:
         exact = tuple(number(c) for c in constants)
         torque = None
@@ -145,15 +110,20 @@ def _scene_of_body(
     # MuJoCo needs the mass, the centre of mass and gravity as data (`notes`); for a free body the
     # last two are zero. A scene with any other torque than weight gets no such data, because our
     # method for MuJoCo cannot do it.
-    com, gravity = (
-        (constants[:3], constants[3:])
-        if handwritten_torque is equations.heavy_top_torque
-        else ((0.0,) * 3,) * 2
-    )
+    com, gravity, torque = (0.0,) * 3, (0.0,) * 3, None
+    if handwritten_torque is equations.heavy_top_torque:
+        com, gravity = constants[:3], constants[3:]
+        torque = HeavyTop(1.0, com, gravity)
+    elif handwritten_torque is equations.gyrostat_torque:
+        torque = Sum(Flywheel(constants[:3]), Damping(constants[3:]))
+    elif handwritten_torque is equations.gravity_gradient_torque:
+        (rate,) = constants
+        circle = Circle(jnp.asarray(RADIUS), jnp.asarray(rate))
+        torque = GravityGradient(rate**2 * RADIUS**3, circle)
     weighs = handwritten_torque in (None, equations.heavy_top_torque)
     return BenchmarkScene(
         name, title, Inertia.from_principal(*moments), Attitude(TILTED, omega),
-        _library_torque(handwritten_torque, constants), end, plain, stored_reference(name),
+        torque, end, plain, stored_reference(name),
         slow=omega[2] > 1e3,
         notes={"mass": 1.0, "com": com, "gravity": gravity} if weighs else None,
     )  # fmt: skip
@@ -168,17 +138,8 @@ def _scene_of_point(
     handwritten_equations: Callable[..., Any],
     constants: Sequence[float],
 ) -> BenchmarkScene:
-    """Return a standard scene, a motion to compare methods on, of a particle.
-
-    - `name`: the name of the scene, by which its stored reference (the correct last state and
-      gradient) is found.
-    - `title`: the name in words.
-    - `start`: the initial position and velocity.
-    - `end`: the last time, in the unit of time of the equations (seconds for the pendulum).
-    - `library_equations`: the object of this library that has the equations of motion.
-    - `handwritten_equations`: a function of `workprecision.equations` that returns the same
-      equations in plain arithmetic.
-    - `constants`: the constants of these equations.
+    """Return a standard scene of a particle, with the equations of the library and the same in
+    plain arithmetic.
     """
 
     def plain(
@@ -186,8 +147,8 @@ def _scene_of_point(
         sin: Callable[..., Any],
         cos: Callable[..., Any],
         sqrt: Callable[..., Any],
-        wrap: Callable[..., Any] = _return_unchanged,
-        number: Callable[..., Any] = _return_unchanged,
+        wrap: Callable[..., Any] = _unchanged,
+        number: Callable[..., Any] = _unchanged,
     ) -> Any:
         return wrap(handwritten_equations(tuple(number(c) for c in constants), sqrt))
 
@@ -197,8 +158,8 @@ def _scene_of_point(
 
 
 def _foucault_scene() -> BenchmarkScene:
-    """Return the standard scene (a motion to compare methods on) of Foucault's pendulum, released
-    at rest and followed for ten minutes.
+    """Return the standard scene of Foucault's pendulum, released at rest and followed for ten
+    minutes.
     """
     law = places.foucault(0.85, 67.0)
     _, north, up = (float(w) for w in law.place.angular_velocity())
@@ -209,8 +170,8 @@ def _foucault_scene() -> BenchmarkScene:
 
 
 def _arenstorf_scene() -> BenchmarkScene:
-    """Return the standard scene (a motion to compare methods on) of Arenstorf's orbit about Earth
-    and Moon, followed for one period.
+    """Return the standard scene of Arenstorf's orbit about Earth and Moon, followed for one
+    period.
     """
     mu, x, v, period = ARENSTORF
     return _scene_of_point(

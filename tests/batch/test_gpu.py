@@ -136,13 +136,13 @@ def test_a_record_on_a_gpu_follows_the_largest_number_of_steps(monkeypatch):
     for one in (sharding, batching, adaptive_loop, module):
         monkeypatch.setattr(one, "platform", lambda: "gpu")
 
-    def fit_chunk_to_memory(*args):
-        division = sharding.fit_chunk_to_memory(*args)
+    def fit_chunk(*args):
+        division = sharding.fit_chunk(*args)
         chunks.append(division.chunk)
         return division
 
-    monkeypatch.setattr(module, "fit_chunk_to_memory", fit_chunk_to_memory)
-    monkeypatch.setattr(sharding, "memory_of_device", lambda mesh: 1e4)
+    monkeypatch.setattr(module, "fit_chunk", fit_chunk)
+    monkeypatch.setattr(sharding, "memory_of", lambda mesh: 1e4)
     there = compiled(401)  # another number, so that no trace of the first call is taken
     monkeypatch.setattr(sharding, "_FEW", 2)
     apart = compiled(402)
@@ -158,11 +158,11 @@ def test_chunks_that_fit_a_memory_have_an_odd_length(monkeypatch):
     monkeypatch.setattr(sharding, "platform", lambda: "gpu")
     rows = jnp.arange(20_000.0)
     division = sharding.divide_batch(None, None, None, rows.dtype, rows.size)
-    assert division.chunk == rows.size == sharding.bodies_per_device(division, rows)
+    assert division.chunk == rows.size == sharding.share_of(division, rows)
 
     def chunk(memory):
-        monkeypatch.setattr(sharding, "memory_of_device", lambda mesh: memory)
-        fit = sharding.fit_chunk_to_memory
+        monkeypatch.setattr(sharding, "memory_of", lambda mesh: memory)
+        fit = sharding.fit_chunk
         return fit(division, lambda scale, row: jnp.sin(scale * row), jnp.asarray(2.0), rows).chunk
 
     found = [chunk(memory) for memory in (1.0, 2e5, 4e5, np.inf)]
@@ -175,9 +175,9 @@ def test_memory_of_a_device_is_what_jax_says(monkeypatch):
     class Card:
         memory_stats = staticmethod(lambda: {"bytes_limit": 5.0})
 
-    assert sharding.memory_of_device(None) == np.inf  # a CPU
+    assert sharding.memory_of(None) == np.inf  # a CPU
     monkeypatch.setattr(jax, "devices", lambda: [Card()])
-    assert sharding.memory_of_device(None) == 5.0
+    assert sharding.memory_of(None) == 5.0
 
 
 def test_many_rows_are_checked_where_they_are():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax.batch.simulate import sort_bodies_for_chunks
+from rigidjax.batch.simulate import sorted_for_chunks
 
 TOP = rj.torques.HeavyTop(1.0, [0.0, 0.0, 1.0], [0.0, 0.0, -1.0])
 TS = [0.0, 0.7, 2.0]
@@ -83,11 +83,11 @@ def test_ill_starts_are_marked_where_they_are_traced():
 def test_dealing_is_a_permutation():
     key = jnp.asarray(np.random.default_rng(1).permutation(50).astype(float)).at[9].set(jnp.nan)
     for chunk, parts in ((4, 1), (4, 3), (128, 2), (1, 7)):
-        order, back = sort_bodies_for_chunks(key, chunk, parts)
+        order, back = sorted_for_chunks(key, chunk, parts)
         assert np.array_equal(np.sort(order), np.arange(50))
         assert np.array_equal(key[order][back], key, equal_nan=True)
     # Two devices: the quick and the slow are shared out.
-    order, _ = sort_bodies_for_chunks(jnp.arange(16.0), 4, 2)
+    order, _ = sorted_for_chunks(jnp.arange(16.0), 4, 2)
     assert order.tolist() == [0, 1, 2, 3, 8, 9, 10, 11, 4, 5, 6, 7, 12, 13, 14, 15]
 
 

@@ -11,7 +11,7 @@ from once import once
 
 from rigidjax.body import parameters
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.validation import require_physical_mass, require_physical_second_moment
+from rigidjax.body.validation import require_physical_mass, require_second_moment
 from rigidjax.rotation import so3
 
 CHARTS = {
@@ -135,9 +135,9 @@ def test_a_thousand_wild_steps_meet_no_invalid_body(dtype):
     assert all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves((bodies, inertia)))
     # The same checks that refuse a wrong body: each raises on the first of the 2000.
     require_physical_mass(bodies.mass)
-    require_physical_second_moment(bodies.second_moment)
+    require_second_moment(bodies.second_moment)
     shapes = jax.jit(jax.vmap(parameters.unpack_shape))(walk[:, :5])
-    require_physical_second_moment(shapes)
+    require_second_moment(shapes)
     np.testing.assert_allclose(jnp.trace(shapes, axis1=1, axis2=2), 1, rtol=1e-5)
     moments = jax.jit(jax.vmap(parameters.unpack_moments))(walk[:, :3])
     assert bool((moments > 0).all() and jnp.isfinite(moments).all())

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rigidjax.body.scaling import largest_binary_exponent, times_power_of_two
+from rigidjax.body.scaling import binary_exponent, times_power_of_two
 
 # (x, n) with a normal product; 2ⁿ itself is out of range in some.
 DOUBLE = [
@@ -81,8 +81,8 @@ def test_exponents(dtype):
     info = np.finfo(dtype)
     for x in (0.0, 1.0, -0.75, 2.0, 1e30, -1e-30, float(info.max), float(info.tiny)):
         x = dtype(x)
-        assert int(largest_binary_exponent(jnp.array([x / 2, x, -x]))) == math.frexp(x)[1]
+        assert int(binary_exponent(jnp.array([x / 2, x, -x]))) == math.frexp(x)[1]
     value, moved = jax.jvp(
-        lambda x: times_power_of_two(x, -largest_binary_exponent(x)), (dtype(3.0),), (dtype(1.0),)
+        lambda x: times_power_of_two(x, -binary_exponent(x)), (dtype(3.0),), (dtype(1.0),)
     )
     assert (value, moved) == (0.75, 0.25)

@@ -137,15 +137,15 @@ def test_faults_agree_with_eigenvalues():
     tensors = np.einsum("nij,nj,nkj->nik", turns, moments, turns) * size[:, None, None]
     least, middle, largest = np.sort(moments).T
     broken = largest > least + middle
-    flat, bad, skew = validation._zero_impossible_asymmetric_flags(
+    flat, bad, skew = validation._faults(
         np, 0.5 * (tensors + tensors.swapaxes(1, 2)), allow_zero_moment=False
     )
     np.testing.assert_array_equal(bad | flat, broken)
     assert not skew.any()
     first = int(np.argmax(broken))
-    assert validation.index_of_first_impossible_inertia(jnp.asarray(tensors)) == first
-    assert validation.index_of_first_impossible_inertia(jnp.asarray(tensors[: first + 1])) == first
-    assert validation.index_of_first_impossible_inertia(jnp.asarray(tensors[~broken])) == -1
+    assert validation.first_impossible_inertia(jnp.asarray(tensors)) == first
+    assert validation.first_impossible_inertia(jnp.asarray(tensors[: first + 1])) == first
+    assert validation.first_impossible_inertia(jnp.asarray(tensors[~broken])) == -1
 
 
 def test_bodies_of_zero_moments_and_rounded_plates_have_energy():

@@ -167,10 +167,10 @@ def test_a_fit_of_six_years(parts, most, ok):
     fit = rj.identify.fit(problem, initial=start, starts=1)
     rms = np.sqrt(np.mean(np.asarray(fit.residuals[0]) ** 2, axis=0)) / mas / 1e3
     assert (rms <= most).all() and fit.ok == ok
-    logs = read.chart(core=core).logs(fit.body) - read.chart()._log_beta_gamma_of_de421
+    logs = read.chart(core=core).logs(fit.body) - read.chart()._published
     near = abs(logs) < np.array([1e-4, 1e-3])
     assert near.all() == ok
     if ok:
         low, high = np.log([fit.interval()[name] for name in "βγ"]).T
-        known = np.asarray(read.chart()._log_beta_gamma_of_de421)
+        known = np.asarray(read.chart()._published)
         assert (low < known).all() and (known < high).all()

@@ -56,8 +56,8 @@ def orbit_of(row):
 @eqx.filter_jit
 def left(scene, orbits):
     """What the orbits miss at the half period, and their stability."""
-    numbers = jax.vmap(differential_correction.numbers_at_crossing)(orbits)
-    missed = jax.vmap(lambda n: differential_correction.periodicity_residual(scene, n))(numbers)
+    numbers = jax.vmap(differential_correction.numbers_of)(orbits)
+    missed = jax.vmap(lambda n: differential_correction.half_period_residual(scene, n))(numbers)
     return jnp.max(jnp.abs(missed)), jax.vmap(scene.stability_indices)(orbits)
 
 
@@ -66,7 +66,7 @@ def test_published_halo_orbits_and_their_stability():
     scene = orbits.cr3bp(0.04)
     correct = eqx.filter_jit(jax.vmap(lambda row: scene.periodic_orbit(orbit_of(row), hold="z")))
     found = correct(jnp.asarray(HOWELL))
-    numbers = jax.vmap(differential_correction.numbers_at_crossing)(found)
+    numbers = jax.vmap(differential_correction.numbers_of)(found)
     # Half a unit of the last digit printed, and of that of z carried along the family.
     slopes = jax.vmap(lambda orbit: scene.family_slope(orbit, hold="z"))(found)
     carried = np.stack(
@@ -182,7 +182,7 @@ def test_following_a_family_past_its_turn():
     assert float(missed) <= 1e-12
     turns = np.diff(np.append(float(first.state.x[0]), found.state.x[:, 0]))
     assert turns[0] < 0 < turns[-1] and (np.diff(found.state.x[:, 2]) > 0).all()
-    numbers = np.asarray(jax.vmap(differential_correction.numbers_at_crossing)(found))
+    numbers = np.asarray(jax.vmap(differential_correction.numbers_of)(found))
     chords = np.sqrt(np.square(np.diff(numbers, axis=0)).sum(axis=1))
     np.testing.assert_allclose(chords, 0.03, rtol=0.02)
     # The same members by another road.

@@ -13,7 +13,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax.rotation import barrier
-from rigidjax.rotation.barrier import compiled_as_one_kernel, match_batch_axes
+from rigidjax.rotation.barrier import match_batch_axes, one_kernel
 
 LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000"
 OLDER = "--xla_cpu_use_fusion_emitters=false"
@@ -27,7 +27,7 @@ def partly_shared(a, b):
 def test_a_derivative_of_its_batch_under_jit(axes):
     """Results that a batch shares: JAX gave the derivatives of all bodies to each."""
     a, b = (jnp.arange(1.0, 4.0) if axis == 0 else jnp.array(0.7) for axis in axes)
-    one, plain = jax.jit(compiled_as_one_kernel(partly_shared)), partly_shared
+    one, plain = jax.jit(one_kernel(partly_shared)), partly_shared
     found, wanted = (
         jax.jit(lambda a, b, f=f: jax.jvp(jax.vmap(f, axes), (a, b), (2 * a, -b)))(a, b)
         for f in (one, plain)
@@ -41,7 +41,7 @@ def test_a_derivative_of_its_batch_under_jit(axes):
 def test_a_second_derivative_of_its_batch_under_jit(axes):
     """The derivative of a kernel repeats its values, which are differentiated in their turn."""
     a, b = (jnp.arange(1.0, 4.0) if axis == 0 else jnp.array(0.7) for axis in axes)
-    kernel = jax.vmap(compiled_as_one_kernel(partly_shared), axes)
+    kernel = jax.vmap(one_kernel(partly_shared), axes)
 
     def along(a, b):
         return jax.jvp(kernel, (a, b), (jnp.ones_like(a), jnp.ones_like(b)))

@@ -73,9 +73,10 @@ def test_from_any_alias_alone_the_right_pair_is_found(shift):
     t, y, pair, day = daily(1)
     span = t[-1]
     x, sigma = jnp.asarray(t / span), jnp.full(t.size, 0.1)
-    table = lattice_series.fourier_sum_table((x, jnp.asarray(y) / sigma, 1 / sigma), 610.0)
+    light = lattice_series.Light(x, jnp.asarray(y) / sigma, 1 / sigma)
+    table = lattice_series.sum_table(light, 610.0)
     wrong = (pair + np.array(shift) / day)[None] * span
-    misfits = lattice_series.fourier_chi2_of_pairs(table, wrong, 1)
+    misfits = lattice_series.chi2_of_pairs(table, wrong, 1)
     pairs, misfits = with_aliases(table, wrong, misfits, 100.0, 1)
     best = pairs[misfits < misfits.min() + 5.0] / span
     assert np.abs(best - pair).max(axis=1).min() < 0.05 / span
@@ -98,8 +99,8 @@ def test_a_tumbler_is_found_blind(seed, mode):
 
 # What depends on the readings themselves, and what JAX compiles to hold an array.
 SMALL = {
-    "_fourier_sums_at_frequencies",
-    "fourier_chi2_of_padded_pairs",
+    "_sums",
+    "chi2_of_padded",
     "stage",
     "squeeze",
     "dynamic_slice",

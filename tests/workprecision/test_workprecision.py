@@ -28,7 +28,7 @@ from rigidjax.workprecision import (
 )
 from rigidjax.workprecision.measurement import compute_reference, long_drift, to_float32
 from rigidjax.workprecision.pareto import pareto_front, time_to
-from rigidjax.workprecision.record import Measurement, read_csv, sentences_about_changes, write_csv
+from rigidjax.workprecision.record import Measurement, changes, read_csv, write_csv
 from rigidjax.workprecision.scene import PreparedMethod, TimedMethod, state_errors
 
 NAMES = list(scenes())
@@ -204,15 +204,15 @@ def test_the_front_and_the_table():
 
 def test_what_moved_is_said():
     was = [line(time=2.0, steps=100.0), line("diffrax Dopri8", group="jax", time=1.0)]
-    assert sentences_about_changes(was, was) == ([], [])
+    assert changes(was, was) == ([], [])
     worse = [dataclasses.replace(was[0], error=1e-4, steps=150.0, time=9.0), was[1]]
-    wrong, paced = sentences_about_changes(worse, was)
+    wrong, paced = changes(worse, was)
     assert wrong == [
         "s, value, a at 1e-06: error was 1e-06, is 0.0001",
         "s, value, a at 1e-06: steps were 100, are 150",
     ]
     assert paced == ["s, value, a: time over diffrax Dopri8's was 2, is 9"]
-    assert sentences_about_changes([was[1]], was)[0] == ["s, value, a at 1e-06: not there any more"]
+    assert changes([was[1]], was)[0] == ["s, value, a at 1e-06: not there any more"]
 
 
 def test_files_and_charts(tmp_path):

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from rigidjax import _checks
 from rigidjax.body import parameters as charts, validation
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of as tensor_of
-from rigidjax.body.symmetric3 import inertia_from_second_moment
+from rigidjax.body.symmetric3 import to_inertia
 
 # A fit may move three parts of a `MassProperties`. This dict maps each part to the indices of its
 # numbers in the array that `rigidjax.body.parameters.pack` returns.
@@ -122,7 +122,7 @@ class Ratios(AbstractBodyChart):
     scale: ClassVar[str | None] = "arbitrary"
 
     def body(self, vector: Numbers) -> Inertia:
-        return Inertia(inertia_from_second_moment(charts.unpack_shape(vector)))
+        return Inertia(to_inertia(charts.unpack_shape(vector)))
 
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_shape(body.second_moment)
@@ -203,9 +203,7 @@ class Tensor(AbstractBodyChart):
     unit: ClassVar[str] = "kg m²"
 
     def body(self, vector: Numbers) -> Inertia:
-        return Inertia(
-            inertia_from_second_moment(charts.unpack_second_moment(vector) * (0.5 * self.typical))
-        )
+        return Inertia(to_inertia(charts.unpack_second_moment(vector) * (0.5 * self.typical)))
 
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_second_moment(body.second_moment / (0.5 * self.typical))

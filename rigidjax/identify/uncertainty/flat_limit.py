@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.symmetric3 import inertia_from_second_moment
+from rigidjax.body.symmetric3 import to_inertia
 from rigidjax.identify.model.charts import (
     AbstractBodyChart,
     body_list,
@@ -164,7 +164,7 @@ def _numbers_of_thicker_body(
     second = jnp.asarray((axes * np.maximum(values, least)) @ axes.T)
     if isinstance(body, MassProperties):
         return chart.vector(MassProperties(body.mass, body.com, second))
-    return chart.vector(Inertia(inertia_from_second_moment(second)))
+    return chart.vector(Inertia(to_inertia(second)))
 
 
 def _is_bounded_by_flat_bodies(chart: AbstractBodyChart) -> bool:
