@@ -37,7 +37,7 @@ from rigidjax.motion.coupled import Coupled, motion_of, with_own_states
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation.barrier import platform
 from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
-from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_or_nonfinite_input
+from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_of_body
 from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
 
@@ -254,7 +254,7 @@ def _results_after_fixed_steps(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
 
     def status(row: PyTree, ys: PyTree) -> dfx.RESULTS:
         result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-        return result_or_nonfinite_input(
+        return result_of_body(
             result, inertia_state_and_torque(batch.shared, row, batch.constants)[0]
         )
 

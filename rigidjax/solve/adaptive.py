@@ -48,7 +48,7 @@ class AdaptiveRun(NamedTuple):
     missed: Array | None
 
 
-class _VectorFieldOnTree(eqx.Module):
+class _FieldOnTree(eqx.Module):
     """Evaluate a field on a state, where the field itself is a function of one vector of numbers.
 
     - `constants`: the arrays on which the field depends.
@@ -69,7 +69,7 @@ class _VectorFieldOnTree(eqx.Module):
         return self.tree(self.field(self.constants, t, ravel_pytree(y)[0]))
 
 
-def _state_as_vector(t: Any, y: PyTree, args: object) -> Array:
+def _vector(t: Any, y: PyTree, args: object) -> Array:
     """Return the n numbers of the state `y` as one vector (n,), for diffrax to save.
 
     Diffrax also gives the time `t`, s, and the argument `args` of the field; neither is used.
@@ -77,7 +77,7 @@ def _state_as_vector(t: Any, y: PyTree, args: object) -> Array:
     return ravel_pytree(y)[0]
 
 
-def integrate_with_diffrax(
+def integrate(
     solver: dfx.AbstractSolver,
     field: Callable[..., Any],
     ts: Array,
@@ -113,15 +113,15 @@ def integrate_with_diffrax(
         numbers, tree = ravel_pytree(y0)
         of_one = lambda t, y, *sides: ravel_pytree(field(t, tree(y), sides or None))[0]  # noqa: E731
         program = program_with_stops(of_one, jumps, ts[0], ts[-1], numbers)
-        field, missed = _VectorFieldOnTree(program.constants, program.field, tree), program.over
+        field, missed = _FieldOnTree(program.constants, program.field, tree), program.over
         if program.stops.size:
             controller = Stopping(controller, program.stops)
     # The last of `ts` is the end of the last step, so that the state there needs no dense output.
-    subs = [dfx.SubSaveAt(t1=True, fn=_state_as_vector)]
+    subs = [dfx.SubSaveAt(t1=True, fn=_vector)]
     if ts.shape[0] > 2 and isinstance(adjoint, ReplayAdjoint) and can_run(solver, max_steps, y0):
         adjoint = dataclasses.replace(adjoint, between=ts[1:-1])
     elif ts.shape[0] > 2:
-        subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=_state_as_vector)]
+        subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=_vector)]
     out = dfx.diffeqsolve(
         dfx.ODETerm(field), solver, ts[0], ts[-1], dt0, y0,
         saveat=dfx.SaveAt(subs=subs), stepsize_controller=controller, adjoint=adjoint,
@@ -205,4 +205,4 @@ def adaptive(
     rtol, atol = (jnp.asarray(a, ts.dtype) for a in (rtol, atol))
     controller = Watched(StandardController(rtol, atol, max_step))
     how = dict(jumps=declared, halt=halt, dt0=dt0, max_steps=max_steps)
-    return integrate_with_diffrax(solver, field, ts, y0, controller, **how)
+    return integrate(solver, field, ts, y0, controller, **how)

@@ -34,7 +34,7 @@ class Layout(NamedTuple):
     bodies: bool  # whether the arrays of each body have this axis; without it there is one body
     shared: tuple[bool, ...]  # for each constant, whether all bodies share it, without this axis
 
-    def vmap_over_bodies(self, function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    def vmap(self, function: Callable[..., PyTree]) -> Callable[..., PyTree]:
         """Map `function(constants, t, y)`, which takes the arrays of one body, over all bodies.
 
         The result takes and returns arrays whose last axis is that of the bodies; constants that
@@ -44,7 +44,7 @@ class Layout(NamedTuple):
         axes = [None if s else -1 for s in self.shared]
         return jax.vmap(function, (axes, -1, -1), -1) if self.bodies else function
 
-    def broadcast_to_bodies(
+    def broadcast(
         self, constants: Arrays, per_body: list[bool], like: Array
     ) -> tuple["Layout", Arrays]:
         """Broadcast some of the constants that all bodies share along a new last axis of bodies.
@@ -74,7 +74,7 @@ class Layout(NamedTuple):
 Program = Callable[[Layout, Arrays, Arrays], Arrays]
 
 
-def run_with_bodies_last(
+def bodies_last(
     program: Program,
     constants: Arrays,
     each: Arrays,
@@ -99,9 +99,7 @@ def run_with_bodies_last(
     """
     was = Layout(False, (True,) * len(constants)) if layout is None else layout
     number = len(constants)
-    call: Any = jax.custom_batching.custom_vmap(
-        partial(_run_in_blocks_of_bodies, program, was, number)
-    )
+    call: Any = jax.custom_batching.custom_vmap(partial(_in_blocks, program, was, number))
 
     @call.def_vmap
     def _(size: int, batched: Any, *args: Any) -> Any:
@@ -120,7 +118,7 @@ def run_with_bodies_last(
                 one = lambda *along: program(layout, constants, [*each[:many], *along])  # noqa: E731
                 return jax.vmap(one, axes, axis_size=size)(*each[many:])
 
-            out = run_with_bodies_last(over, constants, each, num_linear, was)
+            out = bodies_last(over, constants, each, num_linear, was)
             return out, [True] * len(out)
         new = Layout(True, tuple(s and not b for s, b in zip(was.shared, own, strict=True)))
         count = each[0].shape[-1] if was.bodies else 1
@@ -136,7 +134,7 @@ def run_with_bodies_last(
             for c, shared, b, before in zip(constants, new.shared, own, was.shared, strict=True)
         ]
         each = [last(a, b, True) for a, b in zip(each, rest, strict=True)]
-        out = run_with_bodies_last(program, constants, each, num_linear, new)
+        out = bodies_last(program, constants, each, num_linear, new)
 
         def first(a: Any) -> Any:
             a = a.reshape(*a.shape[:-1], count, size) if was.bodies else a
@@ -146,14 +144,12 @@ def run_with_bodies_last(
 
     answer: Any = jax.custom_jvp(lambda *args: call(*args))
     # The derivative rule of `custom_vmap` gives wrong shapes for a batch of tangents, so that
-    # `_program_and_tangent` is used instead.
-    answer.defjvp(
-        partial(_program_and_tangent, program, was, number, num_linear), symbolic_zeros=True
-    )
+    # `_with_tangent` is used instead.
+    answer.defjvp(partial(_with_tangent, program, was, number, num_linear), symbolic_zeros=True)
     return answer(*constants, *each)
 
 
-def _program_and_tangent(
+def _with_tangent(
     program: Program,
     layout: Layout,
     num_constants: int,
@@ -163,8 +159,8 @@ def _program_and_tangent(
 ) -> tuple[Arrays, Arrays]:
     """Return the result of a program and its tangent, which are computed together.
 
-    This is the rule for derivatives of `run_with_bodies_last` in forward mode.
-    `run_with_bodies_last` runs a program with the bodies of any `jax.vmap` in the last axis of all
+    This is the rule for derivatives of `bodies_last` in forward mode.
+    `bodies_last` runs a program with the bodies of any `jax.vmap` in the last axis of all
     arrays; here one call of it runs the program and its tangent.
 
     - `program`: a function `program(layout, constants, each)` that returns a list of arrays.
@@ -179,13 +175,11 @@ def _program_and_tangent(
     # The tangents are passed together with the arrays `each`, in which every body has values of its
     # own. The tangent of a constant that all bodies share therefore needs a last axis of bodies.
     # `with_tangents` adds this axis to the constant, too, so that it has the shape of its tangent.
-    _, along = layout.broadcast_to_bodies(
-        list(tangents[:num_constants]), moving[:num_constants], each[0]
-    )
+    _, along = layout.broadcast(list(tangents[:num_constants]), moving[:num_constants], each[0])
     along = [t for t, m in zip([*along, *tangents[num_constants:]], moving, strict=True) if m]
 
     def with_tangents(layout: Layout, constants: Arrays, rest: Arrays) -> Arrays:
-        layout, constants = layout.broadcast_to_bodies(constants, moving[:num_constants], rest[0])
+        layout, constants = layout.broadcast(constants, moving[:num_constants], rest[0])
         args, given = [*constants, *rest[: len(each)]], iter(rest[len(each) :])
         both = zip(args, moving, strict=True)
         moved = [next(given) if m else zero_from_primal(a) for a, m in both]
@@ -195,9 +189,7 @@ def _program_and_tangent(
 
     out, moved = [], []
     found = iter(
-        run_with_bodies_last(
-            with_tangents, constants, [*each, *along], num_linear + len(along), layout
-        )
+        bodies_last(with_tangents, constants, [*each, *along], num_linear + len(along), layout)
     )
     for a in found:
         out.append(a)
@@ -205,9 +197,7 @@ def _program_and_tangent(
     return out, moved
 
 
-def _run_in_blocks_of_bodies(
-    program: Program, layout: Layout, num_constants: int, *args: Any
-) -> Arrays:
+def _in_blocks(program: Program, layout: Layout, num_constants: int, *args: Any) -> Arrays:
     """Return the result of a program, computed on CPU for at most `BLOCK` (16) bodies at a time.
 
     The arrays of so few bodies stay in the first-level cache of the processor. On other backends
@@ -245,7 +235,7 @@ def _run_in_blocks_of_bodies(
     return [joined(a) for a in lax.map(block, (own, [cut(a) for a in each]))]
 
 
-def add_leading_axes(array: Array, like: Array) -> Array:
+def lift(array: Array, like: Array) -> Array:
     """Return `array` with leading axes of length 1 added, so that it broadcasts against `like`.
 
     The last axes of `like` are the axes of `array`: an array with one number for each body is

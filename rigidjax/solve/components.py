@@ -18,7 +18,7 @@ Atoms = tuple[Array, ...]
 FEW = 32
 
 
-def split_into_scalars(tree: PyTree) -> Atoms:
+def split_scalars(tree: PyTree) -> Atoms:
     """Return the numbers of a tree of arrays as a tuple of scalars, the inverse of `join_scalars`.
 
     An array of more than `FEW` numbers is not split: it is one item of the tuple.
@@ -34,7 +34,7 @@ def split_into_scalars(tree: PyTree) -> Atoms:
 
 
 def join_scalars(scalars: Atoms, like: PyTree) -> PyTree:
-    """Return the tree of arrays whose numbers are in a tuple: the inverse of `split_into_scalars`.
+    """Return the tree of arrays whose numbers are in a tuple: the inverse of `split_scalars`.
 
     `scalars` is that tuple, and `like` is a tree with the structure and the shapes of the result.
     """

@@ -35,7 +35,7 @@ class StepWithLoopedStages(eqx.Module):
     solver: AbstractExplicit
 
 
-def loop_stages_of_low_order(solver: dfx.AbstractSolver) -> Any:
+def loop_low_order(solver: dfx.AbstractSolver) -> Any:
     """Return an explicit method of order 4 or 5 with its stages computed in a loop.
 
     With a loop the program of the method compiles faster. A method of another order, and a method
@@ -69,8 +69,8 @@ def change_in_step(
     **Returns** a tree of the structure of `y`.
     """
     if isinstance(solver, StepWithLoopedStages):
-        return _change_by_looped_stages(solver.solver.tableau, field, t, h, y, end)
-    return change_and_slope_at_start(solver.tableau, field, t, h, y, end)[0]
+        return _looped_change(solver.solver.tableau, field, t, h, y, end)
+    return change_and_slope(solver.tableau, field, t, h, y, end)[0]
 
 
 def state_after_step(tableau: Tableau, field: Field, t: Any, h: Array, y: PyTree) -> PyTree:
@@ -83,10 +83,10 @@ def state_after_step(tableau: Tableau, field: Field, t: Any, h: Array, y: PyTree
     - `t`, `h`: the time at the start of the step, and its length, s.
     - `y`: the state at the start, a tree of arrays.
     """
-    return jax.tree.map(jnp.add, y, change_and_slope_at_start(tableau, field, t, h, y)[0])
+    return jax.tree.map(jnp.add, y, change_and_slope(tableau, field, t, h, y)[0])
 
 
-def change_and_slope_at_start(
+def change_and_slope(
     tableau: Tableau, field: Field, t: Any, h: Array, y: PyTree, end: Any = None
 ) -> tuple[PyTree, PyTree]:
     """Return the change of a state in one step, and the slope dy/dt at the start of the step.
@@ -129,9 +129,7 @@ def _weighted_sum(h: Array, row: Row, slopes: list[PyTree]) -> PyTree:
     return jax.tree.map(moved, *[slopes[i] for i in row])
 
 
-def _change_by_looped_stages(
-    tableau: Tableau, field: Field, t: Any, h: Array, y: PyTree, end: Any
-) -> PyTree:
+def _looped_change(tableau: Tableau, field: Field, t: Any, h: Array, y: PyTree, end: Any) -> PyTree:
     """Return the change of a state in one step of an explicit method, with its stages in a loop.
 
     The loop carries the slopes dy/dt of the last few stages, as many as any later stage reads.

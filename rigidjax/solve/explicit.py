@@ -15,7 +15,7 @@ from rigidjax._types import RealLike
 from rigidjax.motion.equations import project_to_group
 from rigidjax.rotation.barrier import barrier
 from rigidjax.solve import validation
-from rigidjax.solve.runge_kutta import Step, change_within_step, dense_rows, error_estimate, stages
+from rigidjax.solve.runge_kutta import Step, dense_change, dense_rows, error_estimate, stages
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
 
 
@@ -23,7 +23,7 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
     """Interpolate the state within a step (dense output) by a polynomial.
 
     `coefficients` are the coefficients F0, F1, … of the polynomial, each a row of the shape of the
-    state; `runge_kutta.change_within_step` gives the formula. The quaternion of the interpolated
+    state; `runge_kutta.dense_change` gives the formula. The quaternion of the interpolated
     state is scaled to length 1.
     """
 
@@ -43,12 +43,12 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
         safe = jnp.where(length == 0, jnp.ones_like(length), length)
         theta = jnp.where(length == 0, jnp.zeros_like(length), (t0 - self.t0) / safe)
 
-        value = lambda y, rows: y + change_within_step(theta.astype(y.dtype), rows)  # noqa: E731
+        value = lambda y, rows: y + dense_change(theta.astype(y.dtype), rows)  # noqa: E731
         # A maximum has no derivative if XLA rounds its argument differently in two places.
         return barrier(project_to_group(jax.tree.map(value, self.y0, self.coefficients)))
 
 
-def direction_and_length_of_step(
+def direction_and_length(
     terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike
 ) -> tuple[Array, Array]:
     """Return the direction of a step of diffrax, 1 or −1, and its length, s.
@@ -69,7 +69,7 @@ def cubic_coefficients(
 ) -> tuple[Array, Array, Array]:
     """Return the three coefficients of a cubic polynomial that interpolates within a step.
 
-    They are the coefficients F0, F1 and F2 of `runge_kutta.change_within_step`, which evaluates the
+    They are the coefficients F0, F1 and F2 of `runge_kutta.dense_change`, which evaluates the
     polynomial.
 
     - `change`: the change of the polynomial over the step, an array of a state.
@@ -112,7 +112,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
     ) -> Any:
         validation.common_dtype(y0, "state")
         numbers, tree = ravel_pytree(y0)
-        way, h = direction_and_length_of_step(terms, t0, t1)
+        way, h = direction_and_length(terms, t0, t1)
 
         def field(_: Any, t: Any, y: Array) -> Array:
             return way.astype(y.dtype) * ravel_pytree(terms.vf(t, tree(y), args))[0]

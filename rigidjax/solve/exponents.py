@@ -145,10 +145,10 @@ def lyapunov_exponents(
             "f(t, y, None)"
         )
     how = (solver, many, intervals, transient, max_steps)
-    return _exponents_of_run(how, field, state0, begin, length, rtol, atol)
+    return _exponents(how, field, state0, begin, length, rtol, atol)
 
 
-def _product_of_small_matrices(a: Array, b: Array) -> Array:
+def _product(a: Array, b: Array) -> Array:
     """Return the product `a @ b` of small matrices, in a form that XLA fuses with other code.
 
     - `a`, `b`: two matrices, (n, m) and (m, k), of any sizes n, m and k. The result is (n, k).
@@ -157,7 +157,7 @@ def _product_of_small_matrices(a: Array, b: Array) -> Array:
 
 
 @eqx.filter_jit
-def _exponents_of_run(
+def _exponents(
     options: tuple[AbstractExplicit, int, int, int, int],
     field: Callable[..., Any],
     state0: Any,
@@ -195,16 +195,12 @@ def _exponents_of_run(
 
         # Small errors make the frame lose its orthonormality, and the equations of a frame that is
         # not orthonormal are unstable. This formula restores it, up to the square of the errors.
-        frame = 1.5 * frame - 0.5 * _product_of_small_matrices(
-            frame, _product_of_small_matrices(frame.T, frame)
-        )
+        frame = 1.5 * frame - 0.5 * _product(frame, _product(frame.T, frame))
         push = jax.linearize(rate, jnp.zeros(frame.shape[0], t.dtype))[1]
         pushed = jax.vmap(push, -1, -1)(frame)
-        grown = _product_of_small_matrices(frame.T, pushed)
+        grown = _product(frame.T, pushed)
         upper = jnp.triu(grown) + jnp.tril(grown, -1).T
-        return Coupled(
-            slope, (pushed - _product_of_small_matrices(frame, upper), jnp.diagonal(grown))
-        )
+        return Coupled(slope, (pushed - _product(frame, upper), jnp.diagonal(grown)))
 
     def interval(carry: Any, i: Array) -> Any:
         state, frame = carry

@@ -18,7 +18,7 @@ from rigidjax.rotation.barrier import platform
 from rigidjax.solve.equal_steps import StepWithLoopedStages
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.pieces import steps_per_piece, take_equal_steps_on_gpu
+from rigidjax.solve.pieces import march_on_gpu, steps_per_piece
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.steppers import AnyStepper, stepper_of
 
@@ -64,20 +64,20 @@ def fixed(
         if isinstance(substeps, int):
             y = march_steps(stepper, h, left, jnp.zeros((), jnp.int32), substeps, y)
         else:
-            y = lax.fori_loop(0, substeps, lambda i, y: take_equal_step(stepper, h, left, i, y), y)
+            y = lax.fori_loop(0, substeps, lambda i, y: equal_step(stepper, h, left, i, y), y)
         return y, y
 
     if last is None:
-        _, rest = lax.scan(span, stepper.initial_numbers, (ts[:-1], ts[1:]))
+        _, rest = lax.scan(span, stepper.start, (ts[:-1], ts[1:]))
     else:
-        start = stepper.initial_numbers
+        start = stepper.start
         still = jax.tree.map(lambda a: jnp.broadcast_to(a, (ts.size - 1, *a.shape)), start)
-        rest = fill_first_rows(last, lambda y, i: span(y, (ts[i], ts[i + 1])), start, still)
-    later = jax.vmap(stepper.state_of_numbers)(rest)
+        rest = fill_rows(last, lambda y, i: span(y, (ts[i], ts[i + 1])), start, still)
+    later = jax.vmap(stepper.state)(rest)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y0, later)
 
 
-def fill_first_rows(
+def fill_rows(
     count: Any, row_of: Callable[[PyTree, Array], tuple[PyTree, PyTree]], y: PyTree, rows: PyTree
 ) -> PyTree:
     """Compute the first rows of a table in a loop, and return the table.
@@ -99,7 +99,7 @@ def fill_first_rows(
     return lax.fori_loop(zero, jnp.asarray(count, jnp.int32), put, (y, rows))[1]
 
 
-def take_equal_step(
+def equal_step(
     stepper: AnyStepper,
     h: Array,
     t0: Array,
@@ -130,12 +130,12 @@ def take_equal_step(
         # steps to 1e-3 in float32).
         return t0 + i.astype(h.dtype) * h
 
-    now = jax.tree.map(lambda a: _row_or_nearest_row(a, first_row + i), inputs)
+    now = jax.tree.map(lambda a: _row(a, first_row + i), inputs)
     if not stepper.delays:
         return stepper.step(at(i), at(i + 1), h, y, now)
     # A delayed input changes within the step. The step is therefore divided at these changes, and
     # its parts are taken one after another, so that all inputs are constant within each part.
-    parts, early, late = changes_of_delayed_inputs(stepper.delays, h, i, inputs, first_row)
+    parts, early, late = delayed_changes(stepper.delays, h, i, inputs, first_row)
     edges = jnp.concatenate([jnp.zeros(1, h.dtype), jnp.sort(parts), jnp.ones(1, h.dtype)])
 
     def part(y: Any, ends: tuple[Array, Array]) -> tuple[Any, None]:
@@ -151,7 +151,7 @@ def take_equal_step(
     return lax.scan(part, y, (edges[:-1], edges[1:]))[0]
 
 
-def changes_of_delayed_inputs(
+def delayed_changes(
     delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: PyTree, first_row: int
 ) -> tuple[Array, list[Array], list[Array]]:
     """Return where in a step each delayed input changes, with its values before and after it.
@@ -175,12 +175,12 @@ def changes_of_delayed_inputs(
         whole = lax.stop_gradient(jnp.floor(steps))
         parts.append(steps - whole)
         last = first_row + i - whole.astype(jnp.int32)
-        early.append(_row_or_nearest_row(inputs[name], last - 1))
-        late.append(_row_or_nearest_row(inputs[name], last))
+        early.append(_row(inputs[name], last - 1))
+        late.append(_row(inputs[name], last))
     return jnp.stack(parts), early, late
 
 
-def torque_inputs_at_start(torque: Any, h: Array, inputs: PyTree) -> PyTree:
+def inputs_at_start(torque: Any, h: Array, inputs: PyTree) -> PyTree:
     """Return the values that the inputs of a torque have at the start of a run.
 
     A delayed input has at the start the value of the row that belongs to the time one delay
@@ -195,12 +195,12 @@ def torque_inputs_at_start(torque: Any, h: Array, inputs: PyTree) -> PyTree:
     now = jax.tree.map(lambda a: a[0], inputs)
     if not delays:
         return now
-    parts, early, late = changes_of_delayed_inputs(delays, h, jnp.zeros((), jnp.int32), inputs, 0)
+    parts, early, late = delayed_changes(delays, h, jnp.zeros((), jnp.int32), inputs, 0)
     values = [jnp.where(p > 0, a, b) for p, a, b in zip(parts, early, late, strict=True)]
     return InputRow(now, tuple(values))
 
 
-def _row_or_nearest_row(a: Array, i: Any) -> Array:
+def _row(a: Array, i: Any) -> Array:
     """Return row `i` of an array `a` along its first axis.
 
     If `i` lies before the first or after the last row, the first or the last row is returned.
@@ -232,13 +232,11 @@ def march_steps(
     pieces are stored; the states within a piece are stored for one piece at a time.
     """
     if platform() != "cpu":
-        return take_equal_steps_on_gpu(
-            lambda y, i: take_equal_step(stepper, h, t0, i, y, inputs), first, count, y
-        )
+        return march_on_gpu(lambda y, i: equal_step(stepper, h, t0, i, y, inputs), first, count, y)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def one(y: Any, i: Array) -> tuple[Any, None]:
-        return take_equal_step(stepper, h, t0, i, y, inputs), None
+        return equal_step(stepper, h, t0, i, y, inputs), None
 
     @functools.partial(jax.checkpoint, prevent_cse=False, static_argnums=2)
     def some(y: Any, begin: Array, many: int) -> Any:

@@ -52,7 +52,7 @@ def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) 
     return _linear_map.bind(*given, *tangents, function=function, transposed=transposed, **how)
 
 
-def known_with_derivatives_of(known: PyTree, recomputed: PyTree) -> PyTree:
+def with_derivatives(known: PyTree, recomputed: PyTree) -> PyTree:
     """Return the numbers of `known`, with the derivatives of the numbers of `recomputed`.
 
     Both trees hold the same numbers, computed in two ways. Derivatives of every order are those of
@@ -61,23 +61,23 @@ def known_with_derivatives_of(known: PyTree, recomputed: PyTree) -> PyTree:
     - `known`: a tree of arrays, whose values are returned.
     - `recomputed`: a tree of the same structure, whose arrays have derivatives.
     """
-    return jax.tree.map(_array_with_derivatives_of, known, recomputed)
+    return jax.tree.map(_known, known, recomputed)
 
 
 @jax.custom_jvp
-def _array_with_derivatives_of(known: Array, recomputed: Array) -> Array:
+def _known(known: Array, recomputed: Array) -> Array:
     """Return the array `known`, with the derivatives of an array `recomputed` of equal shape."""
     return match_batch_axes(known, (known, recomputed))
 
 
-@_array_with_derivatives_of.defjvp
+@_known.defjvp
 def _array_with_derivatives_of_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> Any:
-    return _array_with_derivatives_of(*primals), tangents[1]
+    return _known(*primals), tangents[1]
 
 
-def nan_derivatives_where_not_finite(tree: PyTree, inputs: PyTree) -> PyTree:
+def nan_derivatives(tree: PyTree, inputs: PyTree) -> PyTree:
     """Return the arrays of `tree`, in which each number that is not finite gets NaN derivatives.
 
     The derivatives of such a number with respect to all numbers in the tree `inputs` are NaN, in
@@ -89,11 +89,11 @@ def nan_derivatives_where_not_finite(tree: PyTree, inputs: PyTree) -> PyTree:
     smooth, rest = eqx.partition(tree, eqx.is_inexact_array)
     outs, structure = jax.tree.flatten(smooth)
     anchors = jax.tree.leaves(eqx.filter(inputs, eqx.is_inexact_array))
-    return eqx.combine(structure.unflatten(_with_nan_derivatives(len(outs), *outs, *anchors)), rest)
+    return eqx.combine(structure.unflatten(_nan_derivatives(len(outs), *outs, *anchors)), rest)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _with_nan_derivatives(count: int, *numbers: Array) -> Arrays:
+def _nan_derivatives(count: int, *numbers: Array) -> Arrays:
     """Return the first `count` of the arrays `numbers`, with NaN derivatives where not finite.
 
     The values are returned as they are. The other arrays of `numbers` are inputs, with respect to
@@ -103,9 +103,9 @@ def _with_nan_derivatives(count: int, *numbers: Array) -> Arrays:
     return match_batch_axes(list(numbers[:count]), numbers)
 
 
-@_with_nan_derivatives.defjvp
+@_nan_derivatives.defjvp
 def _(count: int, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-    outs = _with_nan_derivatives(count, *primals)
+    outs = _nan_derivatives(count, *primals)
 
     def along(*args: Array) -> Arrays:
         moved = args[count : 2 * count]
@@ -144,9 +144,7 @@ def _linear_map_abstract_eval(*_: Any, results: Any, **__: Any) -> list[ShapedAr
     return [ShapedArray(*result) for result in results]
 
 
-def _linear_map_jvp(
-    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...], **params: Any
-) -> Any:
+def _jvp_rule(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...], **params: Any) -> Any:
     """Return the results of a linear map and the tangents of the results, in forward mode.
 
     This is the rule of the JAX primitive `_linear_map`.
@@ -175,13 +173,13 @@ def _linear_map_jvp(
             return jax.jvp(lambda *g: function(*g, *along), given, tuple(moved))[1]
 
         moved = [t for t, w in zip(tangents, which, strict=False) if w]
-        parts.append(linear_map(push, raise_for_missing_transpose, list(primals), moved))
+        parts.append(linear_map(push, no_transpose, list(primals), moved))
     if not parts:
         return out, [_ZERO.from_primal_value(o) for o in out]
     return out, [sum(more, first) for first, *more in zip(*parts, strict=True)]
 
 
-def raise_for_missing_transpose(*_: Any) -> Arrays:
+def no_transpose(*_: Any) -> Arrays:
     """Raise `TypeError`, because reverse mode needs the transpose of a map that has none.
 
     This function takes the place of the missing transpose. It is called in reverse mode over a
@@ -194,7 +192,7 @@ def raise_for_missing_transpose(*_: Any) -> Arrays:
     )
 
 
-def _linear_map_transpose(cotangents: Any, *args: Any, **params: Any) -> Any:
+def _transpose_rule(cotangents: Any, *args: Any, **params: Any) -> Any:
     """Return the cotangents of the arguments of a linear map, in reverse mode.
 
     An argument in which the map may be nonlinear gets `None`. This is the rule of the JAX primitive
@@ -208,7 +206,7 @@ def _linear_map_transpose(cotangents: Any, *args: Any, **params: Any) -> Any:
     number = params["number"]
     given = args[:number]
     if any(ad.is_undefined_primal(g) for g in given):
-        raise_for_missing_transpose()
+        no_transpose()
     whole = [
         jnp.zeros(*result) if isinstance(c, ad.Zero) else c
         for c, result in zip(cotangents, params["results"], strict=True)
@@ -218,7 +216,7 @@ def _linear_map_transpose(cotangents: Any, *args: Any, **params: Any) -> Any:
     return [None] * number + _linear_map.bind(*given, *whole, number=number, **turned)
 
 
-def _linear_map_batching(args: Any, dims: Any, **params: Any) -> Any:
+def _batch_rule(args: Any, dims: Any, **params: Any) -> Any:
     """Return the results of a linear map for a batch, and the batch axes of the results (all 0).
 
     This is the rule of the JAX primitive `_linear_map` for `jax.vmap`.
@@ -248,9 +246,9 @@ def _linear_map_batching(args: Any, dims: Any, **params: Any) -> Any:
     return _linear_map.bind(*given, *along, number=number, **both), [0] * len(results)
 
 
-ad.primitive_jvps[_linear_map] = _linear_map_jvp
-ad.primitive_transposes[_linear_map] = _linear_map_transpose
-batching.primitive_batchers[_linear_map] = _linear_map_batching
+ad.primitive_jvps[_linear_map] = _jvp_rule
+ad.primitive_transposes[_linear_map] = _transpose_rule
+batching.primitive_batchers[_linear_map] = _batch_rule
 mlir.register_lowering(
     _linear_map, mlir.lower_fun(lambda *args, function, **_: function(*args), multiple_results=True)
 )

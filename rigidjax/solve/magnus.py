@@ -20,17 +20,17 @@ from rigidjax.motion.equations import AttitudeEquations, project_to_group
 from rigidjax.motion.torques.base import may_read_attitude
 from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import quaternion_product
-from rigidjax.solve.components import join_scalars, split_into_scalars
-from rigidjax.solve.equal_steps import change_and_slope_at_start
+from rigidjax.solve.components import join_scalars, split_scalars
+from rigidjax.solve.equal_steps import change_and_slope
 from rigidjax.solve.explicit import (
     NestedInterpolation,
     cubic_coefficients,
-    direction_and_length_of_step,
+    direction_and_length,
 )
 from rigidjax.solve.tableaus import KUTTA4
 
 
-def momentum_change_and_turn(
+def change_and_turn(
     slope: Callable[[Any, Triple], Triple], rate: Callable[[Triple], Triple],
     t: Any, end: Any, h: Array, p: Triple,
 ) -> tuple[Triple, QuaternionEntries]:  # fmt: skip
@@ -52,7 +52,7 @@ def momentum_change_and_turn(
     1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas, Nørsett and Zanna 2000,
     doi:10.1017/S0962492900002154, section 5.
     """
-    change, first = change_and_slope_at_start(KUTTA4, slope, t, h, p, end)
+    change, first = change_and_slope(KUTTA4, slope, t, h, p, end)
     after = barrier(add(p, change))
     last = slope(end, after)
     middle = tuple(
@@ -80,7 +80,7 @@ class Magnus4(dfx.AbstractSolver):
     The steps have a fixed length. With steps of the same length, this method does less work than
     `rigidjax.solvers.RungeKutta4` and has a smaller error; it is the default of
     `rigidjax.batch.rollout`. A step should turn the body by less than a radian. Source: Magnus
-    1954, doi:10.1002/cpa.3160070404; see `momentum_change_and_turn`.
+    1954, doi:10.1002/cpa.3160070404; see `change_and_turn`.
 
     **Raises:** `TypeError` for a torque that may depend on the attitude, and for a state that is
     not an `Attitude`.
@@ -108,9 +108,7 @@ class Magnus4(dfx.AbstractSolver):
         args: PyTree,
     ) -> tuple[()]:
         field, _ = field_and_direction(terms)
-        require_independent_of_attitude(
-            require_attitude_equations("Magnus4", field, y0, "RungeKutta4").euler.torque
-        )
+        refuse_attitude(attitude_equations("Magnus4", field, y0, "RungeKutta4").euler.torque)
         return ()
 
     def step(
@@ -123,25 +121,21 @@ class Magnus4(dfx.AbstractSolver):
         solver_state: PyTree,
         made_jump: Bool[ArrayLike, ""],
     ) -> Any:
-        start = split_into_scalars(y0)
+        start = split_scalars(y0)
         q, omega = start[:4], start[4:]
-        way, h = (
-            part.astype(y0.omega.dtype) for part in direction_and_length_of_step(terms, t0, t1)
-        )
+        way, h = (part.astype(y0.omega.dtype) for part in direction_and_length(terms, t0, t1))
         # The torque has declared that it does not read the attitude. It gets NaN as the attitude,
         # so that the result is NaN if the torque reads the attitude nevertheless.
         nowhere = jnp.full_like(y0.q, jnp.nan)
 
         def slope(t: Any, omega: Triple) -> Triple:
-            return split_into_scalars(
-                way * terms.vf(t, Attitude(nowhere, jnp.stack(omega)), args).omega
-            )
+            return split_scalars(way * terms.vf(t, Attitude(nowhere, jnp.stack(omega)), args).omega)
 
         def rate(omega: Triple) -> Triple:
             a, b, c = omega
             return way * a, way * b, way * c
 
-        change, turn = momentum_change_and_turn(slope, rate, t0, t1, h, omega)
+        change, turn = change_and_turn(slope, rate, t0, t1, h, omega)
         change = join_scalars((*quaternion_product(q, turn), *change), y0)
         y1 = project_to_group(jax.tree.map(jnp.add, y0, change))
         left, right = terms.vf(t0, y0, args), terms.vf(t1, y1, args)
@@ -156,7 +150,7 @@ class Magnus4(dfx.AbstractSolver):
         return terms.vf(t0, y0, args)
 
 
-def require_attitude_equations(
+def attitude_equations(
     solver_name: str, field: Any, y0: PyTree, advised_solver: str
 ) -> AttitudeEquations:
     """Return the vector field `field`, after a check that the solver `solver_name` can solve it.
@@ -173,7 +167,7 @@ def require_attitude_equations(
     )
 
 
-def require_independent_of_attitude(torque: Any) -> None:
+def refuse_attitude(torque: Any) -> None:
     """Raise `TypeError` for a torque that may depend on the attitude of the body.
 
     A torque states by `feels = HasSpin` that it does not depend on the attitude; without this

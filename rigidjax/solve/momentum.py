@@ -27,7 +27,7 @@ from rigidjax.motion.torques.states import freeze_own_states
 from rigidjax.rotation.linalg3 import apply, solve
 
 
-class _EquationsUnderChangingInertia(eqx.Module):
+class _ChangingEquations(eqx.Module):
     """Compute the time derivative of the state of a body whose inertia changes with the time.
 
     It is called with the time t, s, and a state with the body rate Ω. In the returned derivative
@@ -56,15 +56,15 @@ class ByMomentum(eqx.Module):
     While such a motion is integrated, its states have the rate Ω̃ = I₀⁻¹ p in the place of the body
     rate Ω. Here p = I(t) Ω is the momentum, I(t) the inertia at the time t, and I₀ the inertia of
     the body that `simulate` was given. When I(t) jumps, Ω jumps, too, but Ω̃ does not. The method
-    `replace_rate_by_momentum` replaces Ω by Ω̃, and `restore_body_rate` replaces Ω̃ by Ω.
+    `to_momentum` replaces Ω by Ω̃, and `to_rate` replaces Ω̃ by Ω.
     """
 
-    field: Any  # an `_EquationsUnderChangingInertia`, or a `CoupledEquations` that contains it
+    field: Any  # an `_ChangingEquations`, or a `CoupledEquations` that contains it
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None) -> Any:
-        return self.field(t, self.restore_body_rate(t, y))
+        return self.field(t, self.to_rate(t, y))
 
-    def replace_rate_by_momentum(self, t: Any, y: PyTree) -> PyTree:
+    def to_momentum(self, t: Any, y: PyTree) -> PyTree:
         """Return the state `y`, with its body rate Ω replaced by I₀⁻¹ p, where p is the momentum.
 
         The momentum is p = I(t) Ω. Here I(t) is the inertia at the time `t`, s, and I₀ is the
@@ -72,12 +72,12 @@ class ByMomentum(eqx.Module):
         """
         return self._replace_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
 
-    def restore_body_rate(self, t: Any, y: PyTree) -> PyTree:
+    def to_rate(self, t: Any, y: PyTree) -> PyTree:
         """Return the state `y` of the run, with the body rate Ω in the place of its rate w.
 
         The body rate is Ω = I(t)⁻¹ I₀ w. Here I(t) is the inertia at the time `t`, s, and I₀ is the
         inertia of the body that `simulate` was given. This is the inverse of
-        `replace_rate_by_momentum`.
+        `to_momentum`.
         """
         return self._replace_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
 
@@ -113,15 +113,15 @@ def equations_by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | N
     - `body`, `torque`: the arguments of `simulate` with these names.
     - `state0`: the state at the start, with the body rate.
     """
-    if not isinstance(law := changing_inertia_of_torque(torque), ChangingInertia) or hasattr(
+    if not isinstance(law := changing_inertia(torque), ChangingInertia) or hasattr(
         law.inertia, "feels"
     ):
         return None
-    field: Any = _EquationsUnderChangingInertia(body, law)
+    field: Any = _ChangingEquations(body, law)
     return ByMomentum(CoupledEquations(field, body) if isinstance(state0, Coupled) else field)
 
 
-def changing_inertia_of_torque(torque: Any) -> ChangingInertia | None:
+def changing_inertia(torque: Any) -> ChangingInertia | None:
     """Return the torque if it is a `ChangingInertia`, or `None` if it is another torque.
 
     A `ChangingInertia` is the law by which the inertia of a body changes with the time; `simulate`
@@ -145,4 +145,4 @@ def with_body_rates(form: ByMomentum | None, ts: Array, ys: PyTree) -> PyTree:
     - `ts`: (T,) the saved times, s.
     - `ys`: the states at these times, with a leading time axis.
     """
-    return ys if form is None else jax.vmap(form.restore_body_rate)(ts, ys)
+    return ys if form is None else jax.vmap(form.to_rate)(ts, ys)

@@ -5,7 +5,7 @@ iteration of the loop (unrolling), free bodies take three times as many steps a 
 mode unrolling does not help, because a backward step has so many numbers that the time of a kernel
 grows in proportion to its number of operations. If a loop is unrolled, JAX also unrolls its
 transpose. The backward loop is therefore written here by hand, with one step in each iteration. It
-stores states on two levels (see `take_equal_steps_on_gpu`). On a CPU neither the unrolling nor this
+stores states on two levels (see `march_on_gpu`). On a CPU neither the unrolling nor this
 backward loop saves time.
 """
 
@@ -44,7 +44,7 @@ def steps_per_piece(count: int) -> int:
 
 
 @dataclasses.dataclass(frozen=True)
-class _StepsInPieces:
+class _Pieces:
     """Take many equal steps in forward direction, and run them in reverse mode.
 
     The steps are divided into pieces of about √N steps, where N is the number of all steps. Only
@@ -73,17 +73,17 @@ class _StepsInPieces:
 
         return lax.scan(one, y, first + jnp.arange(number, dtype=jnp.int32), unroll=self.turn)
 
-    def take_all_steps(
+    def run(
         self, constants: Arrays, first: Array, y: Arrays
     ) -> tuple[Arrays, tuple[Arrays, Arrays]]:
         """Take all steps from the state `y`, beginning with step number `first`.
 
         `constants` are the arrays that the function of a step holds. **Returns** two things: the
-        state at the end, and a pair that `pull_back_all_steps` needs. The first item of the pair is
+        state at the end, and a pair that `pull_back` needs. The first item of the pair is
         the states at the starts of the pieces, along a new first axis. The second item is the state
         after the last piece, from which the remaining steps are taken.
         """
-        firsts, length, left = self.divide_into_pieces(first)
+        firsts, length, left = self.divide(first)
 
         def piece(y: Arrays, begin: Array) -> tuple[Arrays, Arrays]:
             return self.take_steps(constants, y, begin, length)[0], y
@@ -94,7 +94,7 @@ class _StepsInPieces:
             end, _ = self.take_steps(constants, end, first + self.count - left, left)
         return end, (starts, last)
 
-    def pull_back_all_steps(
+    def pull_back(
         self,
         constants: Arrays,
         has_derivative: Sequence[bool],
@@ -109,7 +109,7 @@ class _StepsInPieces:
         - `constants`: the arrays that the function of a step holds.
         - `has_derivative`: for each constant, whether it has a derivative.
         - `first`: the number of the first step.
-        - `starts`: the pair of states that the method `take_all_steps` returned as its second
+        - `starts`: the pair of states that the method `run` returned as its second
           result. The first item is the states at the starts of the pieces, along a new first axis;
           the second item is the state after the last piece.
         - `cotangent_of_end`: the cotangent of the state after all steps.
@@ -117,13 +117,11 @@ class _StepsInPieces:
         **Returns** two lists: the cotangents of the constants with a derivative, and the cotangent
         of the state at the start.
         """
-        firsts, length, left = self.divide_into_pieces(first)
+        firsts, length, left = self.divide(first)
         chosen = [c for c, m in zip(constants, has_derivative, strict=True) if m]
 
         def step_of(i: Array) -> Callable[[Arrays, Arrays], Arrays]:
-            return lambda some, y: self.call(
-                _replace_selected(constants, has_derivative, some), y, i
-            )
+            return lambda some, y: self.call(_replaced(constants, has_derivative, some), y, i)
 
         def one(sums: tuple[Arrays, Arrays], at: tuple[Arrays, Array]) -> tuple[Any, None]:
             (total, bar), (y, i) = sums, at
@@ -147,7 +145,7 @@ class _StepsInPieces:
 
         return lax.scan(whole, sums, (rows, firsts), reverse=True)[0]
 
-    def divide_into_pieces(self, first: Array) -> tuple[Array, int, int]:
+    def divide(self, first: Array) -> tuple[Array, int, int]:
         """Return how all steps are divided into pieces.
 
         A piece is a group of steps that follow one another; all pieces have equally many steps. The
@@ -160,9 +158,7 @@ class _StepsInPieces:
         return first + length * jnp.arange(many, dtype=jnp.int32), length, left
 
 
-def take_equal_steps_on_gpu(
-    step: Callable[[Any, Array], Any], first: Array, count: int, y: Any
-) -> Any:
+def march_on_gpu(step: Callable[[Any, Array], Any], first: Array, count: int, y: Any) -> Any:
     """Take many equal steps on a GPU, several in one kernel, and return the state after them.
 
     - `step`: a function `step(state, i)` that takes step number i from `state`, and returns the
@@ -181,12 +177,12 @@ def take_equal_steps_on_gpu(
     # `turn` is how many steps are taken in one iteration of the loop over the steps. It is a power
     # of two, because the number of steps in a piece is often a multiple of a power of two.
     turn = 1 << (turn.bit_length() - 1)
-    program, constants = _StepsInPieces(one.call, count, turn), one.jax_constants
+    program, constants = _Pieces(one.call, count, turn), one.jax_constants
     number = len(constants)
     smooth = [*[eqx.is_inexact_array(c) for c in constants], False, *[True for _ in start]]
 
     def end(args: Arrays) -> Arrays:
-        return program.take_all_steps(args[:number], args[number], args[number + 1 :])[0]
+        return program.run(args[:number], args[number], args[number + 1 :])[0]
 
     @jax.custom_jvp
     def run(*args: Array) -> Arrays:
@@ -196,20 +192,20 @@ def take_equal_steps_on_gpu(
         both = zip(smooth, tangents, strict=True)
         moving = [s and not isinstance(t, SymbolicZero) for s, t in both]
         size = len(primals)
-        out, starts = program.take_all_steps(
+        out, starts = program.run(
             list(primals[:number]), primals[number], list(primals[number + 1 :])
         )
         rows, shape = jax.tree.flatten(starts)
 
         def push(*args: Array) -> Arrays:
             given = list(args[:size])
-            of = lambda *some: end(_replace_selected(given, moving, some))  # noqa: E731
+            of = lambda *some: end(_replaced(given, moving, some))  # noqa: E731
             at = [g for g, m in zip(given, moving, strict=True) if m]
             return jax.jvp(of, at, list(args[size + len(rows) :]))[1]
 
         def pull(*args: Array) -> Arrays:
             given, kept, bars = args[:number], args[size : size + len(rows)], args[-len(start) :]
-            total, bar = program.pull_back_all_steps(
+            total, bar = program.pull_back(
                 list(given), moving[:number], args[number], shape.unflatten(kept), list(bars)
             )
             return [*total, *[b for b, m in zip(bar, moving[number + 1 :], strict=True) if m]]
@@ -221,7 +217,7 @@ def take_equal_steps_on_gpu(
     return tree.unflatten(run(*constants, first, *start))
 
 
-def _replace_selected(
+def _replaced(
     arrays: Sequence[Any], selected: Sequence[bool], replacements: Sequence[Any]
 ) -> list[Any]:
     """Return a copy of the list `arrays` in which some of its arrays are replaced.

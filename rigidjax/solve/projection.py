@@ -31,7 +31,7 @@ class GroupInterpolation(dfx.AbstractLocalInterpolation):
         return jtu.tree_map(lambda a, b: a - b, end, start)
 
 
-class _MakeGroupInterpolation(eqx.Module):
+class _GroupInterpolationOf(eqx.Module):
     """Make the object that interpolates within a step, and scales the quaternion to length 1.
 
     Diffrax calls it with the times `t0` and `t1` at which the step begins and ends, s, and with the
@@ -45,7 +45,7 @@ class _MakeGroupInterpolation(eqx.Module):
         return GroupInterpolation(t0, t1, self.inner_cls(t0=t0, t1=t1, **dense_info))
 
 
-def _make_property_of_member(member: str, attribute: str) -> Any:
+def _of_solver(member: str, attribute: str) -> Any:
     """Define a property that reads an attribute of a member of an object.
 
     `member` is the name of the member, and `attribute` that of its attribute. With the names
@@ -74,20 +74,18 @@ class Projected(dfx.AbstractWrappedSolver):
     def __check_init__(self) -> None:
         _checks.require_instance(self.solver, dfx.AbstractSolver, "solver")
 
-    term_structure = _make_property_of_member("solver", "term_structure")
-    term_compatible_contr_kwargs = _make_property_of_member(
-        "solver", "term_compatible_contr_kwargs"
-    )
+    term_structure = _of_solver("solver", "term_structure")
+    term_compatible_contr_kwargs = _of_solver("solver", "term_compatible_contr_kwargs")
     # Adjoints of diffrax set `scan_kind` on a Runge–Kutta method, and step controllers set the
     # members of the root finder on an implicit method. They look for these members on the
     # `Projected`, which therefore passes on those of the solver inside it.
-    scan_kind = _make_property_of_member("solver", "scan_kind")
-    root_finder = _make_property_of_member("solver", "root_finder")
-    root_find_max_steps = _make_property_of_member("solver", "root_find_max_steps")
+    scan_kind = _of_solver("solver", "scan_kind")
+    root_finder = _of_solver("solver", "root_finder")
+    root_find_max_steps = _of_solver("solver", "root_find_max_steps")
 
     @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _MakeGroupInterpolation(self.solver.interpolation_cls)
+        return _GroupInterpolationOf(self.solver.interpolation_cls)
 
     def order(self, terms: PyTree[dfx.AbstractTerm]) -> int | None:
         return self.solver.order(terms)

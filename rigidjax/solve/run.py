@@ -33,13 +33,13 @@ from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.composite import Sum
 from rigidjax.rotation.barrier import warn_of_slow_loops
 from rigidjax.solve import validation
-from rigidjax.solve.adaptive import integrate_with_diffrax
-from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_or_nonfinite_input
+from rigidjax.solve.adaptive import integrate
+from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_of_body
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.linear_map import nan_derivatives_where_not_finite
+from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.momentum import (
-    changing_inertia_of_torque,
+    changing_inertia,
     equations_by_momentum,
     with_body_rates,
 )
@@ -89,7 +89,7 @@ class DiffraxRun(eqx.Module):
     cuts: Array | None = None  # more times at which a step ends, besides the jumps of the torque
 
     @property
-    def ends_steps_at_jumps(self) -> bool:
+    def stops_at_jumps(self) -> bool:
         """Return whether steps end at the times at which the torque jumps or switches.
 
         If so, the run uses the time s = σt, which increases along the run: σ is 1, or −1 in a run
@@ -104,7 +104,7 @@ class DiffraxRun(eqx.Module):
         return stops and not reads_field
 
     @property
-    def records_steps_for_derivatives(self) -> bool:
+    def replays(self) -> bool:
         """Return whether the run records its steps, which derivatives then repeat.
 
         This is so for an explicit Runge–Kutta method of this package (an `AbstractExplicit`) under
@@ -123,7 +123,7 @@ class DiffraxRun(eqx.Module):
             control = StandardController(self.rtol, self.atol, self.max_step)
         if isinstance(control, dfx.AbstractAdaptiveStepSizeController):
             control = Watched(control)
-        if self.cuts is not None and not self.ends_steps_at_jumps:
+        if self.cuts is not None and not self.stops_at_jumps:
             control = dfx.ClipStepSizeController(control, step_ts=jnp.sort(self.cuts))
         return control
 
@@ -161,7 +161,7 @@ def equations_of_motion(
     """
     if isinstance(state0, Coupled):
         return CoupledEquations(equations_of_motion(body, state0.motion, torque), body)
-    validation.require_compatible_types(body, state0, torque)
+    validation.require_compatible(body, state0, torque)
     if torque is not None:
         warn_of_slow_loops()
     if isinstance(state0, Point):
@@ -174,21 +174,21 @@ def equations_of_motion(
     return kind(body, torque)
 
 
-def hoist_traced_numbers(function: Any, *args: Any) -> Any:
+def hoist(function: Any, *args: Any) -> Any:
     """Return an equal function of `args` whose arrays include the traced numbers that it holds.
 
     `function` is a torque or a condition. A derivative rule of our own sees no traced number in the
     closure of a function of Python.
     """
     if isinstance(function, Sum):
-        return Sum(*(hoist_traced_numbers(part, *args) for part in function.parts))
+        return Sum(*(hoist(part, *args) for part in function.parts))
     if function is None or isinstance(function, eqx.Module):
         return function
     converted = eqx.filter_closure_convert(function, *args)
     return function if _checks.is_known(converted) else converted
 
 
-def direction_of_times(times: Array) -> Int[Array, ""] | None:
+def time_direction(times: Array) -> Int[Array, ""] | None:
     """Return the direction of the `times` as an integer: 1 if they increase, −1 if they decrease.
 
     The result is `None` if the times increase and are known before the run, that is if they are not
@@ -202,7 +202,7 @@ def direction_of_times(times: Array) -> Int[Array, ""] | None:
     return jnp.asarray(jnp.sign(change), jnp.int32)
 
 
-def convert_to_forward_time(
+def forward_time(
     sign: Array | None,
     field: Callable[..., Any],
     condition: Callable[..., Any] | None,
@@ -226,7 +226,7 @@ def convert_to_forward_time(
     may differ from the jump times by some units of round-off. If `sides` is `None`, steps end
     exactly at the jump times.
     """
-    time = partial(_multiply_by_direction, sign)
+    time = partial(_signed, sign)
 
     def directed(s: Array, y: Any, sides: Any = None) -> Any:
         sided = evaluate_on_correct_sides(
@@ -270,10 +270,10 @@ def solve(
         if scene is not None:
             stats["drift"] = scene.drift(ts, ys)
     if setup.throw:
-        ys = raise_unless_complete(setup, ys, result)
+        ys = require_complete(setup, ys, result)
     inputs = (setup.body, setup.torque, given, ts)
-    ys = nan_derivatives_where_not_finite(ys, inputs)
-    return ys, stats, result_or_nonfinite_input(result, setup.body)
+    ys = nan_derivatives(ys, inputs)
+    return ys, stats, result_of_body(result, setup.body)
 
 
 def _integrate(
@@ -290,16 +290,16 @@ def _integrate(
     """
     form = equations_by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
-    state0 = state0 if form is None else form.replace_rate_by_momentum(ts[0], state0)
+    state0 = state0 if form is None else form.to_momentum(ts[0], state0)
     along, jumps, dt0, sign, halt = ts, None, setup.dt0, None, watch
-    if setup.ends_steps_at_jumps:
+    if setup.stops_at_jumps:
         sign = setup.sign
-        field, halt, along, jumps = convert_to_forward_time(sign, field, watch, ts)
+        field, halt, along, jumps = forward_time(sign, field, watch, ts)
         if setup.cuts is not None:
-            jumps = [*jumps, _multiply_by_direction(sign, setup.cuts)]
+            jumps = [*jumps, _signed(sign, setup.cuts)]
     elif dt0 is not None:
         dt0 = dt0 * jnp.sign(ts[-1] - ts[0])
-    out = integrate_with_diffrax(
+    out = integrate(
         setup.solver, field, along, state0, setup.step_controller(), jumps=jumps, halt=halt,
         dt0=dt0, max_steps=setup.max_steps, adjoint=setup.adjoint,
         progress_meter=setup.progress_meter,
@@ -308,12 +308,12 @@ def _integrate(
     stats: dict[str, Any] = dict(zip(_COUNTS, taken, strict=True))
     if out.missed is not None:
         stats["switches_missed"] = out.missed
-    last_time = _multiply_by_direction(sign, out.last_time)
-    last = out.last if form is None else form.restore_body_rate(last_time, out.last)
+    last_time = _signed(sign, out.last_time)
+    last = out.last if form is None else form.to_rate(last_time, out.last)
     return with_body_rates(form, ts, out.ys), stats, out.result, (last_time, last, out.next_step)
 
 
-def _multiply_by_direction(sign: Array | None, t: Array) -> Array:
+def _signed(sign: Array | None, t: Array) -> Array:
     """Convert times `t` to times s = σt, which increase along a run, or convert s back to t.
 
     `t` is an array of any shape; `sign` is σ: 1, or −1 in a run backwards in time. `None` stands
@@ -360,7 +360,7 @@ def _message_of_too_short_step(time_dtype: Any) -> str:
     )
 
 
-def raise_unless_complete(setup: ClosedFormRun | DiffraxRun, ys: Any, result: dfx.RESULTS) -> Any:
+def require_complete(setup: ClosedFormRun | DiffraxRun, ys: Any, result: dfx.RESULTS) -> Any:
     """Return the states `ys` of a run; raise a readable error if the run ended early.
 
     `setup` holds the torque of the run and the way in which it was solved, on which the advice in
@@ -373,7 +373,7 @@ def raise_unless_complete(setup: ClosedFormRun | DiffraxRun, ys: Any, result: df
         return ys
     if isinstance(setup, ClosedFormRun):
         return eqx.error_if(ys, result != dfx.RESULTS.successful, _CLOSED_FORM)
-    if changing_inertia_of_torque(setup.torque) is not None:
+    if changing_inertia(setup.torque) is not None:
         ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
     shortest = _message_of_too_short_step(jax.tree.leaves(ys)[0].dtype)
@@ -387,7 +387,7 @@ def raise_unless_complete(setup: ClosedFormRun | DiffraxRun, ys: Any, result: df
     return result.error_if(ys, ill)
 
 
-def warn_of_missed_switches(
+def warn_of_missed(
     setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array, stats: dict[str, Any]
 ) -> None:
     """Warn if a torque switches in time so often that steps do not end at all of its switches.
@@ -413,9 +413,7 @@ def warn_of_missed_switches(
 
 
 @eqx.filter_jit
-def _rerun_and_return_end(
-    setup: DiffraxRun, state0: Any, ts: Array
-) -> tuple[Any, Any, Array, Array]:
+def _rerun(setup: DiffraxRun, state0: Any, ts: Array) -> tuple[Any, Any, Array, Array]:
     """Run a motion once more, and return the time and the state at which the run ended.
 
     `setup` holds the body, the torque and the solver; the run begins with the state `state0` and
@@ -431,7 +429,7 @@ def _rerun_and_return_end(
 _STUCK = 1e-2
 
 
-def explain_max_steps_error(
+def explain_max_steps(
     setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array, error: RuntimeError
 ) -> RuntimeError:
     """Return the error of a failed run, with a better message if the run used up all its steps.
@@ -445,11 +443,9 @@ def explain_max_steps_error(
     """
     if _MANY_STEPS not in str(error) or not isinstance(setup, DiffraxRun):
         return error
-    if not setup.records_steps_for_derivatives or not _checks.is_known((setup, state0, ts)):
+    if not setup.replays or not _checks.is_known((setup, state0, ts)):
         return error
-    t, state, step, count = _rerun_and_return_end(
-        dataclasses.replace(setup, throw=False), state0, ts
-    )
+    t, state, step, count = _rerun(dataclasses.replace(setup, throw=False), state0, ts)
     # A torque that is a function may hold traced numbers, which are then in the result alone.
     if not _checks.is_known((t, state, step, count)):
         return error
@@ -488,7 +484,7 @@ def _solve_in_closed_form(
     return ys, stats, dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
 
 
-def raise_if_scene_ended_run(scene: Any, ys: Any, stats: dict[str, Any], ts: Array) -> Any:
+def raise_if_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Array) -> Any:
     """Return the states of a particle's run; raise an error if its scene ended the run early.
 
     **Arguments:**

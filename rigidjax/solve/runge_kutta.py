@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve.batching import Arrays, add_leading_axes
+from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.tableaus import Tableau, round_weights
 
 # field(constants, t, y) → dy/dt, for t (*bodies), y (n, *bodies).
@@ -62,7 +62,7 @@ class Weights(NamedTuple):
     plain: int  # how many stages a step without dense output has
 
 
-def arrays_of_tableau(tableau: Tableau, dtype: Any) -> Weights:
+def weights_of(tableau: Tableau, dtype: Any) -> Weights:
     """Return the numbers of a Runge–Kutta method, its `tableau`, as arrays of the `dtype`."""
     tableau = round_weights(tableau, dtype)
     c = np.array([0.0, *tableau.c, 1.0, *tableau.extra_c])
@@ -80,7 +80,7 @@ def arrays_of_tableau(tableau: Tableau, dtype: Any) -> Weights:
     return Weights(a, b, nodes, jnp.asarray(c == 1.0), dense, errors, plain)
 
 
-def _weighted_sum_of_slopes(weights: Array, slopes: Array) -> Array:
+def _weighted_sum(weights: Array, slopes: Array) -> Array:
     """Return the weighted sum Σ w_i k_i of the slopes k_i at all stages i of a step, (n, …).
 
     `slopes` (n, s, …) are the slopes at s stages. A slope is dy/dt, the n values of the field at a
@@ -108,7 +108,7 @@ def stages(
 
     The quaternion of the state at the end is not scaled to length 1.
     """
-    w = arrays_of_tableau(tableau, step.y.dtype)
+    w = weights_of(tableau, step.y.dtype)
     count = w.plain if dense is False else w.c.size
     number: Any = np.int32(count)
 
@@ -127,8 +127,8 @@ def stages(
         number = jnp.where(dense, number, np.int32(w.plain))
     begun = (times, places, empty)
     times, places, slopes = lax.fori_loop(np.int32(0), number, stage, begun)
-    h = add_leading_axes(step.h.astype(step.y.dtype), step.y)
-    return Stages(times, places, slopes, step.y + h * _weighted_sum_of_slopes(w.b, slopes), number)
+    h = lift(step.h.astype(step.y.dtype), step.y)
+    return Stages(times, places, slopes, step.y + h * _weighted_sum(w.b, slopes), number)
 
 
 def _stage(
@@ -146,9 +146,7 @@ def _stage(
     A state has n numbers; `*bodies` is one last axis for the bodies of a batch, or no axis.
     """
     # The dtype of the time may differ from that of the state.
-    y = step.y + add_leading_axes(step.h.astype(step.y.dtype), step.y) * _weighted_sum_of_slopes(
-        w.a[i], slopes
-    )
+    y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _weighted_sum(w.a[i], slopes)
     t = jnp.where(w.last[i], step.end, step.t + w.c[i].astype(step.t.dtype) * step.h)
     return t, y, field(constants, t, y)
 
@@ -156,7 +154,7 @@ def _stage(
 def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
     """Return the coefficients of dense output within a step of one body, as rows (r, n).
 
-    Dense output is the state, n numbers, at any time within the step. `change_within_step` computes
+    Dense output is the state, n numbers, at any time within the step. `dense_change` computes
     its change since the start of the step from the r rows F0, F1, …. The rows already contain the
     length of the step as a factor.
 
@@ -165,7 +163,7 @@ def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Arr
     - `step`: the times, the length and the state at the start of the step.
     - `slopes`: (n, s) the slopes at the stages of the step.
     """
-    w = arrays_of_tableau(tableau, slopes.dtype)
+    w = weights_of(tableau, slopes.dtype)
     slopes = jnp.pad(slopes, ((0, 0), (0, w.c.size - w.plain)))
 
     def more(i: Array, slopes: Array) -> Array:
@@ -176,7 +174,7 @@ def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Arr
     return step.h.astype(slopes.dtype) * jnp.sum(w.dense[:, None] * slopes[None], 2)
 
 
-def change_within_step(theta: Array, rows: Array) -> Array:
+def dense_change(theta: Array, rows: Array) -> Array:
     """Return the change of the state since the start of a step, at a time within the step.
 
     The change is θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))). Here `theta` is θ, the fraction of
@@ -205,9 +203,9 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     dtype, ones = slopes.dtype, [1] * (slopes.ndim - 2)
     # All sums over stages are computed in one operation, because for one body each separate sum
     # would be a kernel of its own.
-    rows = arrays_of_tableau(tableau, dtype).errors[:, : slopes.shape[1]]
+    rows = weights_of(tableau, dtype).errors[:, : slopes.shape[1]]
     found = jnp.sum(rows.reshape(len(rows), 1, -1, *ones) * slopes[None], 2)
-    found = add_leading_axes(h.astype(dtype), found) * found
+    found = lift(h.astype(dtype), found) * found
     if len(rows) == 1:
         return found[0]
     which = np.repeat(np.eye(len(sizes)), sizes, axis=1)
@@ -238,14 +236,14 @@ def pull_back(
     **Returns** four cotangents: those of the constants, a list; of the time at the start of the
     step; of the length of the step; and of the state at the start.
     """
-    w, count = arrays_of_tableau(tableau, step.y.dtype), step_stages.slopes.shape[1]
+    w, count = weights_of(tableau, step.y.dtype), step_stages.slopes.shape[1]
     h, put = step.h.astype(step.y.dtype), lax.dynamic_update_index_in_dim
 
     def stage(i: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
         m = step_stages.number - 1 - i
         below, seeds = both
-        seed = w.b[m] * cotangent + _weighted_sum_of_slopes(w.a[:, m], below)
-        bar = add_leading_axes(h, seed) * seed
+        seed = w.b[m] * cotangent + _weighted_sum(w.a[:, m], below)
+        bar = lift(h, seed) * seed
         if cotangents_of_slopes is not None:
             bar = bar + cotangents_of_slopes[:, m]
         pull = jax.vjp(
@@ -261,7 +259,7 @@ def pull_back(
     every = jax.vmap(lambda c, t, y: field(c, t, y), (0, 0, 1), 1)
     own = [jnp.broadcast_to(c, (count, *c.shape)) for c in constants]
     pull = jax.vjp(lambda c, t: every(c, t, step_stages.places), own, step_stages.times)[1]
-    bars = add_leading_axes(h, seeds) * seeds
+    bars = lift(h, seeds) * seeds
     by_own, by_times = pull(bars if cotangents_of_slopes is None else bars + cotangents_of_slopes)
     by_constants = [jnp.sum(by, 0) for by in by_own]
     by_length = jnp.sum(seeds * step_stages.slopes, (0, 1)).astype(by_times.dtype)

@@ -91,7 +91,7 @@ class Solution(eqx.Module, Generic[State]):
         """
         if "drift" in self.stats:
             return self.stats["drift"]
-        return _drift_of_conserved_quantities(self._setup, self.ts, self._states)
+        return _drift(self._setup, self.ts, self._states)
 
     @property
     def growth(self) -> Float[Array, " times"]:
@@ -108,7 +108,7 @@ class Solution(eqx.Module, Generic[State]):
         Source: the largest finite-time Lyapunov exponent is the logarithm of the growth, divided by
         t − t₀ (Eckmann and Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
-        found = _growth_of_small_errors(self._setup, self.ts, self._states)
+        found = _growth(self._setup, self.ts, self._states)
         rtol = None
         if isinstance(self._setup, DiffraxRun):
             rtol = getattr(self._setup.step_controller(), "rtol", None)
@@ -150,7 +150,7 @@ class Solution(eqx.Module, Generic[State]):
         if self._error is not None:
             return self._error
         found = estimate_error_of_run(self._setup, self.ts, self._states, self.stats["num_steps"])
-        _warn_if_error_exceeds(found, 0.5, "error: nothing is known of the states")
+        _warn_of_error(found, 0.5, "error: nothing is known of the states")
         return found
 
     def transition_matrix(self) -> Float[Array, "times n n"]:
@@ -203,17 +203,17 @@ class Solution(eqx.Module, Generic[State]):
         return self.ys if self.own is None else Coupled(self.ys, self.own)
 
 
-def store_error_and_warn(sol: Solution, error: Error, accuracy: Any) -> Solution:
+def with_error(sol: Solution, error: Error, accuracy: Any) -> Solution:
     """Return the solution `sol` with its `error` stored; warn if the error exceeds the accuracy.
 
     `accuracy` is the error that the user allows. For a rotation it is an angle, rad; for any other
     array of the state it is a fraction of the largest length of this array in the run.
     """
-    _warn_if_error_exceeds(error, accuracy, "simulate: the accuracy cannot be had")
+    _warn_of_error(error, accuracy, "simulate: the accuracy cannot be had")
     return dataclasses.replace(sol, _error=error)
 
 
-def _warn_if_error_exceeds(error: Error, limit: Any, message_start: str) -> None:
+def _warn_of_error(error: Error, limit: Any, message_start: str) -> None:
     """Warn if the error of a run exceeds a limit, and name the first time at which it does.
 
     `limit` is the largest allowed error. For a rotation it is an angle, rad; for any other array of
@@ -236,9 +236,7 @@ def _warn_if_error_exceeds(error: Error, limit: Any, message_start: str) -> None
 
 
 @eqx.filter_jit
-def _drift_of_conserved_quantities(
-    setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any
-) -> dict[str, Array]:
+def _drift(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> dict[str, Array]:
     """Return the relative drift of each quantity that the motion conserves, by its name.
 
     The drift is the largest distance of the quantity, such as the energy of a free body, from its
@@ -263,7 +261,7 @@ def _transition_matrix(
     # The run is repeated below with a changed start. It must not raise an error, and it must be
     # differentiable in forward mode: a run of diffrax that does not record its steps needs
     # `ForwardMode` for this.
-    plain = isinstance(setup, DiffraxRun) and not setup.records_steps_for_derivatives
+    plain = isinstance(setup, DiffraxRun) and not setup.replays
     more = dict(adjoint=dfx.ForwardMode()) if plain else {}
     setup = dataclasses.replace(setup, throw=False, **more)
     start = jax.tree.map(lambda leaf: leaf[0], ys)
@@ -275,9 +273,7 @@ def _transition_matrix(
 
 
 @eqx.filter_jit
-def _growth_of_small_errors(
-    setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any
-) -> Float[Array, " times"]:
+def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, " times"]:
     """Return the largest factor by which a small error at the start grows until each saved time.
 
     The factor is the largest singular value of ∂y(t)/∂y(t₀). Here t₀ is the time at the start, and

@@ -14,10 +14,10 @@ from jaxtyping import Array, ArrayLike, PyTree
 from rigidjax._types import RealLike
 from rigidjax.solve.adaptive_loop import (
     NONFINITE,
-    acceptance_and_next_step_size,
+    accept_and_adapt,
     finite,
     previous_float,
-    row_of_each_body,
+    rows_at,
     starting_step,
 )
 
@@ -27,7 +27,7 @@ NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
 _SLIVER = 16  # units of round-off: no step is left that is so short
 
 
-def _make_property_of_controller(attribute: str) -> Any:
+def _inner(attribute: str) -> Any:
     """Define a property that reads an attribute of the step controller `self.controller`.
 
     The property is for a class that wraps a step controller. `attribute` is the name of the
@@ -76,9 +76,9 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
         error_order: RealLike | None,
     ) -> tuple[Any, Any]:
         assert dt0 is not None
-        return t0 + self._limited_length(dt0), ()
+        return t0 + self._limited(dt0), ()
 
-    def _limited_length(self, length: Any) -> Any:
+    def _limited(self, length: Any) -> Any:
         """Return the `length` of a step, s, but not more than the longest step that is allowed."""
         return length if self.dtmax is None else jnp.minimum(length, self.dtmax)
 
@@ -104,11 +104,11 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
             return error / (self.atol + self.rtol * jnp.maximum(jnp.abs(left), jnp.abs(right)))
 
         still = lax.stop_gradient((y_error, y0, y1_candidate))
-        keep, length = acceptance_and_next_step_size(
+        keep, length = accept_and_adapt(
             self.norm(jax.tree.map(over_tolerance, *still)), error_order, t1 - t0
         )
         left = jnp.where(keep, t1, t0)
-        right = left + self._limited_length(length)
+        right = left + self._limited(length)
         return keep, left, right, False, controller_state, dfx.RESULTS.successful
 
 
@@ -131,9 +131,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     def __init__(self, controller: dfx.AbstractStepSizeController):
         self.controller = controller
 
-    rtol = _make_property_of_controller("rtol")
-    atol = _make_property_of_controller("atol")
-    norm = _make_property_of_controller("norm")
+    rtol = _inner("rtol")
+    atol = _inner("atol")
+    norm = _inner("norm")
 
     def wrap(self, direction: PyTree) -> "Watched":
         return Watched(self.controller.wrap(direction))
@@ -174,7 +174,7 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         # The first step is at least the shortest that the time can resolve, because steps of length
         # 0 would be accepted without end. If the start is not finite, the step has the length NaN,
         # which ends the run.
-        shortest = begin + self._shortest_resolvable_step(begin, least)
+        shortest = begin + self._shortest(begin, least)
         first = jnp.where(sound, jnp.maximum(first, shortest), jnp.nan)
         return first.astype(begin.dtype), (inner, least)
 
@@ -194,7 +194,7 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         size, rate = (jnp.asarray(self.norm(of_state(a / scale))) for a in both)
         return starting_step(size, rate, order)
 
-    def _shortest_resolvable_step(self, t: ArrayLike, smallest_time: ArrayLike) -> Array:
+    def _shortest(self, t: ArrayLike, smallest_time: ArrayLike) -> Array:
         """Return the length of the shortest step that the resolution of the time allows, s.
 
         It is 8 units of round-off of the time `t`, s. If |t| is smaller than `smallest_time`, s, it
@@ -217,7 +217,7 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
-        unit = self._shortest_resolvable_step(left, least)
+        unit = self._shortest(left, least)
         stuck = ~keep & ~(right - left > unit)
         # A run that is stuck after a step to NaN or infinity ends with `NONFINITE`. If this step
         # was already the shortest possible one, a still shorter step might be finite: the result
@@ -255,9 +255,9 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         still = lax.stop_gradient(stops)
         self.following = jnp.searchsorted(still, still, side="right").astype(jnp.int32)
 
-    rtol = _make_property_of_controller("rtol")
-    atol = _make_property_of_controller("atol")
-    norm = _make_property_of_controller("norm")
+    rtol = _inner("rtol")
+    atol = _inner("atol")
+    norm = _inner("norm")
 
     def wrap(self, direction: PyTree) -> "Stopping":
         way = jnp.asarray(direction).astype(self.stops.dtype)
@@ -281,11 +281,11 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
 
     def _end_of_step(self, t: RealLike, length: Any, stop_index: Array) -> Array:
         """Return the end of a step from t, s, which is the next stop if that is not far beyond."""
-        end = self._stop_and_last_time_before(stop_index)[1]
+        end = self._stop_and_end(stop_index)[1]
         near = end - _SLIVER * jnp.finfo(end.dtype).eps * jnp.abs(lax.stop_gradient(end))
         return jnp.where(t + length > jnp.where(jnp.isinf(end), end, near), end, t + length)
 
-    def _stop_and_last_time_before(self, stop_index: Array) -> tuple[Array, Array]:
+    def _stop_and_end(self, stop_index: Array) -> tuple[Array, Array]:
         """Return the time of a stop, s, and the last floating-point time before it, s.
 
         A stop is a time at which steps end because the field jumps; `stop_index` is its index. The
@@ -293,7 +293,7 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         beyond the last stop, both times are infinite.
         """
         none = jnp.full_like(self.stops[:1], jnp.inf)
-        stop = row_of_each_body(jnp.concatenate([self.stops, none]), stop_index)
+        stop = rows_at(jnp.concatenate([self.stops, none]), stop_index)
         still = lax.stop_gradient(stop)
         gap = jnp.where(jnp.isinf(still), 0, previous_float(still) - still)
         return stop, stop + gap
@@ -313,11 +313,11 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
-        stop, end = self._stop_and_last_time_before(index)
+        stop, end = self._stop_and_end(index)
         reached = keep & (t1 >= end)
         length = lax.stop_gradient(right - left)
         length = jnp.where(reached, jnp.maximum(length, kept), length)
         left = jnp.where(reached, stop, left)
-        index = jnp.where(reached, row_of_each_body(self.following, index), index)
+        index = jnp.where(reached, rows_at(self.following, index), index)
         right = self._end_of_step(left, length, index)
         return keep, left, right, jumped | reached, (inner, length, index), result

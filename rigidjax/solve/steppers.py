@@ -30,10 +30,10 @@ from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import quaternion_product, squared_quaternion_length
 from rigidjax.rotation.linalg3 import components
 from rigidjax.solve import splitting
-from rigidjax.solve.components import Atoms, join_scalars, split_into_scalars
+from rigidjax.solve.components import Atoms, join_scalars, split_scalars
 from rigidjax.solve.equal_steps import StepWithLoopedStages, change_in_step
 from rigidjax.solve.explicit import AbstractExplicit, RungeKutta4
-from rigidjax.solve.magnus import Magnus4, momentum_change_and_turn, require_independent_of_attitude
+from rigidjax.solve.magnus import Magnus4, change_and_turn, refuse_attitude
 from rigidjax.solve.splitting import AbstractSplitting
 
 # Runs of at least this many steps use `Carrying`, with which a run without derivatives takes a
@@ -50,11 +50,11 @@ class Stepper(NamedTuple):
     torque's inputs during the step, or `None`.
     """
 
-    initial_numbers: Any  # the numbers y at the start, which stand for the state there
+    start: Any  # the numbers y at the start, which stand for the state there
     # change(t, end, h, y, inputs): the change of the numbers y in a step from t to end, of length
     # h.
     change: Callable[[Any, Any, Any, Any, Any], Any]
-    state_of_numbers: Callable[[Any], Any]  # the state that the numbers y stand for
+    state: Callable[[Any], Any]  # the state that the numbers y stand for
     delays: tuple[tuple[str, Array], ...] = ()  # name and delay, s, of each delayed input
 
     def step(self, t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:
@@ -74,9 +74,9 @@ class Carrying(NamedTuple):
     of: Stepper
 
     @property
-    def initial_numbers(self) -> tuple[Any, Any]:
+    def start(self) -> tuple[Any, Any]:
         """Return the numbers of the state at the start, and their rounding errors, which are 0."""
-        return self.of.initial_numbers, jax.tree.map(jnp.zeros_like, self.of.initial_numbers)
+        return self.of.start, jax.tree.map(jnp.zeros_like, self.of.start)
 
     @property
     def delays(self) -> tuple[tuple[str, Array], ...]:
@@ -89,12 +89,12 @@ class Carrying(NamedTuple):
         lost = jax.tree.map(lambda d, a, b: d - (b - a), change, y, after)
         return after, lax.stop_gradient(lost)
 
-    def state_of_numbers(self, numbers_and_errors: tuple[Any, Any]) -> Any:
+    def state(self, numbers_and_errors: tuple[Any, Any]) -> Any:
         """Return the state that its numbers stand for; their rounding errors are left out.
 
         `numbers_and_errors` is a pair of the numbers and of their rounding errors.
         """
-        return self.of.state_of_numbers(numbers_and_errors[0])
+        return self.of.state(numbers_and_errors[0])
 
 
 AnyStepper = Stepper | Carrying
@@ -111,11 +111,11 @@ def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) 
     - `count`: the number of steps. If it is at least 10 000 or is traced, the result is a
       `Carrying`, which also carries the rounding errors of the sums along; else it is a `Stepper`.
     """
-    stepper = _stepper_without_delays(solver, field, y0)._replace(delays=tuple(delays_of(field)))
+    stepper = _stepper(solver, field, y0)._replace(delays=tuple(delays_of(field)))
     return Carrying(stepper) if not isinstance(count, int) or count >= _MANY else stepper
 
 
-def cheapest_method_of_order_4(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
+def cheapest_method(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
     """Return the method of order 4 that takes the least work for a vector field.
 
     It is `Magnus4` for the attitude of a body whose torque does not read the attitude, else
@@ -126,7 +126,7 @@ def cheapest_method_of_order_4(field: Callable[..., Any]) -> Magnus4 | RungeKutt
     return Magnus4() if blind else RungeKutta4()
 
 
-def _stepper_without_delays(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
+def _stepper(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
     """Return the object that takes fixed steps of a vector field by a method, as a `Stepper`.
 
     Its field `delays` is empty: the caller fills in the delays of the torque's inputs. Raise
@@ -137,16 +137,12 @@ def _stepper_without_delays(solver: Any, field: Callable[..., Any], y0: Any) -> 
     - `y0`: the state at the start.
     """
     turning = _inertia_and_torque(field, y0)
-    solver = cheapest_method_of_order_4(field) if solver is None else solver
+    solver = cheapest_method(field) if solver is None else solver
     if isinstance(solver, Magnus4) and isinstance(y0, Attitude) and turning is not None:
-        require_independent_of_attitude(turning.torque)
-        return (
-            _stepper_of_free_body(turning.inertia, y0)
-            if turning.torque is None
-            else _stepper_of_magnus(turning, y0)
-        )
+        refuse_attitude(turning.torque)
+        return _free(turning.inertia, y0) if turning.torque is None else _magnus(turning, y0)
     if isinstance(solver, AbstractSplitting):
-        return _stepper_of_splitting(solver, field, y0)
+        return _splitting(solver, field, y0)
     if not isinstance(solver, AbstractExplicit | StepWithLoopedStages):
         raise TypeError(
             f"no fixed steps of {type(solver).__name__} on {type(y0).__name__}; wanted "
@@ -155,16 +151,16 @@ def _stepper_without_delays(solver: Any, field: Callable[..., Any], y0: Any) -> 
             "stepsize_controller=diffrax.ConstantStepSize() under jax.vmap"
         )
     if turning is not None:
-        return _stepper_of_explicit_method(solver, turning, y0)
+        return _explicit(solver, turning, y0)
 
     def slope_under(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
-        return lambda t, y: split_into_scalars(bind(field, inputs)(t, join_scalars(y, y0), None))
+        return lambda t, y: split_scalars(bind(field, inputs)(t, join_scalars(y, y0), None))
 
-    start = split_into_scalars(y0)
-    return _stepper_of_slope_function(solver, slope_under, start, lambda y: join_scalars(y, y0), y0)
+    start = split_scalars(y0)
+    return _of_slope(solver, slope_under, start, lambda y: join_scalars(y, y0), y0)
 
 
-class _InertiaAndTorque(NamedTuple):
+class _Turning(NamedTuple):
     """Hold the inertia and the torque of a body that only turns, and does not move in space.
 
     The inertia has the same dtype as the body rate in the state.
@@ -175,7 +171,7 @@ class _InertiaAndTorque(NamedTuple):
     torque: Any  # the torque law, or `None` for a free body
 
 
-def _inertia_and_torque(field: Any, y0: Any) -> _InertiaAndTorque | None:
+def _inertia_and_torque(field: Any, y0: Any) -> _Turning | None:
     """Return the inertia and the torque of a body that only turns, or `None` for other motions.
 
     `field` is the vector field of the body, dy/dt as a function of time and state, and `y0` is the
@@ -187,12 +183,10 @@ def _inertia_and_torque(field: Any, y0: Any) -> _InertiaAndTorque | None:
         return None
     dtype = y0.omega.dtype
     inertia = jax.tree.map(lambda a: a.astype(dtype), euler.inertia)
-    return _InertiaAndTorque(
-        inertia, _entries_of_symmetric_matrix(euler.inverse.astype(dtype)), euler.torque
-    )
+    return _Turning(inertia, _entries(euler.inverse.astype(dtype)), euler.torque)
 
 
-def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
+def _free(body: Inertia, state0: Attitude) -> Stepper:
     """Return the object that takes fixed steps of a free body by Magnus' method of order 4.
 
     `body` is the inertia, and `state0` the state at the start. The object carries seven numbers
@@ -201,18 +195,16 @@ def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
     hold these axes fixed: when the inertia changes, the off-diagonal entries of the inertia along
     the axes, which are zero, have tangents that are not zero.
     """
-    frame = splitting.principal_frame_of_tensor(body.tensor)
+    frame = splitting.principal_frame(body.tensor)
     weights, axes = frame.weights, frame.axes
     a, b, c, *_ = lax.stop_gradient(weights)
     gaps = (c - b, a - c, b - a)
-    momentum = splitting.momentum_along_axes(frame, state0.omega)
+    momentum = splitting.momentum_along(frame, state0.omega)
     one, none = jnp.ones_like(a), jnp.zeros_like(a)
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
-        slope = lambda _, p: _free_momentum_derivative(weights, gaps, p)  # noqa: E731
-        dp, turn = momentum_change_and_turn(
-            slope, partial(splitting.body_rate_along_axes, weights), t, end, h, y[4:]
-        )
+        slope = lambda _, p: _free_slope(weights, gaps, p)  # noqa: E731
+        dp, turn = change_and_turn(slope, partial(splitting.rate_along, weights), t, end, h, y[4:])
         return (*quaternion_product(y[:4], turn), *dp)
 
     def state(y: Atoms) -> Attitude:
@@ -220,15 +212,13 @@ def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
         # axes; `combine_columns` gives the vector in body axes.
         turn = jnp.stack([y[0], *combine_columns(axes, y[1:4])])
         q = quaternion.normalise(quaternion.multiply(state0.q, turn))
-        return Attitude(q, splitting.body_rate_in_body_axes(frame, y[4:]))
+        return Attitude(q, splitting.rate_in_body(frame, y[4:]))
 
     return Stepper((one, none, none, none, *momentum), change, state)
 
 
 @jax.custom_jvp
-def _free_momentum_derivative(
-    inverse: SymmetricEntries, inverse_differences: Triple, momentum: Triple
-) -> Triple:
+def _free_slope(inverse: SymmetricEntries, inverse_differences: Triple, momentum: Triple) -> Triple:
     """Return the time derivative of the momentum of a free body, dΠ/dt = Π × Ω, N m.
 
     `momentum` is the angular momentum Π, three numbers along the principal axes, N m s; Ω is the
@@ -240,14 +230,14 @@ def _free_momentum_derivative(
     return d[0] * (p[1] * p[2]), d[1] * (p[2] * p[0]), d[2] * (p[0] * p[1])
 
 
-@_free_momentum_derivative.defjvp
-def _free_momentum_derivative_jvp(primals, tangents):
+@_free_slope.defjvp
+def _free_slope_jvp(primals, tangents):
     (weights, gaps, p), (dw, _, dp) = primals, tangents
-    rate, turning = splitting.body_rate_along_axes_jvp((weights, p), (dw, dp))
-    return _free_momentum_derivative(weights, gaps, p), add(cross(dp, rate), cross(p, turning))
+    rate, turning = splitting.rate_along_jvp((weights, p), (dw, dp))
+    return _free_slope(weights, gaps, p), add(cross(dp, rate), cross(p, turning))
 
 
-def _entries_of_symmetric_matrix(a: Array) -> SymmetricEntries:
+def _entries(a: Array) -> SymmetricEntries:
     """Return the six different entries of a symmetric matrix, in the order 11, 22, 33, 12, 13, 23.
 
     `a` (3, 3) is the matrix. Each of the last three is the mean of two equal entries.
@@ -257,7 +247,7 @@ def _entries_of_symmetric_matrix(a: Array) -> SymmetricEntries:
     return a[0, 0], a[1, 1], a[2, 2], *off
 
 
-def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
+def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
     """Return the object that takes fixed steps by Magnus' method, under a torque.
 
     The torque may read the time and the body rate, not the attitude. `turning` holds the inertia
@@ -265,7 +255,7 @@ def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
     carries the quaternion of the attitude, and the angular momentum in body axes.
     """
     body, weights, torque = turning
-    start, rate = split_into_scalars(state0), partial(matvec, weights)
+    start, rate = split_scalars(state0), partial(matvec, weights)
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         law = bind(torque, inputs)
@@ -275,21 +265,19 @@ def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
             # The torque does not read the attitude. It therefore gets a `Spin`, a state without an
             # attitude.
             value = evaluate_torque(law, t, Spin(jnp.stack(omega)), body)
-            return add(cross(p, omega), split_into_scalars(value))
+            return add(cross(p, omega), split_scalars(value))
 
-        dp, turn = momentum_change_and_turn(slope, rate, t, end, h, y[4:])
+        dp, turn = change_and_turn(slope, rate, t, end, h, y[4:])
         return (*quaternion_product(y[:4], turn), *dp)
 
     def state(y: Atoms) -> Attitude:
         return Attitude(quaternion.normalise(jnp.stack(y[:4])), jnp.stack(rate(y[4:])))
 
-    return Stepper(
-        (*start[:4], *matvec(_entries_of_symmetric_matrix(body.tensor), start[4:])), change, state
-    )
+    return Stepper((*start[:4], *matvec(_entries(body.tensor), start[4:])), change, state)
 
 
-def _stepper_of_explicit_method(
-    solver: AbstractExplicit | StepWithLoopedStages, turning: _InertiaAndTorque, state0: Any
+def _explicit(
+    solver: AbstractExplicit | StepWithLoopedStages, turning: _Turning, state0: Any
 ) -> Stepper:
     """Return the object that takes fixed steps of an explicit method for a body that only turns.
 
@@ -299,7 +287,7 @@ def _stepper_of_explicit_method(
     body axes.
     """
     body, weights, torque = turning
-    start = split_into_scalars(state0)
+    start = split_scalars(state0)
     many = len(start) - 3
 
     def slope_for_inputs(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
@@ -313,7 +301,7 @@ def _stepper_of_explicit_method(
             pushed = cross(p, omega)
             if law is not None:
                 value = evaluate_torque(law, t, join_scalars((*q, *omega), state0), body)
-                pushed = add(pushed, split_into_scalars(value))
+                pushed = add(pushed, split_scalars(value))
             return (*half_product(q, omega), *pushed) if many else pushed
 
         return slope
@@ -321,17 +309,15 @@ def _stepper_of_explicit_method(
     def state(y: Atoms) -> Any:
         return join_scalars((*y[:many], *matvec(weights, y[many:])), state0)
 
-    momentum = matvec(_entries_of_symmetric_matrix(body.tensor), start[many:])
-    return _stepper_of_slope_function(
-        solver, slope_for_inputs, (*start[:many], *momentum), state, state0
-    )
+    momentum = matvec(_entries(body.tensor), start[many:])
+    return _of_slope(solver, slope_for_inputs, (*start[:many], *momentum), state, state0)
 
 
-def _stepper_of_slope_function(
+def _of_slope(
     solver: AbstractExplicit | StepWithLoopedStages,
     slope_for_inputs: Callable[[Any], Callable[[Any, Atoms], Atoms]],
-    initial_numbers: Atoms,
-    state_of_numbers: Callable[[Atoms], Any],
+    start: Atoms,
+    state: Callable[[Atoms], Any],
     example_state: Any,
 ) -> Stepper:
     """Return the object that takes fixed steps of an explicit method, for a slope dy/dt.
@@ -341,8 +327,8 @@ def _stepper_of_slope_function(
     - `solver`: the Runge–Kutta method.
     - `slope_for_inputs`: a function such that `slope_for_inputs(inputs)(t, y)` is dy/dt. Here
       `inputs` are the values of the torque's inputs during the step.
-    - `initial_numbers`: the numbers y at the start, a tuple of scalars that stand for the state.
-    - `state_of_numbers`: a function that returns the state for the numbers y.
+    - `start`: the numbers y at the start, a tuple of scalars that stand for the state.
+    - `state`: a function that returns the state for the numbers y.
     - `example_state`: a state whose arrays have as many numbers as y, in the same order. It shows
       which of the numbers y are a quaternion, which is scaled to length 1.
     """
@@ -352,7 +338,7 @@ def _stepper_of_slope_function(
             y, change_in_step(solver, slope_for_inputs(inputs), t, h, y, end), example_state
         )
 
-    return Stepper(initial_numbers, change, state_of_numbers)
+    return Stepper(start, change, state)
 
 
 def _change_to_unit_length(y: Atoms, change: Atoms, example_state: Any) -> Atoms:
@@ -383,12 +369,12 @@ def _change_to_unit_length(y: Atoms, change: Atoms, example_state: Any) -> Atoms
     # steps bring the length back to 1.
     less = barrier(excess * (0.5 - excess * (0.375 - 0.3125 * excess)))
     q = jnp.stack([d - less * a for d, a in zip(moved, after, strict=True)])
-    return split_into_scalars(
+    return split_scalars(
         eqx.tree_at(lambda s: motion_of(s).q, join_scalars(change, example_state), q)
     )
 
 
-def _stepper_of_splitting(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
+def _splitting(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
     """Return the object that takes fixed steps of a splitting: free motions and kicks in turn.
 
     A kick adds a weight times the torque times the length of the step to the momentum, at a fixed
@@ -402,14 +388,12 @@ def _stepper_of_splitting(solver: AbstractSplitting, field: Any, state0: Any) ->
     """
     # The momentum Π is carried from step to step, along the principal axes. No step converts Π to Ω
     # = I⁻¹Π and back, so that |Π| drifts only by the round-off of the free motion.
-    frame = splitting.principal_frame_of_field(field, state0)
+    frame = splitting.frame_of_field(field, state0)
 
     def change(t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:
-        return splitting.change_in_splitting_step(
-            solver.composition, bind(field, inputs), frame, t, h, y
-        )
+        return splitting.splitting_change(solver.composition, bind(field, inputs), frame, t, h, y)
 
     def state(y: Any) -> Attitude:
-        return Attitude(quaternion.normalise(y[0]), splitting.body_rate_in_body_axes(frame, y[1]))
+        return Attitude(quaternion.normalise(y[0]), splitting.rate_in_body(frame, y[1]))
 
-    return Stepper((state0.q, splitting.momentum_along_axes(frame, state0.omega)), change, state)
+    return Stepper((state0.q, splitting.momentum_along(frame, state0.omega)), change, state)

@@ -22,7 +22,7 @@ from rigidjax.motion.torques.composite import parts_of
 from rigidjax.rotation.validation import rotation_tolerance
 
 
-def checked_body_state_and_times(
+def checked_run(
     body: Any, state0: Any, ts: Any, torque: Any, throw: bool
 ) -> tuple[Any, Any, Array]:
     """Return the body, the state at the start and the times of a run, after a check of all three.
@@ -46,14 +46,14 @@ def checked_body_state_and_times(
     ts, state0 = jax.tree.map(
         lambda leaf: leaf if leaf.dtype == dtype else leaf.astype(dtype), (ts, state0)
     )
-    require_compatible_types(body, state0, torque)
-    warn_of_unknown_inertia_scale(body, torque)
+    require_compatible(body, state0, torque)
+    warn_of_scale(body, torque)
     if body is not None:
         body = real_or_nan(body, throw)
     return body, state0, ts
 
 
-def require_compatible_types(body: Any, state0: Any, torque: Any) -> None:
+def require_compatible(body: Any, state0: Any, torque: Any) -> None:
     """Raise `TypeError` unless the body, the type of the state and the torque fit together.
 
     The arguments are those of `simulate` with the same names.
@@ -76,16 +76,12 @@ def require_compatible_types(body: Any, state0: Any, torque: Any) -> None:
     if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
         raise TypeError(
             f"Rigid moves as well as turns: wanted MassProperties, got {type(body).__name__}"
-            + _advice_to_make_body_of_numbers(body, moves=True)
+            + _advice(body, moves=True)
         )
     if not isinstance(state0, Rigid | Point) and not isinstance(body, Inertia):
         raise TypeError(
             f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
-            + (
-                "; pass body.inertia"
-                if isinstance(body, MassProperties)
-                else _advice_to_make_body_of_numbers(body)
-            )
+            + ("; pass body.inertia" if isinstance(body, MassProperties) else _advice(body))
         )
     if body is not None:
         _checks.require_unbatched_instance(body, type(body), "body")
@@ -129,7 +125,7 @@ def common_dtype(tree: Any, name: str) -> Any:
     return kinds.pop()
 
 
-def warn_of_unknown_inertia_scale(body: Any, torque: Any) -> None:
+def warn_of_scale(body: Any, torque: Any) -> None:
     """Warn if a torque in N m acts on a body whose inertia is known only up to a factor.
 
     The gravity gradient without harmonics needs no warning, because it is proportional to the
@@ -145,7 +141,7 @@ def warn_of_unknown_inertia_scale(body: Any, torque: Any) -> None:
         )
 
 
-def _advice_to_make_body_of_numbers(numbers: Any, moves: bool = False) -> str:
+def _advice(numbers: Any, moves: bool = False) -> str:
     """Return the end of an error message, for a user who gave bare numbers in the place of a body.
 
     The text says how to make a body from the `numbers`. The body is a `MassProperties` if `moves`
@@ -228,7 +224,7 @@ def checked_times(ts: Any, throw: bool) -> Array:
     ahead = xp.where(back, numbers[:-1] > numbers[1:], numbers[1:] > numbers[:-1])
     if xp is not np:
         words = "ts: wanted increasing times, or decreasing ones throughout"
-        return _error_or_nan_if_bad(found, ~ahead.all(), words, throw)
+        return _error_or_nan(found, ~ahead.all(), words, throw)
     where = ""
     if not ahead.all():
         i = int(np.argmin(ahead)) + 1
@@ -239,7 +235,7 @@ def checked_times(ts: Any, throw: bool) -> Array:
                 + _checks.advice_for_large_times(found.dtype)
             )
     kind = "decreasing" if back else "increasing"
-    return _error_or_nan_if_bad(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
+    return _error_or_nan(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
 
 
 def checked_first_step(dt0: Any, times: Array) -> Array:
@@ -292,7 +288,7 @@ def checked_start(state0: Any, throw: bool) -> Any:
     if isinstance(state0, HasAttitude):
         xp = _checks.array_module(state0.q)
         off = xp.abs(xp.sqrt(xp.sum(xp.square(state0.q))) - 1)
-        q = _error_or_nan_if_bad(
+        q = _error_or_nan(
             state0.q,
             off > rotation_tolerance(state0.q.dtype),
             "q: wanted a unit quaternion (w, x, y, z), got one whose length is not 1; normalise it "
@@ -303,7 +299,7 @@ def checked_start(state0: Any, throw: bool) -> Any:
     return state0
 
 
-def _error_or_nan_if_bad(value: Array, bad: Any, message: str, throw: bool) -> Array:
+def _error_or_nan(value: Array, bad: Any, message: str, throw: bool) -> Array:
     """Return an array after a check: if it is bad, raise an error, or return NaN in its place.
 
     **Arguments:**
