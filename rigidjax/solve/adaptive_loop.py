@@ -206,8 +206,7 @@ def step_times(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
 
 
 def rows_at(rows: Array, index: Array) -> Array:
-    """Return `rows[index]`, where each body of a batch has rows (J, *bodies) and indices of its
-    own.
+    """Return `rows[index]`, where each body has rows (J, *bodies) and indices of its own.
 
     An index out of range gives the nearest row.
     """

@@ -26,37 +26,20 @@ BLOCK = 16
 
 
 class Layout(NamedTuple):
-    """Describe which arrays of a program have a last axis for the bodies of a batch.
-
-    A program is a function of two lists of arrays: the constants, and the arrays of each body.
-    """
+    """Describe which arrays of a program have a last axis for the bodies of a batch."""
 
     bodies: bool  # whether the arrays of each body have this axis; without it there is one body
     shared: tuple[bool, ...]  # for each constant, whether all bodies share it, without this axis
 
     def vmap(self, function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-        """Map `function(constants, t, y)`, which takes the arrays of one body, over all bodies.
-
-        The result takes and returns arrays whose last axis is that of the bodies; constants that
-        all bodies share have no such axis. Without an axis of bodies `function` is returned
-        unchanged.
-        """
+        """Map `function(constants, t, y)` of one body over the bodies in the last axis, if any."""
         axes = [None if s else -1 for s in self.shared]
         return jax.vmap(function, (axes, -1, -1), -1) if self.bodies else function
 
     def broadcast(
         self, constants: Arrays, per_body: list[bool], like: Array
     ) -> tuple["Layout", Arrays]:
-        """Broadcast some of the constants that all bodies share along a new last axis of bodies.
-
-        - `constants`: the constants of a program, some with a last axis of bodies and some without.
-        - `per_body`: for each constant, whether it needs this axis.
-        - `like`: an array whose last axis is that of the bodies; its length is the number of
-          bodies.
-
-        **Returns** two things: the new layout, which says which constants are still shared; and the
-        constants.
-        """
+        """Give the shared constants that are `per_body` a last axis, as long as that of `like`."""
         if not self.bodies:
             return self, constants
         own = [s and w for s, w in zip(self.shared, per_body, strict=True)]
@@ -83,19 +66,9 @@ def bodies_last(
 ) -> Arrays:
     """Run a program with the bodies of any `jax.vmap` in the last axis of all arrays.
 
-    **Arguments:**
-
-    - `program`: a function `program(layout, constants, each)` that returns a list of arrays; see
-      `Program`.
-    - `constants`: arrays, each of which all bodies may share.
-    - `each`: arrays in which each body has values of its own.
-    - `num_linear`: the number of arrays at the end of `each` in which the program is linear, such
-      as tangents. A `jax.vmap` over these arrays alone adds tangents, not bodies: its axis is not
-      moved to the end.
-    - `layout`: says which of the given arrays have a last axis of bodies already; `None` stands for
-      one body.
-
-    **Returns** the list of arrays that the program returns.
+    It is linear in the last `num_linear` arrays of `each`, such as tangents. A `jax.vmap` over
+    these alone adds tangents, not bodies: its axis is not moved. `layout` says which arrays have
+    bodies already; `None` stands for one body.
     """
     was = Layout(False, (True,) * len(constants)) if layout is None else layout
     number = len(constants)
@@ -157,19 +130,8 @@ def _with_tangent(
     primals: tuple[PyTree, ...],
     tangents: tuple[PyTree, ...],
 ) -> tuple[Arrays, Arrays]:
-    """Return the result of a program and its tangent, which are computed together.
-
-    This is the rule for derivatives of `bodies_last` in forward mode.
-    `bodies_last` runs a program with the bodies of any `jax.vmap` in the last axis of all
-    arrays; here one call of it runs the program and its tangent.
-
-    - `program`: a function `program(layout, constants, each)` that returns a list of arrays.
-    - `layout`: says which arrays have a last axis of bodies.
-    - `num_constants`: the number of constants, which are the first of `primals`. The other primals
-      are the arrays `each`, in which each body has values of its own.
-    - `num_linear`: the number of arrays at the end of `each` in which the program is linear.
-    - `primals`, `tangents`: the arrays that the program takes, and their tangents.
-    """
+    """Return the result of a program and its tangent, by one run of both."""
+    # The other primals are the arrays `each`.
     constants, each = list(primals[:num_constants]), list(primals[num_constants:])
     moving = [not isinstance(t, SymbolicZero) for t in tangents]
     # The tangents are passed together with the arrays `each`, in which every body has values of its
@@ -198,16 +160,7 @@ def _with_tangent(
 
 
 def _in_blocks(program: Program, layout: Layout, num_constants: int, *args: Any) -> Arrays:
-    """Return the result of a program, computed on CPU for at most `BLOCK` (16) bodies at a time.
-
-    The arrays of so few bodies stay in the first-level cache of the processor. On other backends
-    all bodies are computed at once.
-
-    - `program`: a function `program(layout, constants, each)` that returns a list of arrays.
-    - `layout`: says which arrays have a last axis of bodies.
-    - `num_constants`: the number of constants, which are the first of `args`.
-    - `args`: the constants, then the arrays in which each body has values of its own.
-    """
+    """Return the result of a program, computed on CPU for at most `BLOCK` bodies at a time."""
     constants, each = list(args[:num_constants]), list(args[num_constants:])
     count = each[0].shape[-1] if layout.bodies else 1
     if platform() != "cpu" or count <= BLOCK:
@@ -236,9 +189,8 @@ def _in_blocks(program: Program, layout: Layout, num_constants: int, *args: Any)
 
 
 def lift(array: Array, like: Array) -> Array:
-    """Return `array` with leading axes of length 1 added, so that it broadcasts against `like`.
+    """Return `array` with leading axes of length 1, so that it broadcasts against `like`.
 
-    The last axes of `like` are the axes of `array`: an array with one number for each body is
-    lifted to multiply states (n, *bodies), for example. The result has as many axes as `like`.
+    An array with one number for each body then multiplies states (n, *bodies).
     """
     return array.reshape((1,) * (like.ndim - array.ndim) + array.shape)

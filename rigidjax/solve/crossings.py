@@ -439,6 +439,24 @@ class Section(NamedTuple):
         """Return σs: convert the time s to the time t, or t to s."""
         return self.sign.astype(s.dtype) * s
 
+    def measure(self, constants: Arrays, s: Array, y: Array) -> Measured:
+        """Return g and its rate at a state, the slope of the state, and the round-off of g."""
+        of_g = lambda s, y: self.rates(constants, s, y)[0]  # noqa: E731
+        noise = jax.jvp(of_g, (s, y), (s, _probe(self.sizes, y)))[1]
+        blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)
+        g, rate, slope = self.rates(constants, s, y)
+        return Measured(jnp.asarray(g), jnp.asarray(rate), slope, blur)
+
+    def clarity(self, constants: Arrays, s: Array, y: Array) -> Array:
+        """Return |dg/ds| at a zero over the rate that round-off could cause: about 1 if it did."""
+        rates = partial(self.rates, constants, s)
+        _, rate, slope = rates(y)
+        shift = jax.jvp(lambda y: rates(y)[2], (y,), (_probe(self.sizes, y),))[1]
+        by_s, by_y = jax.jacfwd(lambda s, y: self.rates(constants, s, y)[0], (0, 1))(s, y)
+        lengths = _norms(self.sizes, slope) + _norms(self.sizes, shift)
+        terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * lengths)
+        return jnp.abs(rate) / (jnp.finfo(y.dtype).eps * terms)
+
 
 class Numbers(NamedTuple):
     """Hold the arrays with which a `Section` is searched."""
@@ -532,9 +550,7 @@ def _locate(
     run, longest = Path(*each[:-1]), each[-1]
     solver, motion = section.solver, layout.vmap(section.motion)
     project = jax.vmap(section.project, -1, -1) if layout.bodies else section.project
-    seen, clear = (
-        partial(layout.vmap(partial(f, section)), constants) for f in (_measure, _clarity)
-    )
+    seen, clear = (partial(layout.vmap(f), constants) for f in (section.measure, section.clarity))
 
     def counts(s: Array, y: Array, steps: Array) -> Array:
         # The round-off of n steps adds up as a random walk does, to about √n times that of one
@@ -568,26 +584,6 @@ def _probe(sizes: list[int], y: Array) -> Array:
     so that the change has components along all axes of the body.
     """
     return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _norms(sizes, y)
-
-
-def _measure(section: Section, constants: Arrays, s: Array, y: Array) -> Measured:
-    """Return g and its rate at a state, the slope of the state, and the round-off of g."""
-    of_g = lambda s, y: section.rates(constants, s, y)[0]  # noqa: E731
-    noise = jax.jvp(of_g, (s, y), (s, _probe(section.sizes, y)))[1]
-    blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)
-    g, rate, slope = section.rates(constants, s, y)
-    return Measured(jnp.asarray(g), jnp.asarray(rate), slope, blur)
-
-
-def _clarity(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
-    """Return |dg/ds| at a zero over the rate that round-off could cause: about 1 if it did."""
-    rates, sizes = partial(section.rates, constants, s), section.sizes
-    _, rate, slope = rates(y)
-    shift = jax.jvp(lambda y: rates(y)[2], (y,), (_probe(sizes, y),))[1]
-    by_s, by_y = jax.jacfwd(lambda s, y: section.rates(constants, s, y)[0], (0, 1))(s, y)
-    lengths = _norms(sizes, slope) + _norms(sizes, shift)
-    terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * lengths)
-    return jnp.abs(rate) / (jnp.finfo(y.dtype).eps * terms)
 
 
 def chebyshev_step(

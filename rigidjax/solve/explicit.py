@@ -20,12 +20,7 @@ from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
 
 
 class NestedInterpolation(dfx.AbstractLocalInterpolation):
-    """Interpolate the state within a step (dense output) by a polynomial.
-
-    `coefficients` are the coefficients F0, F1, … of the polynomial, each a row of the shape of the
-    state; `runge_kutta.dense_change` gives the formula. The quaternion of the interpolated
-    state is scaled to length 1.
-    """
+    """Interpolate the state within a step by the rows F0, F1, … of `runge_kutta.dense_change`."""
 
     t0: Any
     t1: Any
@@ -33,10 +28,7 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
     coefficients: Any
 
     def evaluate(self, t0: RealLike, t1: RealLike | None = None, left: bool = True) -> PyTree:
-        """Return the interpolated state at the time `t0`, or its change from `t0` to `t1`.
-
-        The change is returned if `t1` is given.
-        """
+        """Return the state at `t0`, or its change from `t0` to `t1`."""
         if t1 is not None:
             return jax.tree.map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
         length = self.t1 - self.t0
@@ -53,11 +45,8 @@ def direction_and_length(
 ) -> tuple[Array, Array]:
     """Return the direction of a step of diffrax, 1 or −1, and its length, s.
 
-    `terms` is the `diffrax.ODETerm` of the vector field, and `t0` and `t1` are the times of diffrax
-    at which the step begins and ends. In a run backwards in time diffrax uses −t as the time, so
-    that `t1` > `t0` in both directions; only the control `contr(t0, t1)` of the term is negative. A
-    step backwards is therefore computed as a step forwards from `t0` to `t1` with slopes of the
-    opposite sign.
+    In a run backwards diffrax uses −t as the time: `t1` > `t0`, and only `contr(t0, t1)` is
+    negative. Such a step is computed forwards, with slopes of the opposite sign.
     """
     h = jnp.asarray(terms.contr(t0, t1))
     way = jnp.where(h < 0, -jnp.ones_like(h), jnp.ones_like(h))
@@ -67,15 +56,8 @@ def direction_and_length(
 def cubic_coefficients(
     change: Array, h: Array, left_slope: Array, right_slope: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the three coefficients of a cubic polynomial that interpolates within a step.
-
-    They are the coefficients F0, F1 and F2 of `runge_kutta.dense_change`, which evaluates the
-    polynomial.
-
-    - `change`: the change of the polynomial over the step, an array of a state.
-    - `h`: the length of the step, s.
-    - `left_slope`, `right_slope`: the slopes of the polynomial at the start and the end of the
-      step, with the shape of `change`.
+    """Return F0, F1 and F2 of `runge_kutta.dense_change`, from the change and the slopes at both
+    ends.
     """
     return change, h * left_slope - change, 2 * change - h * (left_slope + right_slope)
 
@@ -187,10 +169,7 @@ class DormandPrince8(AbstractExplicit):
 
 
 def require_explicit(solver: AbstractExplicit | None) -> AbstractExplicit:
-    """Return the solver, or `DormandPrince8` for `None`.
-
-    Raise `TypeError` for a solver that is no explicit method of `rigidjax.solvers`.
-    """
+    """Return the solver, or `DormandPrince8` for `None`; raise `TypeError` if not explicit."""
     solver = DormandPrince8() if solver is None else solver
     wanted = "an explicit method of rigidjax.solvers"
     return _checks.require_instance(solver, AbstractExplicit, "solver", requirement=wanted)

@@ -149,10 +149,7 @@ def lyapunov_exponents(
 
 
 def _product(a: Array, b: Array) -> Array:
-    """Return the product `a @ b` of small matrices, in a form that XLA fuses with other code.
-
-    - `a`, `b`: two matrices, (n, m) and (m, k), of any sizes n, m and k. The result is (n, k).
-    """
+    """Return the product `a @ b` of small matrices, in a form that XLA fuses with other code."""
     return jnp.sum(a[:, :, None] * b[None], 1)
 
 
@@ -166,18 +163,7 @@ def _exponents(
     rtol: Any,
     atol: Any,
 ) -> Exponents:
-    """Return the Lyapunov exponents along a motion, without a check of the arguments.
-
-    The exponents are the mean rates, 1/s, at which small changes of the state grow.
-
-    - `options`: a tuple of the solver and of four integers: the number of exponents, the number of
-      intervals into which the run is divided, the number of intervals at the beginning whose growth
-      is left out of the means, and the largest number of steps in one interval.
-    - `field`: a vector field `f(t, y, args)` that returns dy/dt.
-    - `state0`: the state at `t0`.
-    - `t0`, `length`: the time at which the run begins, and its length, s.
-    - `rtol`, `atol`: the relative and the absolute tolerance of each step.
-    """
+    """Return the Lyapunov exponents along a motion; `options` are static."""
     # The options are no arrays: `filter_jit` takes them as static, and compiles again if one of
     # them changes.
     solver, many, intervals, transient, max_steps = options

@@ -36,20 +36,10 @@ def change_and_turn(
 ) -> tuple[Triple, QuaternionEntries]:  # fmt: skip
     """Return the change of the momentum (or body rate) `p` in a step, and the turn of the body.
 
-    The turn is a quaternion, scalar first, from which the identity (1, 0, 0, 0) is subtracted.
-
-    **Arguments:**
-
-    - `slope(t, p)`: the derivative dp/dt.
-    - `rate(p)`: the body rate Ω, rad/s, that belongs to `p`.
-    - `t`, `end`, `h`: the times at which the step begins and ends, s, and the length of the step,
-      s.
-    - `p`: the momentum, or the body rate, at the time `t`.
-
-    The rotation vector of the step is `∫Ω dt + h²/12 Ω(t) × Ω(t+h)`. The integral is computed by
-    Simpson's rule, from Ω at the start, the middle and the end of the step. The value of p at the
-    middle is that of the cubic polynomial with the right p and dp/dt at both ends. Source: Magnus
-    1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas, Nørsett and Zanna 2000,
+    The turn is a quaternion less the identity. `rate(p)` is Ω, rad/s. The rotation vector of the
+    step is `∫Ω dt + h²/12 Ω(t) × Ω(t+h)`, by Simpson's rule; p in the middle is that of the cubic
+    polynomial with the right p and dp/dt at both ends. Source: Magnus 1954,
+    doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas, Nørsett and Zanna 2000,
     doi:10.1017/S0962492900002154, section 5.
     """
     change, first = change_and_slope(KUTTA4, slope, t, h, p, end)
@@ -153,12 +143,7 @@ class Magnus4(dfx.AbstractSolver):
 def attitude_equations(
     solver_name: str, field: Any, y0: PyTree, advised_solver: str
 ) -> AttitudeEquations:
-    """Return the vector field `field`, after a check that the solver `solver_name` can solve it.
-
-    The solver needs the field of an attitude and its body rate: raise `TypeError` unless `field` is
-    an `AttitudeEquations` and the state `y0` is an `Attitude`. The message advises the user to take
-    the solver `advised_solver` instead.
-    """
+    """Return `field`; raise `TypeError` unless field and state are those of an attitude."""
     if isinstance(field, AttitudeEquations) and isinstance(y0, Attitude):
         return field
     raise TypeError(
@@ -170,8 +155,7 @@ def attitude_equations(
 def refuse_attitude(torque: Any) -> None:
     """Raise `TypeError` for a torque that may depend on the attitude of the body.
 
-    A torque states by `feels = HasSpin` that it does not depend on the attitude; without this
-    statement it is refused. `None` stands for no torque, and is accepted.
+    A torque states by `feels = HasSpin` that it does not.
     """
     if may_read_attitude(torque):
         raise TypeError(

@@ -12,7 +12,7 @@ backward loop saves time.
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,22 +35,28 @@ _LONG, _MOST = 2800, 8
 def steps_per_piece(count: int) -> int:
     """Return how many steps are in each piece of a run of `count` steps: about √count.
 
-    If `count` has divisors between √count and 2√count, the smallest of them is returned. The pieces
-    then contain all steps, so that no loop for remaining steps has to be compiled.
+    The smallest divisor of `count` between √count and 2√count is taken, if there is one: no loop
+    for remaining steps has then to be compiled.
     """
     root = math.isqrt(count - 1) + 1
     near = [d for d in range(root, min(2 * root, count) + 1) if count % d == 0]
     return near[0] if near else root
 
 
+class _Division(NamedTuple):
+    """Hold how steps are divided into pieces of equally many steps."""
+
+    firsts: Array  # the number of the first step of each piece
+    length: int  # the number of steps in a piece
+    left: int  # the number of steps after the last piece, too few for another one
+
+
 @dataclasses.dataclass(frozen=True)
 class _Pieces:
-    """Take many equal steps in forward direction, and run them in reverse mode.
+    """Take many equal steps, and run them in reverse mode, in pieces of about √count steps.
 
-    The steps are divided into pieces of about √N steps, where N is the number of all steps. Only
-    the states at the starts of the pieces are stored; reverse mode computes the states within a
-    piece once more. A state is a list of arrays, and so are the constants, which are the arrays
-    that the function of a step holds.
+    Only the states at the starts of the pieces are stored; reverse mode computes those within a
+    piece once more. States and constants are lists of arrays.
     """
 
     # call(constants, y, i) → the state after step number i, which begins with the state y.
@@ -61,12 +67,7 @@ class _Pieces:
     def take_steps(
         self, constants: Arrays, y: Arrays, first: Array, number: int, keep_starts: bool = False
     ) -> tuple[Arrays, Arrays | None]:
-        """Take `number` steps from the state `y`; the first of them is step number `first`.
-
-        `constants` are the arrays that the function of a step holds. **Returns** two things. The
-        first is the state after the steps. If `keep_starts` is true, the second is the states at
-        the starts of these steps, along a new first axis; else it is `None`.
-        """
+        """Take `number` steps from `y`; return the end and, if wanted, the starts of all."""
 
         def one(y: Arrays, i: Array) -> tuple[Arrays, Any]:
             return self.call(constants, y, i), y if keep_starts else None
@@ -76,12 +77,9 @@ class _Pieces:
     def run(
         self, constants: Arrays, first: Array, y: Arrays
     ) -> tuple[Arrays, tuple[Arrays, Arrays]]:
-        """Take all steps from the state `y`, beginning with step number `first`.
+        """Take all steps; return the end, and the states that `pull_back` needs.
 
-        `constants` are the arrays that the function of a step holds. **Returns** two things: the
-        state at the end, and a pair that `pull_back` needs. The first item of the pair is
-        the states at the starts of the pieces, along a new first axis. The second item is the state
-        after the last piece, from which the remaining steps are taken.
+        These are the starts of the pieces, and the state after the last piece.
         """
         firsts, length, left = self.divide(first)
 
@@ -102,21 +100,7 @@ class _Pieces:
         starts: tuple[Arrays, Arrays],
         cotangent_of_end: Arrays,
     ) -> tuple[Arrays, Arrays]:
-        """Run all steps in reverse mode: return the cotangents of constants and state at the start.
-
-        **Arguments:**
-
-        - `constants`: the arrays that the function of a step holds.
-        - `has_derivative`: for each constant, whether it has a derivative.
-        - `first`: the number of the first step.
-        - `starts`: the pair of states that the method `run` returned as its second
-          result. The first item is the states at the starts of the pieces, along a new first axis;
-          the second item is the state after the last piece.
-        - `cotangent_of_end`: the cotangent of the state after all steps.
-
-        **Returns** two lists: the cotangents of the constants with a derivative, and the cotangent
-        of the state at the start.
-        """
+        """Return the cotangents of the constants with a derivative, and of the start."""
         firsts, length, left = self.divide(first)
         chosen = [c for c, m in zip(constants, has_derivative, strict=True) if m]
 
@@ -145,31 +129,18 @@ class _Pieces:
 
         return lax.scan(whole, sums, (rows, firsts), reverse=True)[0]
 
-    def divide(self, first: Array) -> tuple[Array, int, int]:
-        """Return how all steps are divided into pieces.
-
-        A piece is a group of steps that follow one another; all pieces have equally many steps. The
-        first of all steps has the number `first`. **Returns** three things: an array with the
-        number of the first step of each piece; how many steps are in a piece; and how many steps
-        remain after the last piece, because they are too few for another piece.
-        """
+    def divide(self, first: Array) -> _Division:
+        """Return how all steps are divided into pieces, if the first has the number `first`."""
         length = steps_per_piece(self.count)
         many, left = divmod(self.count, length)
-        return first + length * jnp.arange(many, dtype=jnp.int32), length, left
+        return _Division(first + length * jnp.arange(many, dtype=jnp.int32), length, left)
 
 
 def march_on_gpu(step: Callable[[Any, Array], Any], first: Array, count: int, y: Any) -> Any:
-    """Take many equal steps on a GPU, several in one kernel, and return the state after them.
+    """Take many equal steps `step(state, i)`, several in one kernel; return the state after them.
 
-    - `step`: a function `step(state, i)` that takes step number i from `state`, and returns the
-      state after the step.
-    - `first`: the number of the first step.
-    - `count`: how many steps are taken.
-    - `y`: the state before the first step.
-
-    In reverse mode the run is divided into about √count pieces. The states at the starts of all
-    pieces are stored; the states within a piece are stored for one piece at a time. Second
-    derivatives are forward over reverse.
+    In reverse mode the run is divided into pieces (see `_Pieces`). Second derivatives are forward
+    over reverse.
     """
     start, tree = jax.tree.flatten(y)
     one = trace_program(lambda y, i: jax.tree.leaves(step(tree.unflatten(y), i)), start, first)
@@ -220,10 +191,6 @@ def march_on_gpu(step: Callable[[Any, Array], Any], first: Array, count: int, y:
 def _replaced(
     arrays: Sequence[Any], selected: Sequence[bool], replacements: Sequence[Any]
 ) -> list[Any]:
-    """Return a copy of the list `arrays` in which some of its arrays are replaced.
-
-    `selected` has a truth value for each array of the list `arrays`: whether it is replaced.
-    `replacements` are the new arrays, in order, one for each true value.
-    """
+    """Return the list `arrays` with its `selected` items replaced, in order."""
     rest = iter(replacements)
     return [next(rest) if new else a for a, new in zip(arrays, selected, strict=True)]

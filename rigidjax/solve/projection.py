@@ -14,11 +14,7 @@ from rigidjax.solve.adaptive_loop import NONFINITE, finite
 
 
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
-    """Interpolate the state within a step by `inner`, and scale the quaternion to length 1.
-
-    The quaternion is that of the interpolated state. `inner` is the interpolation of the solver
-    that took the step.
-    """
+    """Interpolate the state within a step by `inner`, and scale the quaternion to length 1."""
 
     t0: Any
     t1: Any
@@ -32,12 +28,7 @@ class GroupInterpolation(dfx.AbstractLocalInterpolation):
 
 
 class _GroupInterpolationOf(eqx.Module):
-    """Make the object that interpolates within a step, and scales the quaternion to length 1.
-
-    Diffrax calls it with the times `t0` and `t1` at which the step begins and ends, s, and with the
-    arrays that the solver has stored for this step. From these arrays the state at any time within
-    the step (dense output) is computed.
-    """
+    """Make a `GroupInterpolation` from what the solver has stored for a step."""
 
     inner_cls: Any = eqx.field(static=True)  # the class of the solver's own interpolation
 
@@ -45,13 +36,9 @@ class _GroupInterpolationOf(eqx.Module):
         return GroupInterpolation(t0, t1, self.inner_cls(t0=t0, t1=t1, **dense_info))
 
 
-def _of_solver(member: str, attribute: str) -> Any:
-    """Define a property that reads an attribute of a member of an object.
-
-    `member` is the name of the member, and `attribute` that of its attribute. With the names
-    "solver" and "order", for example, the property of an object x has the value `x.solver.order`.
-    """
-    return property(lambda self: getattr(getattr(self, member), attribute))
+def _of_solver(attribute: str) -> Any:
+    """Define a property that reads an attribute of the wrapped solver."""
+    return property(lambda self: getattr(self.solver, attribute))
 
 
 class Projected(dfx.AbstractWrappedSolver):
@@ -74,14 +61,14 @@ class Projected(dfx.AbstractWrappedSolver):
     def __check_init__(self) -> None:
         _checks.require_instance(self.solver, dfx.AbstractSolver, "solver")
 
-    term_structure = _of_solver("solver", "term_structure")
-    term_compatible_contr_kwargs = _of_solver("solver", "term_compatible_contr_kwargs")
+    term_structure = _of_solver("term_structure")
+    term_compatible_contr_kwargs = _of_solver("term_compatible_contr_kwargs")
     # Adjoints of diffrax set `scan_kind` on a Runge–Kutta method, and step controllers set the
     # members of the root finder on an implicit method. They look for these members on the
     # `Projected`, which therefore passes on those of the solver inside it.
-    scan_kind = _of_solver("solver", "scan_kind")
-    root_finder = _of_solver("solver", "root_finder")
-    root_find_max_steps = _of_solver("solver", "root_find_max_steps")
+    scan_kind = _of_solver("scan_kind")
+    root_finder = _of_solver("root_finder")
+    root_find_max_steps = _of_solver("root_find_max_steps")
 
     @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -34,10 +34,7 @@ class Step(NamedTuple):
 
 
 class Stages(NamedTuple):
-    """Hold the s stages of a step, and the state at the end of the step.
-
-    A stage is a time and a state at which the step evaluates the field, and the value there.
-    """
+    """Hold the s stages of a step, and the state at its end."""
 
     times: Array  # (s, *bodies) the times of the stages, in seconds
     places: Array  # (n, s, *bodies) the states at which the field is evaluated
@@ -49,8 +46,7 @@ class Stages(NamedTuple):
 class Weights(NamedTuple):
     """Hold the numbers of a Runge–Kutta method as arrays over its s stages.
 
-    The stages of a step come first, then the stages that only dense output needs. Dense output is
-    the state at any time within the step.
+    The stages of a step come first, then those that only dense output needs.
     """
 
     a: Array  # (s, s) the weights of the slopes in the state of each stage
@@ -63,7 +59,7 @@ class Weights(NamedTuple):
 
 
 def weights_of(tableau: Tableau, dtype: Any) -> Weights:
-    """Return the numbers of a Runge–Kutta method, its `tableau`, as arrays of the `dtype`."""
+    """Return the numbers of a Runge–Kutta method as arrays of the `dtype`."""
     tableau = round_weights(tableau, dtype)
     c = np.array([0.0, *tableau.c, 1.0, *tableau.extra_c])
     rows = [{}, *tableau.a, tableau.b, *tableau.extra_a, *tableau.dense, *tableau.errors]
@@ -81,12 +77,7 @@ def weights_of(tableau: Tableau, dtype: Any) -> Weights:
 
 
 def _weighted_sum(weights: Array, slopes: Array) -> Array:
-    """Return the weighted sum Σ w_i k_i of the slopes k_i at all stages i of a step, (n, …).
-
-    `slopes` (n, s, …) are the slopes at s stages. A slope is dy/dt, the n values of the field at a
-    stage. `weights` are the w_i. If there are fewer slopes than weights, the last weights are left
-    out.
-    """
+    """Return Σ wᵢ kᵢ (n, …) of the slopes (n, s, …); weights beyond the slopes are left out."""
     weights = weights[: slopes.shape[1]]
     return jnp.sum(weights.reshape(1, -1, *[1] * (slopes.ndim - 2)) * slopes, 1)
 
@@ -94,19 +85,10 @@ def _weighted_sum(weights: Array, slopes: Array) -> Array:
 def stages(
     tableau: Tableau, field: Field, constants: Arrays, step: Step, dense: Any = False
 ) -> Stages:
-    """Compute all stages of a step of a Runge–Kutta method, and the state at its end.
+    """Compute all stages of a step; the quaternion at its end is not scaled to length 1.
 
-    **Arguments:**
-
-    - `tableau`: the numbers of the method.
-    - `field`: the vector field `(constants, t, y)`, and `constants` the list of its arrays.
-    - `step`: the times, the length and the state (n, *bodies) at the start of the step.
-    - `dense`: whether the stages for dense output (the state within the step) are computed, too. If
-      `dense` is a traced truth value, the arrays have places for these stages in any case. If its
-      value is false, these places hold the time and the state at the start of the step, and 0 as
-      the slope.
-
-    The quaternion of the state at the end is not scaled to length 1.
+    If `dense` is traced, the arrays have places for the stages of dense output in any case; if it
+    is false, these hold the time and the state at the start, and the slope 0.
     """
     w = weights_of(tableau, step.y.dtype)
     count = w.plain if dense is False else w.c.size
@@ -134,16 +116,8 @@ def stages(
 def _stage(
     w: Weights, field: Field, constants: Arrays, step: Step, i: Array, slopes: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the time, the state (n, *bodies) and the slope (n, *bodies) of one stage of a step.
-
-    - `w`: the weights and the times of the stages of the method.
-    - `field`: the vector field `field(constants, t, y)`, which returns dy/dt, the slope.
-    - `constants`: the arrays on which the field depends.
-    - `step`: holds the times, the length and the state at the start of the step.
-    - `i`: the index of the stage.
-    - `slopes`: (n, s, *bodies) the slopes of all s stages, of which those before `i` are used.
-
-    A state has n numbers; `*bodies` is one last axis for the bodies of a batch, or no axis.
+    """Return the time, the state and the slope of stage `i`, from the slopes (n, s, *bodies)
+    before.
     """
     # The dtype of the time may differ from that of the state.
     y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _weighted_sum(w.a[i], slopes)
@@ -152,16 +126,9 @@ def _stage(
 
 
 def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
-    """Return the coefficients of dense output within a step of one body, as rows (r, n).
+    """Return the coefficients (r, n) of dense output in a step of one body (see `dense_change`).
 
-    Dense output is the state, n numbers, at any time within the step. `dense_change` computes
-    its change since the start of the step from the r rows F0, F1, …. The rows already contain the
-    length of the step as a factor.
-
-    - `tableau`: the numbers of the method.
-    - `field`: the vector field `(constants, t, y)`, which is called with no constants.
-    - `step`: the times, the length and the state at the start of the step.
-    - `slopes`: (n, s) the slopes at the stages of the step.
+    The length of the step is in them as a factor.
     """
     w = weights_of(tableau, slopes.dtype)
     slopes = jnp.pad(slopes, ((0, 0), (0, w.c.size - w.plain)))
@@ -175,12 +142,10 @@ def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Arr
 
 
 def dense_change(theta: Array, rows: Array) -> Array:
-    """Return the change of the state since the start of a step, at a time within the step.
+    """Return the change of the state since the start of a step, at its fraction θ.
 
-    The change is θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))). Here `theta` is θ, the fraction of
-    the step that has passed, from 0 to 1, and `rows` are F0, F1, …. The state at the start of the
-    step plus this change is the state at the time within the step. Source: Hairer, Nørsett and
-    Wanner (1993), II.6.
+    It is θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))), where `rows` are F0, F1, …. Source: Hairer,
+    Nørsett and Wanner (1993), II.6.
     """
     total = jnp.zeros((), rows.dtype)
     for i in reversed(range(rows.shape[0])):
@@ -191,14 +156,9 @@ def dense_change(theta: Array, rows: Array) -> Array:
 def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) -> Array:
     """Return an estimate of the error of each number of the state after a step, (n, *bodies).
 
-    - `tableau`: the numbers of the method.
-    - `sizes`: how many numbers each array of the state has.
-    - `h`: (*bodies) the length of the step, in seconds.
-    - `slopes`: (n, s, *bodies) the slopes at the s stages of the step.
-
-    If the tableau has two estimates, e5 of order 5 and e3 of order 3, they are combined to
-    e5 |e5|/√(|e5|² + 0.01 |e3|²), which is proportional to h⁸ for short steps (Hairer, Nørsett and
-    Wanner 1993, II.10). The norms |e5| and |e3| are taken over each array of the state separately.
+    Estimates e5 of order 5 and e3 of order 3 are combined to e5 |e5|/√(|e5|² + 0.01 |e3|²), which
+    is proportional to h⁸ for short steps (Hairer, Nørsett and Wanner 1993, II.10). The norms are
+    taken over each array of the state, of `sizes`.
     """
     dtype, ones = slopes.dtype, [1] * (slopes.ndim - 2)
     # All sums over stages are computed in one operation, because for one body each separate sum
@@ -221,21 +181,7 @@ def pull_back(
     tableau: Tableau, field: Field, constants: Arrays, step: Step, step_stages: Stages,
     cotangent: Array, cotangents_of_slopes: Array | None = None,
 ) -> tuple[Arrays, Array, Array, Array]:  # fmt: skip
-    """Compute a step of a Runge–Kutta method in reverse mode: the cotangents of its inputs.
-
-    **Arguments:**
-
-    - `tableau`: the numbers of the method.
-    - `field`: the vector field `(constants, t, y)`, and `constants` the list of its arrays.
-    - `step`: the times, the length and the state (n, *bodies) at the start of the step.
-    - `step_stages`: the s stages of the step.
-    - `cotangent`: (n, *bodies) the cotangent of the state at the end of the step.
-    - `cotangents_of_slopes`: (n, s, *bodies) the cotangents of all slopes, or `None` if these are
-      0.
-
-    **Returns** four cotangents: those of the constants, a list; of the time at the start of the
-    step; of the length of the step; and of the state at the start.
-    """
+    """Return the cotangents of a step's inputs from those of its end and of its slopes."""
     w, count = weights_of(tableau, step.y.dtype), step_stages.slopes.shape[1]
     h, put = step.h.astype(step.y.dtype), lax.dynamic_update_index_in_dim
 

@@ -47,12 +47,7 @@ from rigidjax.solve.tableaus import parse_numbers
 
 
 class Composition(NamedTuple):
-    """Hold a splitting method B(b1) A(a1) B(b2) … A(a1) B(b1) by its order and its weights.
-
-    A(a) is the exact motion of the free body during the time a h, where h is the length of a step.
-    B(b) is a kick, which adds b h times the torque to the momentum. `flows` are the weights a1, a2,
-    …, and `kicks` the weights b1, b2, ….
-    """
+    """Hold a splitting method by its order and its weights, `flows` a1, a2, … and `kicks` b1, …."""
 
     order: int
     flows: tuple[float, ...]
@@ -60,13 +55,9 @@ class Composition(NamedTuple):
 
 
 def _symmetric(order: int, flows: tuple[float, ...], kicks: tuple[float, ...]) -> Composition:
-    """Return a symmetric splitting method of the given `order`, from the first of its weights.
+    """Return a symmetric splitting from the first of its weights.
 
-    A step of the method alternates between exact free motions and kicks. A free motion lasts for a
-    weight times the length of the step. A kick adds, at a fixed time and attitude, a weight times
-    the torque times the length of the step to the momentum. `flows` are the first weights of the
-    free motions, and `kicks` those of the kicks. The middle weights follow because the weights of
-    each kind sum up to 1; the last weights follow because the step is symmetric.
+    The middle weights follow because the weights of each kind sum up to 1.
     """
     if len(flows) < len(kicks):
         middle = 1 - 2 * sum(kicks)
@@ -101,8 +92,7 @@ SRKN11 = _symmetric(
 class PrincipalFrame(NamedTuple):
     """Hold the principal axes of a body, and the inertia and its inverse along these axes.
 
-    The off-diagonal entries of both matrices are zero. Derivatives hold the axes fixed: if the
-    inertia changes, these entries have tangents that are not zero.
+    The off-diagonal entries are zero, but have tangents: derivatives hold the axes fixed.
     """
 
     moments: SymmetricEntries  # the inertia, kg m²
@@ -111,10 +101,7 @@ class PrincipalFrame(NamedTuple):
 
 
 def principal_frame(tensor: Array) -> PrincipalFrame:
-    """Return the principal axes of a body, and the inertia and its inverse along these axes.
-
-    `tensor` (3, 3) is the inertia in body axes, kg m².
-    """
+    """Return the principal axes of an inertia (3, 3), kg m²."""
     six, axes = principal_tensor_and_axes(tensor)
     # The tensor is divided by its trace before it is inverted, because the determinant of an
     # inertia of 1e37 kg m² would overflow.
@@ -126,12 +113,9 @@ def principal_frame(tensor: Array) -> PrincipalFrame:
 
 @jax.custom_jvp
 def rate_along(inverse: SymmetricEntries, momentum: Triple) -> Triple:
-    """Return the body rate Ω = I⁻¹Π along the principal axes, three numbers, rad/s.
+    """Return the body rate Ω = I⁻¹Π along the principal axes.
 
-    `momentum` is Π along these axes, three numbers, N m s. `inverse` has the six entries (11, 22,
-    33, 12, 13, 23) of I⁻¹, the inverse of the inertia along these axes. The off-diagonal entries
-    are zero, and the value does not use them; but they may have tangents, which the derivative
-    uses.
+    The value does not use the off-diagonal entries of I⁻¹, which are zero; the derivative does.
     """
     return inverse[0] * momentum[0], inverse[1] * momentum[1], inverse[2] * momentum[2]
 
@@ -143,10 +127,7 @@ def rate_along_jvp(primals, tangents):
 
 
 class AbstractSplitting(dfx.AbstractSolver):
-    """Solve the rotation of a body by a sequence of kicks and exact free motions.
-
-    Each subclass sets the `composition`, which holds the weights of the sequence.
-    """
+    """Solve the rotation of a body by a sequence of kicks and exact free motions."""
 
     term_structure: ClassVar = dfx.ODETerm
     interpolation_cls: ClassVar = NestedInterpolation
@@ -248,12 +229,9 @@ class Splitting6(AbstractSplitting):
 
 
 def frame_of_field(field: Any, y0: Any) -> PrincipalFrame:
-    """Return the principal axes of the body to which a vector field belongs.
+    """Return the principal axes of the body of a vector field, in the dtype of `y0`.
 
-    The result also holds the inertia and its inverse along these axes. `field` is the vector field,
-    an `AttitudeEquations`, and `y0` is the `Attitude` at the start; the result has the dtype of
-    `y0`. Raise `TypeError` for any other field or state, and for a torque that may read the body
-    rate.
+    Raise `TypeError` unless it is an `AttitudeEquations` of a torque that reads no body rate.
     """
     # A torque that reads the body rate is refused, because a kick would then be no exact flow, and
     # the order of the method would fall to 1.
@@ -268,20 +246,12 @@ def frame_of_field(field: Any, y0: Any) -> PrincipalFrame:
 
 
 def momentum_along(frame: PrincipalFrame, omega: Array) -> Triple:
-    """Return the momentum Π = IΩ along the principal axes, three numbers, N m s.
-
-    `frame` holds the principal axes and the inertia I along them; `omega` (3,) is the body rate Ω
-    in body axes, rad/s.
-    """
+    """Return the momentum Π = IΩ along the principal axes, N m s, from Ω in body axes, rad/s."""
     return matvec(frame.moments, components_along(frame.axes, omega))
 
 
 def rate_in_body(frame: PrincipalFrame, momentum: Triple) -> Array:
-    """Return the body rate Ω = I⁻¹Π in body axes (3,), rad/s.
-
-    `frame` holds the principal axes and the inverse inertia I⁻¹ along them; `momentum` is Π along
-    the principal axes, three numbers, N m s.
-    """
+    """Return the body rate Ω = I⁻¹Π in body axes (3,), rad/s."""
     return jnp.stack(combine_columns(frame.axes, rate_along(frame.weights, momentum)))
 
 
@@ -293,19 +263,9 @@ def splitting_change(
     h: Any,
     state: Any,
 ) -> tuple[Array, Triple]:
-    """Take one step of a splitting method: exact free motions and kicks by the torque in turn.
+    """Return the change of q, not scaled to length 1, and of Π in one step from `state` (q, Π).
 
-    **Arguments:**
-
-    - `composition`: the weights of the method.
-    - `field`: the equations of the attitude, which hold the torque and the inertia.
-    - `frame`: the principal axes of the body, and the inertia along them.
-    - `t`, `h`: the time at the start of the step, s, and the length of the step, s.
-    - `state`: the pair of the quaternion q (4,) and the momentum Π at the start; Π is three numbers
-      along the principal axes, N m s.
-
-    **Returns** the change of q and the change of Π in the step. The changed q is not scaled to
-    length 1.
+    Π has components along the principal axes.
     """
     dtype = state[0].dtype
 
@@ -352,21 +312,9 @@ def splitting_change(
 def _quintic(
     terms: PyTree[dfx.AbstractTerm], t0: Any, t1: Any, args: PyTree, y0: PyTree, y1: PyTree
 ) -> Any:
-    """Return the coefficients of a polynomial of degree 5 that interpolates within a step.
+    """Return the five coefficients (5, …) of a polynomial for dense output (see `dense_change`).
 
-    At both ends of the step the polynomial has the state of the motion and its first and second
-    time derivatives, so that the dense output is of order 6.
-
-    **Arguments:**
-
-    - `terms`, `args`: the `diffrax.ODETerm` of the vector field, and the argument `args` with which
-      diffrax calls the field.
-    - `t0`, `t1`: the times at which the step begins and ends, s; diffrax uses −t for the time t in
-      a run backwards.
-    - `y0`, `y1`: the states at the start and at the end of the step.
-
-    **Returns** a tree like the state, whose arrays (5, …) hold the five coefficients. The function
-    `runge_kutta.dense_change` evaluates the polynomial from these coefficients.
+    It has the state and its first two time derivatives at both ends, and is of order 6.
     """
     way, length = direction_and_length(terms, t0, t1)
     h = way * length

@@ -42,12 +42,11 @@ _MANY = 10_000
 
 
 class Stepper(NamedTuple):
-    """Hold the functions that take fixed steps of one body.
+    """Hold the functions that take fixed steps of one body, from `t` to `end`, of length `h`, s.
 
-    They work on numbers y, which stand for the state of the body. The numbers may differ from the
-    state: for example, they may hold the momentum in the place of the body rate. A step goes from
-    the time `t` to the time `end`, s, and has the length `h`, s. `inputs` are the values of the
-    torque's inputs during the step, or `None`.
+    They work on numbers y, which stand for the state but may differ from it: they may hold the
+    momentum in the place of the body rate. `inputs` are the values of the torque's inputs during
+    the step, or `None`.
     """
 
     start: Any  # the numbers y at the start, which stand for the state there
@@ -64,18 +63,16 @@ class Stepper(NamedTuple):
 class Carrying(NamedTuple):
     """Take the fixed steps of the stepper `of`, and carry the rounding errors of the sums along.
 
-    Each step adds a change to the numbers y. It also computes the rounding error of this sum, which
-    the next step adds to its own change. The round-off of n steps then grows as √n, not as n. The
-    rounding error is carried along with the numbers y, and has no derivative. It is exact if
-    |change| ≤ |y|. Source: Kahan 1965, doi:10.1145/363707.363723; Dekker 1971,
-    doi:10.1007/BF01397083.
+    Each step adds the rounding error of the sum before it to its own change, so that the round-off
+    of n steps grows as √n, not as n. The error has no derivative; it is exact if |change| ≤ |y|.
+    Source: Kahan 1965, doi:10.1145/363707.363723; Dekker 1971, doi:10.1007/BF01397083.
     """
 
     of: Stepper
 
     @property
     def start(self) -> tuple[Any, Any]:
-        """Return the numbers of the state at the start, and their rounding errors, which are 0."""
+        """Return the numbers at the start, and their rounding errors, which are 0."""
         return self.of.start, jax.tree.map(jnp.zeros_like, self.of.start)
 
     @property
@@ -90,10 +87,7 @@ class Carrying(NamedTuple):
         return after, lax.stop_gradient(lost)
 
     def state(self, numbers_and_errors: tuple[Any, Any]) -> Any:
-        """Return the state that its numbers stand for; their rounding errors are left out.
-
-        `numbers_and_errors` is a pair of the numbers and of their rounding errors.
-        """
+        """Return the state that the numbers stand for; their rounding errors are left out."""
         return self.of.state(numbers_and_errors[0])
 
 
@@ -101,15 +95,10 @@ AnyStepper = Stepper | Carrying
 
 
 def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) -> AnyStepper:
-    """Return the object that takes fixed steps of a vector field by a method.
+    """Return the object that takes fixed steps of a vector field `f(t, y, args)` by a method.
 
-    **Arguments:**
-
-    - `solver`: a method of `rigidjax.solvers`; `None` stands for the cheapest one.
-    - `field`: the vector field `f(t, y, args)` of one body.
-    - `y0`: the state at the start.
-    - `count`: the number of steps. If it is at least 10 000 or is traced, the result is a
-      `Carrying`, which also carries the rounding errors of the sums along; else it is a `Stepper`.
+    `None` stands for the cheapest method. At 10 000 steps and more, and if `count` is traced, the
+    result is a `Carrying`.
     """
     stepper = _stepper(solver, field, y0)._replace(delays=tuple(delays_of(field)))
     return Carrying(stepper) if not isinstance(count, int) or count >= _MANY else stepper
@@ -118,25 +107,21 @@ def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) 
 def cheapest_method(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
     """Return the method of order 4 that takes the least work for a vector field.
 
-    It is `Magnus4` for the attitude of a body whose torque does not read the attitude, else
-    `RungeKutta4`.
+    It is `Magnus4` for an attitude whose torque does not read the attitude, else `RungeKutta4`.
     """
     attitude = isinstance(field, AttitudeEquations)
     blind = attitude and not may_read_attitude(field.euler.torque)
     return Magnus4() if blind else RungeKutta4()
 
 
-def _stepper(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
-    """Return the object that takes fixed steps of a vector field by a method, as a `Stepper`.
-
-    Its field `delays` is empty: the caller fills in the delays of the torque's inputs. Raise
-    `TypeError` if the method cannot take fixed steps of this vector field.
-
-    - `solver`: a method of `rigidjax.solvers`; `None` stands for the one whose steps cost least.
-    - `field`: the vector field `f(t, y, args)`.
-    - `y0`: the state at the start.
-    """
-    turning = _inertia_and_torque(field, y0)
+def _stepper(solver: Any, field: Any, y0: Any) -> Stepper:
+    """Return a `Stepper` without delays; raise `TypeError` if the method cannot take such steps."""
+    # A body that also moves in space, or whose torque has states of its own, is not `turning`.
+    euler, turning = field.euler if isinstance(field, AttitudeEquations) else field, None
+    if isinstance(euler, EulerEquations) and isinstance(y0, Spin | Attitude):
+        dtype = y0.omega.dtype
+        inertia = jax.tree.map(lambda a: a.astype(dtype), euler.inertia)
+        turning = _Turning(inertia, _entries(euler.inverse.astype(dtype)), euler.torque)
     solver = cheapest_method(field) if solver is None else solver
     if isinstance(solver, Magnus4) and isinstance(y0, Attitude) and turning is not None:
         refuse_attitude(turning.torque)
@@ -161,39 +146,19 @@ def _stepper(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
 
 
 class _Turning(NamedTuple):
-    """Hold the inertia and the torque of a body that only turns, and does not move in space.
-
-    The inertia has the same dtype as the body rate in the state.
-    """
+    """Hold inertia and torque of a body that only turns, in the dtype of the body rate."""
 
     inertia: Inertia
     weights: SymmetricEntries  # the six different entries of the inverse of the inertia, 1/(kg m²)
     torque: Any  # the torque law, or `None` for a free body
 
 
-def _inertia_and_torque(field: Any, y0: Any) -> _Turning | None:
-    """Return the inertia and the torque of a body that only turns, or `None` for other motions.
-
-    `field` is the vector field of the body, dy/dt as a function of time and state, and `y0` is the
-    state at the start. The result is `None`, for example, if the body also moves in space, or if
-    the torque has states of its own.
-    """
-    euler = field.euler if isinstance(field, AttitudeEquations) else field
-    if not isinstance(euler, EulerEquations) or not isinstance(y0, Spin | Attitude):
-        return None
-    dtype = y0.omega.dtype
-    inertia = jax.tree.map(lambda a: a.astype(dtype), euler.inertia)
-    return _Turning(inertia, _entries(euler.inverse.astype(dtype)), euler.torque)
-
-
 def _free(body: Inertia, state0: Attitude) -> Stepper:
-    """Return the object that takes fixed steps of a free body by Magnus' method of order 4.
+    """Return the steps of a free body by Magnus' method of order 4.
 
-    `body` is the inertia, and `state0` the state at the start. The object carries seven numbers
-    from step to step: the quaternion of the turn since the start, and the angular momentum Π. The
-    vector of the quaternion and Π have components along the principal axes of the body. Derivatives
-    hold these axes fixed: when the inertia changes, the off-diagonal entries of the inertia along
-    the axes, which are zero, have tangents that are not zero.
+    The numbers are the quaternion of the turn since the start, and the momentum Π, both along the
+    principal axes. Derivatives hold these axes fixed: the off-diagonal entries of the inertia along
+    them are zero, but have tangents.
     """
     frame = splitting.principal_frame(body.tensor)
     weights, axes = frame.weights, frame.axes
@@ -219,12 +184,9 @@ def _free(body: Inertia, state0: Attitude) -> Stepper:
 
 @jax.custom_jvp
 def _free_slope(inverse: SymmetricEntries, inverse_differences: Triple, momentum: Triple) -> Triple:
-    """Return the time derivative of the momentum of a free body, dΠ/dt = Π × Ω, N m.
+    """Return the time derivative of the momentum of a free body along its principal axes, Π × Ω.
 
-    `momentum` is the angular momentum Π, three numbers along the principal axes, N m s; Ω is the
-    body rate. `inverse` has the six entries (11, 22, 33, 12, 13, 23) of the inverse of the inertia
-    along these axes, 1/(kg m²). `inverse_differences` (c − b, a − c, b − a) are the
-    differences of its first three entries a, b and c.
+    `inverse_differences` (c − b, a − c, b − a) are those of the diagonal a, b, c of I⁻¹.
     """
     d, p = inverse_differences, momentum
     return d[0] * (p[1] * p[2]), d[1] * (p[2] * p[0]), d[2] * (p[0] * p[1])
@@ -238,21 +200,16 @@ def _free_slope_jvp(primals, tangents):
 
 
 def _entries(a: Array) -> SymmetricEntries:
-    """Return the six different entries of a symmetric matrix, in the order 11, 22, 33, 12, 13, 23.
-
-    `a` (3, 3) is the matrix. Each of the last three is the mean of two equal entries.
-    """
+    """Return the entries 11, 22, 33, 12, 13, 23 of a symmetric matrix (3, 3)."""
     # Both halves of the matrix are used, so that the derivative is symmetric as the matrix is.
     off = [0.5 * (a[i, j] + a[j, i]) for i, j in ((0, 1), (0, 2), (1, 2))]
     return a[0, 0], a[1, 1], a[2, 2], *off
 
 
 def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
-    """Return the object that takes fixed steps by Magnus' method, under a torque.
+    """Return steps by Magnus' method under a torque that reads the time and the body rate.
 
-    The torque may read the time and the body rate, not the attitude. `turning` holds the inertia
-    and the torque of the body, and `state0` is the state at the start. From step to step the object
-    carries the quaternion of the attitude, and the angular momentum in body axes.
+    The numbers are the quaternion and the angular momentum in body axes.
     """
     body, weights, torque = turning
     start, rate = split_scalars(state0), partial(matvec, weights)
@@ -279,12 +236,9 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
 def _explicit(
     solver: AbstractExplicit | StepWithLoopedStages, turning: _Turning, state0: Any
 ) -> Stepper:
-    """Return the object that takes fixed steps of an explicit method for a body that only turns.
+    """Return steps of an explicit method for a body that only turns, a `Spin` or an `Attitude`.
 
-    `solver` is the Runge–Kutta method, `turning` holds the inertia and the torque of the body, and
-    `state0` is the state at the start, a `Spin` or an `Attitude`. The numbers that the object
-    carries from step to step are the quaternion, if the state has one, and the angular momentum in
-    body axes.
+    The numbers are the quaternion, if any, and the angular momentum in body axes.
     """
     body, weights, torque = turning
     start = split_scalars(state0)
@@ -320,71 +274,43 @@ def _of_slope(
     state: Callable[[Atoms], Any],
     example_state: Any,
 ) -> Stepper:
-    """Return the object that takes fixed steps of an explicit method, for a slope dy/dt.
+    """Return steps of an explicit method for a slope `slope_for_inputs(inputs)(t, y)`.
 
-    **Arguments:**
-
-    - `solver`: the Runge–Kutta method.
-    - `slope_for_inputs`: a function such that `slope_for_inputs(inputs)(t, y)` is dy/dt. Here
-      `inputs` are the values of the torque's inputs during the step.
-    - `start`: the numbers y at the start, a tuple of scalars that stand for the state.
-    - `state`: a function that returns the state for the numbers y.
-    - `example_state`: a state whose arrays have as many numbers as y, in the same order. It shows
-      which of the numbers y are a quaternion, which is scaled to length 1.
+    `example_state` has as many numbers as y, in the same order, and shows which are a quaternion.
     """
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
-        return _change_to_unit_length(
-            y, change_in_step(solver, slope_for_inputs(inputs), t, h, y, end), example_state
+        change = change_in_step(solver, slope_for_inputs(inputs), t, h, y, end)
+        if not isinstance(motion_of(example_state), HasAttitude):
+            return change
+        # Without the barrier XLA would compute the whole change again for each part of the
+        # quaternion.
+        change = barrier(change)
+        after, moved = (
+            components(motion_of(join_scalars(part, example_state)).q)
+            for part in (jax.tree.map(jnp.add, y, change), change)
+        )
+        # q is the quaternion after the step. The difference |q|² − 1, the excess, has few correct
+        # digits. Its rounding error is harmless, because it only changes the length of q and does
+        # not turn the body.
+        excess = jnp.minimum(squared_quaternion_length(after) - 1.0, 1.0)
+        # 1 − 1/√(1 + e), with the excess e, is computed by a series, because on a GPU a root and a
+        # quotient take a third of the time of a step. The error e⁴/4 of the series is below
+        # round-off for steps that turn the body by less than half a radian; after a longer step the
+        # following steps bring the length back to 1.
+        less = barrier(excess * (0.5 - excess * (0.375 - 0.3125 * excess)))
+        q = jnp.stack([d - less * a for d, a in zip(moved, after, strict=True)])
+        return split_scalars(
+            eqx.tree_at(lambda s: motion_of(s).q, join_scalars(change, example_state), q)
         )
 
     return Stepper(start, change, state)
 
 
-def _change_to_unit_length(y: Atoms, change: Atoms, example_state: Any) -> Atoms:
-    """Return the change of a state in a step, after which the quaternion has the length 1.
-
-    - `y`: the numbers of the state before the step, a tuple of scalars.
-    - `change`: the changes of these numbers in the step. The changes of the quaternion are
-      corrected; the other changes are returned as they are.
-    - `example_state`: a state whose arrays have as many numbers as `y`, in the same order. It shows
-      which numbers are the quaternion. If it has none, nothing is corrected.
-    """
-    if not isinstance(motion_of(example_state), HasAttitude):
-        return change
-    # Without the barrier XLA would compute the whole change again for each part of the quaternion.
-    change = barrier(change)
-    after, moved = (
-        motion_of(join_scalars(part, example_state)).q
-        for part in (jax.tree.map(jnp.add, y, change), change)
-    )
-    after, moved = components(after), components(moved)
-    # q is the quaternion after the step. The difference |q|² − 1, the excess, has few correct
-    # digits. Its rounding error is harmless, because it only changes the length of q and does not
-    # turn the body.
-    excess = jnp.minimum(squared_quaternion_length(after) - 1.0, 1.0)
-    # 1 − 1/√(1 + e), with the excess e, is computed by a series, because on a GPU a root and a
-    # quotient take a third of the time of a step. The error e⁴/4 of the series is below round-off
-    # for steps that turn the body by less than half a radian; after a longer step the following
-    # steps bring the length back to 1.
-    less = barrier(excess * (0.5 - excess * (0.375 - 0.3125 * excess)))
-    q = jnp.stack([d - less * a for d, a in zip(moved, after, strict=True)])
-    return split_scalars(
-        eqx.tree_at(lambda s: motion_of(s).q, join_scalars(change, example_state), q)
-    )
-
-
 def _splitting(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
-    """Return the object that takes fixed steps of a splitting: free motions and kicks in turn.
+    """Return steps of a splitting: free motions and kicks in turn.
 
-    A kick adds a weight times the torque times the length of the step to the momentum, at a fixed
-    attitude. From step to step the object carries the quaternion of the attitude, and the angular
-    momentum along the principal axes of the body.
-
-    - `solver`: the splitting method.
-    - `field`: the equations of motion of a body under a torque that reads the time and the
-      attitude.
-    - `state0`: the state at the start.
+    The numbers are the quaternion, and the angular momentum along the principal axes.
     """
     # The momentum Π is carried from step to step, along the principal axes. No step converts Π to Ω
     # = I⁻¹Π and back, so that |Π| drifts only by the round-off of the free motion.

@@ -44,12 +44,7 @@ class Tableau(NamedTuple):
 
 
 def _parse_rows(text: str) -> tuple[Row, ...]:
-    """Return the rows of a Butcher tableau from a text of `stage:weight` pairs.
-
-    A row holds the weights of the slopes at the stages of a Runge–Kutta method in one sum, such as
-    the sum for the state at a later stage. A semicolon separates two rows. Each row is a dict
-    `{stage: weight}`, where stages are counted from 0.
-    """
+    """Return the rows of a Butcher tableau from `stage:weight` pairs; a semicolon ends a row."""
     rows = [row.split() for row in text.split(";")]
     return tuple({int(i): float(w) for i, w in (part.split(":") for part in row)} for row in rows)
 
@@ -60,13 +55,11 @@ def parse_numbers(text: str) -> tuple[float, ...]:
 
 
 def round_weights(tableau: Tableau, dtype: Any) -> Tableau:
-    """Return the `tableau` with the weights of its stages and of its solution rounded to `dtype`,
-    such that the sum of each row hardly changes.
+    """Return the tableau with weights rounded to `dtype` such that the row sums hardly change.
 
-    The sum of a row is the time of its stage as a fraction of the step. If each weight is rounded
-    to the nearest number of float32, the weights of Dormand and Prince's method of order 8 sum to 1
-    + 4e-7: every run is too fast by this fraction, however short its steps are. Weights of float64
-    are returned unchanged.
+    The sum of a row is the time of its stage. If each weight is rounded to the nearest float32,
+    those of DOP853 sum to 1 + 4e-7: every run is too fast by this fraction, however short its steps
+    are. Weights of float64 are returned unchanged.
     """
     if np.dtype(dtype) == np.float64:
         return tableau
@@ -82,10 +75,10 @@ def round_weights(tableau: Tableau, dtype: Any) -> Tableau:
 
 @functools.cache
 def _rounded(weights: tuple[float, ...], times: tuple[float, ...], dtype: Any) -> tuple[float, ...]:
-    """Return the weights of one row of a tableau, each rounded up or down to a number of `dtype`.
+    """Return the weights of one row, each rounded up or down to a number of `dtype`.
 
-    Of all such choices, the result changes least the sum of the weights wᵢ and the sum of wᵢcᵢ,
-    where the `times` cᵢ are those of the stages, as fractions of the step.
+    Of all such choices, the result changes least the sum of the weights wᵢ and that of wᵢcᵢ, where
+    the `times` cᵢ are those of the stages, as fractions of the step.
     """
     exact = np.array(weights)
     near = exact.astype(dtype)
@@ -106,10 +99,7 @@ def _rounded(weights: tuple[float, ...], times: tuple[float, ...], dtype: Any) -
 
 
 def _sparse_row(row: np.ndarray) -> Row:
-    """Return a row of a Butcher tableau without its zeros, as a dict `{stage: weight}`.
-
-    `row` (s,) has the weights of all s stages.
-    """
+    """Return a row (s,) without its zeros."""
     return {i: float(w) for i, w in enumerate(row) if w != 0}
 
 
