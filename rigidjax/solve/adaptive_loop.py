@@ -19,14 +19,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from rigidjax.rotation.barrier import platform
 from rigidjax.solve.batching import Arrays, lift
-from rigidjax.solve.runge_kutta import (
-    Field,
-    Step,
-    dense_change,
-    error_estimate,
-    stages,
-    weights_of,
-)
+from rigidjax.solve.runge_kutta import Field, Step, dense_change, error_estimate, stages, weights_of
 from rigidjax.solve.tableaus import Tableau
 
 # diffrax inherits this member from optimistix, and type checkers do not find it there.
@@ -76,8 +69,9 @@ class Method(NamedTuple):
     # controller on one step. `again` is whether a recorded step is repeated for a derivative;
     # `state` holds the states of controller and progress meter; `times` are those at which the run
     # begins and ends, and those at which the step begins and ends; `left` and `right` are the
-    # states of the body before and after the step; `error` is the error of the step.
-    control: Callable[..., Decision]
+    # states of the body before and after the step; `error` is the error of the step. The result is
+    # a `Decision`.
+    control: Any
     sizes: list[int]  # how many numbers each array of the state has
     max_steps: int  # the largest number of steps, rejected steps included
 
@@ -406,7 +400,7 @@ def _attempt(
     method: Method, constants: Arrays, run: Run, loop: LoopState, until: Array | None,
     dense: bool | Array = False,
 ) -> _Attempted:  # fmt: skip
-    """Attempt one step of every body that is running.
+    """Take one attempted step of every body that is running.
 
     `until` is `None`, or the time, s, at which a part of the run that is repeated for derivatives
     ends: only repeated steps have derivatives with respect to the times of the run. `dense` adds
@@ -415,12 +409,8 @@ def _attempt(
     # The loop that calls this function goes on while any body of a batch has a step to take. Bodies
     # that have no step to take are left as they are.
     on = is_running(method, run, loop, until) if run.t0.ndim else True
-    stop, end = lax.stop_gradient(
-        (
-            rows_at(run.stops, loop.stop),
-            rows_at(step_ends(run.stops), loop.stop),
-        )
-    )
+    ends = rows_at(run.stops, loop.stop), rows_at(step_ends(run.stops), loop.stop)
+    stop, end = lax.stop_gradient(ends)
     # A body needs no step to a stop that it has already reached, such as the second of two stops at
     # the same time.
     arrived = on & (loop.t >= stop) if run.stops.shape[0] > 1 else False
@@ -431,12 +421,12 @@ def _attempt(
     end = jnp.where(last, end, loop.end)
     if until is not None:
         last, end = last & (end <= until), jnp.minimum(end, until)
-    end = _choose(moving, end, loop.t)
+    end = choose(moving, end, loop.t)
     h, kind = end - loop.t, jnp.where(last, LAST, STEP)
     step = Step(loop.t, h, end, loop.y)
     if until is not None:
         head = [a.astype(loop.y.dtype) for a in (loop.t, h, kind, loop.stop)]
-        begin, length, late = _choose(moving, step_times(run, jnp.stack(head)), step[:3])
+        begin, length, late = choose(moving, step_times(run, jnp.stack(head)), step[:3])
         step = Step(begin, length, late, loop.y)
     there = stages(method.tableau, method.field, constants, step, dense)
     y = method.project(there.end)
@@ -458,29 +448,29 @@ def _attempt(
         result = over_bodies(run, ended)(met, result)
     reached = accept & (t >= stop) | arrived if run.stops.shape[0] > 1 else 0
     after = LoopState(
-        y=_choose(accept, y, loop.y),
-        t=_choose(accept, t, loop.t),
-        end=_choose(moving, following, loop.end),
+        y=choose(accept, y, loop.y),
+        t=choose(accept, t, loop.t),
+        end=choose(moving, following, loop.end),
         stop=loop.stop + jnp.asarray(reached, jnp.int32),
         steps=loop.steps + jnp.asarray(moving, jnp.int32),
         rejected=loop.rejected + jnp.asarray(moving & ~keep, jnp.int32),
-        result=_choose(moving, result, loop.result),
-        state=_choose(moving, state, loop.state),
+        result=choose(moving, result, loop.result),
+        state=choose(moving, state, loop.state),
     )
     head = (loop.t, h, jnp.where(accept, kind, NONE), loop.stop)
     row = jnp.concatenate([jnp.stack([a.astype(y.dtype) for a in head]), loop.y])
     return _Attempted(after, row, step, there.slopes)
 
 
-def _choose(condition: Literal[True] | Array, new: PyTree, old: PyTree) -> PyTree:
+def choose(condition: Literal[True] | Array, new: PyTree, old: PyTree) -> PyTree:
     """Return the arrays of `new` for the bodies with a true `condition`, else those of `old`.
 
     The dtypes are those of `old`; `condition` may be the constant `True`.
     """
     if condition is True:
         return jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), new, old)
-    choose = lambda a, b: jnp.where(lift(condition, a), a, b).astype(b.dtype)  # noqa: E731
-    return jax.tree.map(choose, new, old)
+    one = lambda a, b: jnp.where(lift(condition, a), a, b).astype(b.dtype)  # noqa: E731
+    return jax.tree.map(one, new, old)
 
 
 class Filled(NamedTuple):

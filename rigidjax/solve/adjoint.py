@@ -119,12 +119,7 @@ def replay(method: Method, constants: Arrays, run: Run, record: Record) -> Repla
         def step(k: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
             y, rows = both
             row = part.rows[k]
-            there = stages(
-                method.tableau,
-                method.field,
-                constants,
-                Step(*step_times(run, row), y),
-            )
+            there = stages(method.tableau, method.field, constants, Step(*step_times(run, row), y))
             rows = lax.dynamic_update_index_in_dim(rows, row.at[HEAD:].set(y), k, 0)
             return jnp.where(lift(row[2] >= STEP, y), method.project(there.end), y), rows
 

@@ -22,14 +22,15 @@ from jaxtyping import Array
 
 from rigidjax.solve.adaptive_loop import (
     NONFINITE,
+    Method,
     accept_and_adapt,
+    choose,
     rows_at,
     starting_step,
     step_ends,
 )
 from rigidjax.solve.batching import Arrays, lift
-from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
-from rigidjax.solve.tableaus import Tableau
+from rigidjax.solve.runge_kutta import Step, error_estimate, stages
 
 # The largest number of guesses for one zero by Newton's method; after these guesses the interval
 # that contains the zero is halved again and again. `_GUESSES` is also the largest number of times
@@ -37,15 +38,6 @@ from rigidjax.solve.tableaus import Tableau
 _GUESSES = 8
 # The largest number of guesses and halvings for one zero.
 _MOST = 70
-
-
-class SearchMethod(NamedTuple):
-    """Hold an explicit method and the field that it solves; states are arrays (n, *bodies)."""
-
-    tableau: Tableau
-    field: Field
-    project: Callable[[Array], Array]  # scales a quaternion to length 1
-    sizes: list[int]  # how many numbers each array of the state has
 
 
 class Path(NamedTuple):
@@ -188,10 +180,7 @@ def _next(motion: Motion, search: Search, run: Path, body: _SearchState) -> _Sea
     """Return the state of the search after one more pass; an ended search keeps its state."""
     on = _searching(search, run, body)
     t, h, y, side = body.t, body.h, body.y, body.side
-    begin, end = (
-        rows_at(run.stops, body.stop),
-        rows_at(step_ends(run.stops), body.stop),
-    )
+    begin, end = rows_at(run.stops, body.stop), rows_at(step_ends(run.stops), body.stop)
     arrived = on & ~body.refining & (t >= begin)
     left = end - t
     last = ~body.refining & (h >= left)
@@ -231,12 +220,12 @@ def _next(motion: Motion, search: Search, run: Path, body: _SearchState) -> _Sea
     # A zero is searched for by Newton's method in the interval from `low` to `high`, at whose ends
     # g has opposite signs.
     refine = on & body.refining
-    low = _choose_end(refine & ~other, here, body.low)
-    high = _choose_end(refine & other, here, body.high)
+    low = choose(refine & ~other, here, body.low)
+    high = choose(refine & other, here, body.high)
     near, pinned, move, guess = _newton_step(body, low, high, here)
     done = refine & (near | pinned)
     move = jnp.where(done, move, jnp.zeros_like(move))
-    low, high = _choose_end(crossed, start, low), _choose_end(crossed, here, high)
+    low, high = choose(crossed, start, low), choose(crossed, here, high)
 
     new = accept | done
     reached = accept & last
@@ -244,7 +233,7 @@ def _next(motion: Motion, search: Search, run: Path, body: _SearchState) -> _Sea
     flipped = done | (accept & other)
     return _SearchState(
         t=jnp.where(new, jnp.where(reached, begin, late) + move, t),
-        y=jnp.where(lift(new, y), jnp.where(lift(done, y), shifted, after), y),
+        y=choose(new, choose(done, shifted, after), y),
         h=next_h,
         side=jnp.where(flipped, -side, jnp.where(accept & (side == 0), jnp.sign(g), side)),
         g=jnp.where(done, jnp.zeros_like(g), jnp.where(accept, g, body.g)),
@@ -288,12 +277,6 @@ def _newton_step(
     inside = (goal > low.x) & (goal < high.x) & (body.tries < _GUESSES)
     guess = jnp.where(inside, goal, low.x + 0.5 * width)
     return _Newton(near, pinned, jnp.where(near, move, jnp.zeros_like(move)), guess)
-
-
-def _choose_end(condition: Array, if_true: _IntervalEnd, if_false: _IntervalEnd) -> _IntervalEnd:
-    """Return `if_true` for the bodies with a true `condition`, else `if_false`."""
-    pairs = zip(if_true, if_false, strict=True)
-    return _IntervalEnd(*(jnp.where(condition, x, y) for x, y in pairs))
 
 
 def _hidden_zeros(
@@ -365,7 +348,7 @@ def _guess(sign_at_low: Array, low: _IntervalEnd, high: _IntervalEnd) -> Array:
 
 
 def step_with_error(
-    method: SearchMethod, constants: Arrays, run: Path, step: Step
+    method: Method, constants: Arrays, run: Path, step: Step
 ) -> tuple[Array, Array]:
     """Return the state after a step, and its error over the tolerance, a root mean square."""
     there = stages(method.tableau, method.field, constants, step)
@@ -418,7 +401,7 @@ def result_of_search(h: Array, t: Array, end: Array, is_full: Array) -> dfx.RESU
     return result
 
 
-def first_step(method: SearchMethod, constants: Arrays, run: Path) -> Array:
+def first_step(method: Method, constants: Arrays, run: Path) -> Array:
     """Return the length of the first step of a search, s."""
     y0 = run.y0
     scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)

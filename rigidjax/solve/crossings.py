@@ -48,7 +48,7 @@ from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import missing_state_part_message
 from rigidjax.solve import crossing_loop, validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
-from rigidjax.solve.adaptive_loop import result_of_body
+from rigidjax.solve.adaptive_loop import Method, result_of_body
 from rigidjax.solve.batching import Arrays, Layout, bodies_last
 from rigidjax.solve.crossing_loop import (
     Located,
@@ -56,7 +56,6 @@ from rigidjax.solve.crossing_loop import (
     Motion,
     Path,
     Search,
-    SearchMethod,
     first_step,
     result_of_search,
     step_with_error,
@@ -242,11 +241,7 @@ def crossings(
 
 
 def checked_state(
-    event: Event,
-    body: Inertia | MassProperties | None,
-    state0: PyTree,
-    torque: Any,
-    t: Array,
+    event: Event, body: Inertia | MassProperties | None, state0: PyTree, torque: Any, t: Array
 ) -> PyTree:
     """Check an event's condition at the start; return the state, with the torque's own states.
 
@@ -561,7 +556,10 @@ def _locate(
     order, still = 1, jnp.zeros_like(run.rtol)
     attempt: Any = lambda step: (motion(constants, step.end, step.y), still)  # noqa: E731
     if solver is not None:
-        method = SearchMethod(solver.tableau, motion, project, section.sizes)
+        # `locate_zeros` has its own control of steps.
+        method = Method(
+            solver.tableau, motion, project, None, None, section.sizes, search.max_steps
+        )
         h0 = first_step(method, constants, run)
         h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), longest)
         run = run._replace(h0=h0)

@@ -73,12 +73,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
         return self.tableau.order
 
     def init(
-        self,
-        terms: PyTree[dfx.AbstractTerm],
-        t0: RealLike,
-        t1: RealLike,
-        y0: PyTree,
-        args: PyTree,
+        self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike, y0: PyTree, args: PyTree
     ) -> tuple[()]:
         return ()
 

@@ -22,11 +22,7 @@ from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import quaternion_product
 from rigidjax.solve.components import join_scalars, split_scalars
 from rigidjax.solve.equal_steps import change_and_slope
-from rigidjax.solve.explicit import (
-    NestedInterpolation,
-    cubic_coefficients,
-    direction_and_length,
-)
+from rigidjax.solve.explicit import NestedInterpolation, cubic_coefficients, direction_and_length
 from rigidjax.solve.tableaus import KUTTA4
 
 
@@ -90,12 +86,7 @@ class Magnus4(dfx.AbstractSolver):
         return 4
 
     def init(
-        self,
-        terms: PyTree[dfx.AbstractTerm],
-        t0: RealLike,
-        t1: RealLike,
-        y0: PyTree,
-        args: PyTree,
+        self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike, y0: PyTree, args: PyTree
     ) -> tuple[()]:
         field, _ = field_and_direction(terms)
         refuse_attitude(attitude_equations("Magnus4", field, y0, "RungeKutta4").euler.torque)

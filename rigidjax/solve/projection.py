@@ -84,12 +84,7 @@ class Projected(dfx.AbstractWrappedSolver):
         return self.solver.error_order(terms)
 
     def init(
-        self,
-        terms: PyTree[dfx.AbstractTerm],
-        t0: RealLike,
-        t1: RealLike,
-        y0: PyTree,
-        args: PyTree,
+        self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike, y0: PyTree, args: PyTree
     ) -> Any:
         return self.solver.init(terms, t0, t1, y0, args)
 

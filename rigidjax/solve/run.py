@@ -38,11 +38,7 @@ from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_of_body
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.momentum import (
-    changing_inertia,
-    equations_by_momentum,
-    with_body_rates,
-)
+from rigidjax.solve.momentum import changing_inertia, equations_by_momentum, with_body_rates
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.sides import declared_jumps, evaluate_on_correct_sides
@@ -189,10 +185,7 @@ def time_direction(times: Array) -> Int[Array, ""] | None:
 
 
 def forward_time(
-    sign: Array | None,
-    field: Callable[..., Any],
-    condition: Callable[..., Any] | None,
-    ts: Array,
+    sign: Array | None, field: Callable[..., Any], condition: Callable[..., Any] | None, ts: Array
 ) -> ForwardRun:
     """Convert a run to one forwards in the time s = σt.
 

@@ -37,11 +37,7 @@ from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import evaluate_torque, may_read_rate
 from rigidjax.rotation import quaternion
-from rigidjax.solve.explicit import (
-    NestedInterpolation,
-    cubic_coefficients,
-    direction_and_length,
-)
+from rigidjax.solve.explicit import NestedInterpolation, cubic_coefficients, direction_and_length
 from rigidjax.solve.magnus import attitude_equations
 from rigidjax.solve.tableaus import parse_numbers
 
@@ -137,12 +133,7 @@ class AbstractSplitting(dfx.AbstractSolver):
         return self.composition.order
 
     def init(
-        self,
-        terms: PyTree[dfx.AbstractTerm],
-        t0: RealLike,
-        t1: RealLike,
-        y0: PyTree,
-        args: PyTree,
+        self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike, y0: PyTree, args: PyTree
     ) -> PrincipalFrame:
         return frame_of_field(field_and_direction(terms)[0], y0)
 
