@@ -376,8 +376,7 @@ def record_run(method: Method, constants: Arrays, run: Run) -> Recorded:
         loop, ys, starts, rows, number, _ = state
         after, rows, count = record_segment(method, constants, run, loop, rows, None)
         if run.between.shape[0]:
-            part = segment_of(rows, after.t, count)
-            ys = fill_saved(method, constants, run, part, ys)
+            ys = fill_saved(method, constants, run, segment_of(rows, after.t, count), ys)
         return after, ys, put(starts, number + 1, after), rows, number + 1, count
 
     state = (loop, ys, put(starts, zero, loop), rows, zero, zero)
@@ -502,8 +501,7 @@ def record_segment(
         return Filled(loop, rows, now.number + 1)
 
     def block(now: Filled) -> Filled:
-        few = jnp.zeros((many, *rows.shape[1:]), rows.dtype)
-        part = filled(attempt, now.loop, few, many)
+        part = filled(attempt, now.loop, jnp.zeros((many, *rows.shape[1:]), rows.dtype), many)
         all_ = lax.dynamic_update_slice_in_dim(now.rows, part.rows, now.number, 0)
         return Filled(part.loop, all_, now.number + part.number)
 

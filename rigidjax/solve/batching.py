@@ -5,7 +5,7 @@ batch axis first, which makes a loop over small states many times slower. Theref
 `jax.custom_batching.custom_vmap` moves the batch axis of any `jax.vmap` to the end.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -142,9 +142,8 @@ def _with_tangent(
 
     def with_tangents(layout: Layout, constants: Arrays, rest: Arrays) -> Arrays:
         layout, constants = layout.broadcast(constants, moving[:num_constants], rest[0])
-        args, given = [*constants, *rest[: len(each)]], iter(rest[len(each) :])
-        both = zip(args, moving, strict=True)
-        moved = [next(given) if m else zero_from_primal(a) for a, m in both]
+        args = [*constants, *rest[: len(each)]]
+        moved = replaced([zero_from_primal(a) for a in args], moving, rest[len(each) :])
         one = lambda *args: program(layout, list(args[:num_constants]), list(args[num_constants:]))  # noqa: E731
         pairs = zip(*jax.jvp(one, args, moved), strict=True)
         return [a for o, m in pairs for a in ([o, m] if eqx.is_inexact_array(o) else [o])]
@@ -194,3 +193,11 @@ def lift(array: Array, like: Array) -> Array:
     An array with one number for each body then multiplies states (n, *bodies).
     """
     return array.reshape((1,) * (like.ndim - array.ndim) + array.shape)
+
+
+def replaced(
+    arrays: Sequence[Any], selected: Sequence[bool], replacements: Sequence[Any]
+) -> list[Any]:
+    """Return the list `arrays` with its `selected` items replaced, in order."""
+    rest = iter(replacements)
+    return [next(rest) if new else a for a, new in zip(arrays, selected, strict=True)]

@@ -343,8 +343,7 @@ def _guess(sign_at_low: Array, low: _IntervalEnd, high: _IntervalEnd) -> Array:
     x = width * u * u * (3 - 2 * u) + rise * u * (1 - u) * ((1 - u) * left - u * right)
     middle = low.x + 0.5 * (high.x - low.x)
     x = low.x + x.astype(low.x.dtype)
-    inside = steady & (x > low.x) & (x < high.x)
-    return jnp.where(inside, x, middle)
+    return jnp.where(steady & (x > low.x) & (x < high.x), x, middle)
 
 
 def step_with_error(
@@ -359,8 +358,7 @@ def step_with_error(
     error = error_estimate(method.tableau, method.sizes, h, slopes)
     largest = jnp.maximum(jnp.abs(left), jnp.abs(after))
     scale = lift(run.atol, left) + lift(run.rtol, left) * largest
-    tiny = float(jnp.finfo(error.dtype).tiny)
-    return right, jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
+    return right, jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + float(jnp.finfo(error.dtype).tiny))
 
 
 def _accept(

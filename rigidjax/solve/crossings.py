@@ -509,8 +509,7 @@ def section_of_run(
     stops = jnp.concatenate([program.stops, along[1:]])
     sizes = [leaf.size for leaf in jax.tree.leaves(state0)]
     crossed = Section(solver, of_motion, of_rates, tree, sizes, sign, form)
-    run = Path(along[0], stops, y0, rtol, atol, h0)
-    return crossed, Numbers(constants, run, longest)
+    return crossed, Numbers(constants, Path(along[0], stops, y0, rtol, atol, h0), longest)
 
 
 def _sampling_interval(body: Any, state0: Any, length: Array) -> Array:
@@ -531,8 +530,7 @@ def _sampling_interval(body: Any, state0: Any, length: Array) -> Array:
 def locate(section: Section, search: Search, numbers: Numbers) -> Located:
     """Return the first crossings of a run, without derivatives."""
     constants, run, longest = lax.stop_gradient(numbers)
-    program = partial(_locate, section, search)
-    return Located(*bodies_last(program, constants, [*run, longest]))
+    return Located(*bodies_last(partial(_locate, section, search), constants, [*run, longest]))
 
 
 def _locate(
@@ -606,5 +604,4 @@ def chebyshev_step(
     move = jnp.where(
         is_crossing, newton * (1 - 0.5 * newton * second / rate), jnp.zeros_like(newton)
     )
-    state = y + slope * move + 0.5 * turn * move * move
-    return s + move.astype(s.dtype), section.project(state)
+    return s + move.astype(s.dtype), section.project(y + slope * move + 0.5 * turn * move * move)

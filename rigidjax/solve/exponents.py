@@ -212,8 +212,7 @@ def _exponents(
     rates = logs[transient:] / step
     count = rates.shape[0]
     times = t0 + jnp.arange(transient + 1, intervals + 1).astype(t0.dtype) * step
-    index = jnp.arange(1, count + 1).astype(t0.dtype)
-    running = jnp.cumsum(rates, axis=0) / index[:, None]
+    running = jnp.cumsum(rates, axis=0) / jnp.arange(1, count + 1).astype(t0.dtype)[:, None]
     whole = count // _PARTS * _PARTS
     means = jnp.mean(rates[count - whole :].reshape(_PARTS, -1, many), axis=1)
     apart = jnp.var(means, axis=0, ddof=1) / _PARTS

@@ -75,8 +75,7 @@ class ByMomentum(eqx.Module):
             if own
             else inner.law.tensor(t)
         )
-        fixed = tensor_of(inner.body).astype(dtype)
-        omega = new_rate(now.astype(dtype), fixed, motion.omega)
+        omega = new_rate(now.astype(dtype), tensor_of(inner.body).astype(dtype), motion.omega)
         return eqx.tree_at(lambda s: motion_of(s).omega, y, omega)
 
 

@@ -21,7 +21,7 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from rigidjax.solve.batching import Arrays
+from rigidjax.solve.batching import Arrays, replaced
 from rigidjax.solve.linear_map import linear_map
 from rigidjax.solve.stops import trace_program
 
@@ -105,7 +105,7 @@ class _Pieces:
         chosen = [c for c, m in zip(constants, has_derivative, strict=True) if m]
 
         def step_of(i: Array) -> Callable[[Arrays, Arrays], Arrays]:
-            return lambda some, y: self.call(_replaced(constants, has_derivative, some), y, i)
+            return lambda some, y: self.call(replaced(constants, has_derivative, some), y, i)
 
         def one(sums: tuple[Arrays, Arrays], at: tuple[Arrays, Array]) -> tuple[Any, None]:
             (total, bar), (y, i) = sums, at
@@ -170,7 +170,7 @@ def march_on_gpu(step: Callable[[Any, Array], Any], first: Array, count: int, y:
 
         def push(*args: Array) -> Arrays:
             given = list(args[:size])
-            of = lambda *some: end(_replaced(given, moving, some))  # noqa: E731
+            of = lambda *some: end(replaced(given, moving, some))  # noqa: E731
             at = [g for g, m in zip(given, moving, strict=True) if m]
             return jax.jvp(of, at, list(args[size + len(rows) :]))[1]
 
@@ -186,11 +186,3 @@ def march_on_gpu(step: Callable[[Any, Array], Any], first: Array, count: int, y:
 
     run.defjvp(run_jvp, symbolic_zeros=True)
     return tree.unflatten(run(*constants, first, *start))
-
-
-def _replaced(
-    arrays: Sequence[Any], selected: Sequence[bool], replacements: Sequence[Any]
-) -> list[Any]:
-    """Return the list `arrays` with its `selected` items replaced, in order."""
-    rest = iter(replacements)
-    return [next(rest) if new else a for a, new in zip(arrays, selected, strict=True)]

@@ -16,7 +16,7 @@ from jaxtyping import Array
 from rigidjax.solve import adaptive_loop, adjoint
 from rigidjax.solve.adaptive_loop import LoopState, Method, Record, Run
 from rigidjax.solve.adjoint import Smooth
-from rigidjax.solve.batching import Arrays, Layout, bodies_last
+from rigidjax.solve.batching import Arrays, Layout, bodies_last, replaced
 from rigidjax.solve.linear_map import linear_map, no_transpose
 
 SMOOTH = len(Smooth._fields)
@@ -171,22 +171,18 @@ def _recorded(
     field = layout.vmap(one)
 
     def of_moving(chosen: Arrays, t: Array, y: Array) -> Array:
-        rest = iter(chosen)
-        mixed = [next(rest) if m else c for c, m in zip(constants, there, strict=True)]
-        return field(mixed, t, y)
+        return field(replaced(constants, there, chosen), t, y)
 
     chosen = [c for c, m in zip(constants, there, strict=True) if m]
-    record = Record(starts, rows, counts)
-    return _Seen(method._replace(field=of_moving), chosen, run, record, along)
+    return _Seen(method._replace(field=of_moving), chosen, run, Record(starts, rows, counts), along)
 
 
 def _push(has_tangent: HasTangent, *bodies: Any) -> Arrays:
     """Return the tangents of the states of a recorded run (see `Replayed`), in forward mode."""
     method, chosen, run, record, along = _recorded(has_tangent, *bodies)
-    rest = iter(along[len(chosen) :])
     smooth = adjoint.smooth_arrays(run)
-    still = zip(smooth, has_tangent[1], strict=False)
-    of_run = Smooth(*(next(rest) if moves else jnp.zeros_like(a) for a, moves in still))
+    zeros = [jnp.zeros_like(a) for a in smooth]
+    of_run = Smooth(*replaced(zeros, has_tangent[1][:SMOOTH], along[len(chosen) :]))
 
     def again(chosen: Arrays, smooth: Smooth) -> Any:
         return adjoint.replay(method, chosen, run._replace(**smooth._asdict()), record)

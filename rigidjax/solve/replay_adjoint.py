@@ -181,8 +181,7 @@ class _Control(NamedTuple):
         following = jnp.where(keep & (following > near), last, following)
         if not again:
             progress = meter.step(progress, (t - t0) / (last - t0))
-        found = Decision(keep, t, following, (control, progress), result)
-        return jax.tree.map(jnp.asarray, found)
+        return jax.tree.map(jnp.asarray, Decision(keep, t, following, (control, progress), result))
 
 
 def can_run(

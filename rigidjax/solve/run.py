@@ -235,8 +235,7 @@ def solve(setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array) -> Solved:
             stats["drift"] = scene.drift(ts, ys)
     if setup.throw:
         ys = require_complete(setup, ys, result)
-    inputs = (setup.body, setup.torque, given, ts)
-    ys = nan_derivatives(ys, inputs)
+    ys = nan_derivatives(ys, (setup.body, setup.torque, given, ts))
     return Solved(ys, stats, result_of_body(result, setup.body))
 
 

@@ -107,8 +107,7 @@ def stages(
         # may be infinite or NaN at a state of zeros.
         times, places = times + step.t[None], places + step.y[:, None]
         number = jnp.where(dense, number, np.int32(w.plain))
-    begun = (times, places, empty)
-    times, places, slopes = lax.fori_loop(np.int32(0), number, stage, begun)
+    times, places, slopes = lax.fori_loop(np.int32(0), number, stage, (times, places, empty))
     h = lift(step.h.astype(step.y.dtype), step.y)
     return Stages(times, places, slopes, step.y + h * _weighted_sum(w.b, slopes), number)
 

@@ -156,8 +156,7 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         # The first step is at least the shortest that the time can resolve, because steps of length
         # 0 would be accepted without end. If the start is not finite, the step has the length NaN,
         # which ends the run.
-        shortest = begin + self._shortest(begin, least)
-        first = jnp.where(sound, jnp.maximum(first, shortest), jnp.nan)
+        first = jnp.where(sound, jnp.maximum(first, begin + self._shortest(begin, least)), jnp.nan)
         return first.astype(begin.dtype), (inner, least)
 
     def _first_step(self, y: PyTree, slope: PyTree, order: RealLike) -> Array:
@@ -241,8 +240,7 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         none = jnp.full_like(self.stops[:1], jnp.inf)
         stop = rows_at(jnp.concatenate([self.stops, none]), stop_index)
         still = lax.stop_gradient(stop)
-        gap = jnp.where(jnp.isinf(still), 0, previous_float(still) - still)
-        return stop, stop + gap
+        return stop, stop + jnp.where(jnp.isinf(still), 0, previous_float(still) - still)
 
     # As in diffrax, the arguments come by position; they are those of `StandardController`.
     def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -109,8 +109,7 @@ def cheapest_method(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
 
     It is `Magnus4` for an attitude whose torque does not read the attitude, else `RungeKutta4`.
     """
-    attitude = isinstance(field, AttitudeEquations)
-    blind = attitude and not may_read_attitude(field.euler.torque)
+    blind = isinstance(field, AttitudeEquations) and not may_read_attitude(field.euler.torque)
     return Magnus4() if blind else RungeKutta4()
 
 
