@@ -27,7 +27,7 @@ from rigidjax.motion.torques import bind
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.fixed_loop import march_steps, torque_inputs_at_start
+from rigidjax.solve.fixed_loop import inputs_at_start, march_steps
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.pieces import steps_per_piece
 from rigidjax.solve.splitting import AbstractSplitting
@@ -225,9 +225,7 @@ def _rollout(
         shared, initial, h, t0 = numbers
         own, inputs = row
         body, state0, torque = one_body(shared, own, constants)
-        state0 = with_own_states(
-            body, state0, bind(torque, torque_inputs_at_start(torque, h, inputs)), t0
-        )
+        state0 = with_own_states(body, state0, bind(torque, inputs_at_start(torque, h, inputs)), t0)
         field = equations_of_motion(body, state0, torque)
         stepper = stepper_of(solver, field, state0, count)
 
@@ -238,10 +236,10 @@ def _rollout(
             y = march_steps(stepper, h, t0, first, every, y, inputs)
             if reduce is not None:
                 t = t0 + (first + every).astype(h.dtype) * h
-                carried = reduce(carried, t, stepper.state_of_numbers(y))
-            return (y, carried), stepper.state_of_numbers(y) if keep else None
+                carried = reduce(carried, t, stepper.state(y))
+            return (y, carried), stepper.state(y) if keep else None
 
-        begin = (stepper.initial_numbers, initial)
+        begin = (stepper.start, initial)
         if every == count:
             (y, carried), saved = advance(begin, jnp.zeros((), jnp.int32))
             saved = jax.tree.map(lambda leaf: leaf[None], saved)
@@ -249,8 +247,8 @@ def _rollout(
             firsts = jnp.arange(0, count, every, dtype=jnp.int32)
             (y, carried), saved = lax.scan(advance, begin, firsts)
         if reduce is not None:
-            return stepper.state_of_numbers(y), carried
-        return saved if keep else stepper.state_of_numbers(y)
+            return stepper.state(y), carried
+        return saved if keep else stepper.state(y)
 
     size = sum(leaf.size for leaf in jax.tree.leaves(per_body[0])) * h.dtype.itemsize
     if size * (count // every) * (every // steps_per_piece(every) + 1) > _MOST_KEPT:

@@ -37,7 +37,7 @@ from rigidjax.motion.coupled import Coupled, motion_of, with_own_states
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation.barrier import platform
 from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
-from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_or_nonfinite_input
+from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_of_body
 from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
 
@@ -240,7 +240,9 @@ def _results(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
 
     def status(row: PyTree, ys: PyTree) -> dfx.RESULTS:
         result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-        return result_or_nonfinite_input(result, one_body(batch.shared, row, batch.constants)[0])
+        return result_of_body(
+            result, one_body(batch.shared, row, batch.constants)[0]
+        )
 
     return jax.vmap(status)(batch.per_body, ys)
 

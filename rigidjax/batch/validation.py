@@ -138,10 +138,8 @@ def check_batch(
     # many steps.
     shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
     row = (lambda a: a[0]) if isinstance(bodies, MassProperties) else shape
-    validation.require_compatible_types(
-        *eqx.combine(shared, jax.tree.map(row, per_body), constants)
-    )
-    validation.warn_of_unknown_inertia_scale(bodies, torque)
+    validation.require_compatible(*eqx.combine(shared, jax.tree.map(row, per_body), constants))
+    validation.warn_of_scale(bodies, torque)
     batch = BodyBatch(shared, per_body, constants, count, dtype, tuple(checks))
     if all(isinstance(index, np.ndarray | np.integer) for index, _ in checks):
         # The numbers of few bodies have been checked on the host, not on the device. The error can

@@ -48,36 +48,23 @@ class AdaptiveRun(NamedTuple):
     missed: Array | None
 
 
-class _VectorFieldOnTree(eqx.Module):
-    """Evaluate a field on a state, where the field itself is a function of one vector of numbers.
-
-    - `constants`: the arrays on which the field depends.
-    - `field`: a function `field(constants, t, numbers)` that takes and returns all numbers of a
-      state as one vector (n,).
-    - `tree`: a function that makes a state from such a vector.
-    """
+class _FieldOnTree(eqx.Module):
+    """Evaluate on a state a field `(constants, t, numbers)` of the vector of its numbers."""
 
     constants: Any
     field: Any = eqx.field(static=True)
     tree: Any = eqx.field(static=True)
 
     def __call__(self, t: Any, y: Any, args: object = None) -> Any:
-        """Return dy/dt at the time `t`, s, and the state `y`, with the structure of `y`.
-
-        `args`, which diffrax gives to every field, is not used.
-        """
         return self.tree(self.field(self.constants, t, ravel_pytree(y)[0]))
 
 
-def _state_as_vector(t: Any, y: PyTree, args: object) -> Array:
-    """Return the n numbers of the state `y` as one vector (n,), for diffrax to save.
-
-    Diffrax also gives the time `t`, s, and the argument `args` of the field; neither is used.
-    """
+def _vector(t: Any, y: PyTree, args: object) -> Array:
+    """Return the numbers of a state as one vector (n,), for diffrax to save."""
     return ravel_pytree(y)[0]
 
 
-def integrate_with_diffrax(
+def integrate(
     solver: dfx.AbstractSolver,
     field: Callable[..., Any],
     ts: Array,
@@ -93,35 +80,25 @@ def integrate_with_diffrax(
 ) -> AdaptiveRun:
     """Run diffrax under any step size controller, and return the states at the times `ts`.
 
-    - `solver`, `controller`, `dt0`, `max_steps`, `adjoint`, `progress_meter`: as for
-      `diffrax.diffeqsolve`.
-    - `field`: a vector field `f(t, y, args)`. If several parts of the field jump, `args` is a
-      sequence with one array for each of these parts: the times at which steps end for this part.
-      Otherwise `args` is `None`.
-    - `ts`: (T,) the times of the states, s; increasing if `jumps` is a list.
-    - `y0`: the state at `ts[0]`.
-    - `jumps`: a list with one array of times, s, for each part of the field that jumps. Steps end
-      at these times, and at each time with which the field compares its argument t. With `None` no
-      step is cut short for a jump.
-    - `halt`: a condition `halt(t, y)`, tested after each accepted step; the run ends where the
-      condition is true.
-
-    **Returns** an `AdaptiveRun`: the states and how the run ended.
+    `jumps` has one array of times, s, for each part of the field that jumps; steps end at these,
+    and at each time with which the field compares its t. The field gets them, as they are reached,
+    as `args`. With `None` no step is cut short for a jump. A `halt(t, y)` is tested after each
+    accepted step.
     """
     missed, looks_at_error = None, isinstance(controller, dfx.AbstractAdaptiveStepSizeController)
     if jumps is not None:
         numbers, tree = ravel_pytree(y0)
         of_one = lambda t, y, *sides: ravel_pytree(field(t, tree(y), sides or None))[0]  # noqa: E731
         program = program_with_stops(of_one, jumps, ts[0], ts[-1], numbers)
-        field, missed = _VectorFieldOnTree(program.constants, program.field, tree), program.over
+        field, missed = _FieldOnTree(program.constants, program.field, tree), program.over
         if program.stops.size:
             controller = Stopping(controller, program.stops)
     # The last of `ts` is the end of the last step, so that the state there needs no dense output.
-    subs = [dfx.SubSaveAt(t1=True, fn=_state_as_vector)]
+    subs = [dfx.SubSaveAt(t1=True, fn=_vector)]
     if ts.shape[0] > 2 and isinstance(adjoint, ReplayAdjoint) and can_run(solver, max_steps, y0):
         adjoint = dataclasses.replace(adjoint, between=ts[1:-1])
     elif ts.shape[0] > 2:
-        subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=_state_as_vector)]
+        subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=_vector)]
     out = dfx.diffeqsolve(
         dfx.ODETerm(field), solver, ts[0], ts[-1], dt0, y0,
         saveat=dfx.SaveAt(subs=subs), stepsize_controller=controller, adjoint=adjoint,
@@ -205,4 +182,4 @@ def adaptive(
     rtol, atol = (jnp.asarray(a, ts.dtype) for a in (rtol, atol))
     controller = Watched(StandardController(rtol, atol, max_step))
     how = dict(jumps=declared, halt=halt, dt0=dt0, max_steps=max_steps)
-    return integrate_with_diffrax(solver, field, ts, y0, controller, **how)
+    return integrate(solver, field, ts, y0, controller, **how)

@@ -5,7 +5,7 @@ batch axis first, which makes a loop over small states many times slower. Theref
 `jax.custom_batching.custom_vmap` moves the batch axis of any `jax.vmap` to the end.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -26,37 +26,20 @@ BLOCK = 16
 
 
 class Layout(NamedTuple):
-    """Describe which arrays of a program have a last axis for the bodies of a batch.
-
-    A program is a function of two lists of arrays: the constants, and the arrays of each body.
-    """
+    """Describe which arrays of a program have a last axis for the bodies of a batch."""
 
     bodies: bool  # whether the arrays of each body have this axis; without it there is one body
     shared: tuple[bool, ...]  # for each constant, whether all bodies share it, without this axis
 
-    def vmap_over_bodies(self, function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-        """Map `function(constants, t, y)`, which takes the arrays of one body, over all bodies.
-
-        The result takes and returns arrays whose last axis is that of the bodies; constants that
-        all bodies share have no such axis. Without an axis of bodies `function` is returned
-        unchanged.
-        """
+    def vmap(self, function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+        """Map `function(constants, t, y)` of one body over the bodies in the last axis, if any."""
         axes = [None if s else -1 for s in self.shared]
         return jax.vmap(function, (axes, -1, -1), -1) if self.bodies else function
 
-    def broadcast_to_bodies(
+    def broadcast(
         self, constants: Arrays, per_body: list[bool], like: Array
     ) -> tuple["Layout", Arrays]:
-        """Broadcast some of the constants that all bodies share along a new last axis of bodies.
-
-        - `constants`: the constants of a program, some with a last axis of bodies and some without.
-        - `per_body`: for each constant, whether it needs this axis.
-        - `like`: an array whose last axis is that of the bodies; its length is the number of
-          bodies.
-
-        **Returns** two things: the new layout, which says which constants are still shared; and the
-        constants.
-        """
+        """Give the shared constants that are `per_body` a last axis, as long as that of `like`."""
         if not self.bodies:
             return self, constants
         own = [s and w for s, w in zip(self.shared, per_body, strict=True)]
@@ -74,7 +57,7 @@ class Layout(NamedTuple):
 Program = Callable[[Layout, Arrays, Arrays], Arrays]
 
 
-def run_with_bodies_last(
+def bodies_last(
     program: Program,
     constants: Arrays,
     each: Arrays,
@@ -83,25 +66,13 @@ def run_with_bodies_last(
 ) -> Arrays:
     """Run a program with the bodies of any `jax.vmap` in the last axis of all arrays.
 
-    **Arguments:**
-
-    - `program`: a function `program(layout, constants, each)` that returns a list of arrays; see
-      `Program`.
-    - `constants`: arrays, each of which all bodies may share.
-    - `each`: arrays in which each body has values of its own.
-    - `num_linear`: the number of arrays at the end of `each` in which the program is linear, such
-      as tangents. A `jax.vmap` over these arrays alone adds tangents, not bodies: its axis is not
-      moved to the end.
-    - `layout`: says which of the given arrays have a last axis of bodies already; `None` stands for
-      one body.
-
-    **Returns** the list of arrays that the program returns.
+    It is linear in the last `num_linear` arrays of `each`, such as tangents. A `jax.vmap` over
+    these alone adds tangents, not bodies: its axis is not moved. `layout` says which arrays have
+    bodies already; `None` stands for one body.
     """
     was = Layout(False, (True,) * len(constants)) if layout is None else layout
     number = len(constants)
-    call: Any = jax.custom_batching.custom_vmap(
-        partial(_run_in_blocks_of_bodies, program, was, number)
-    )
+    call: Any = jax.custom_batching.custom_vmap(partial(_in_blocks, program, was, number))
 
     @call.def_vmap
     def _(size: int, batched: Any, *args: Any) -> Any:
@@ -120,7 +91,7 @@ def run_with_bodies_last(
                 one = lambda *along: program(layout, constants, [*each[:many], *along])  # noqa: E731
                 return jax.vmap(one, axes, axis_size=size)(*each[many:])
 
-            out = run_with_bodies_last(over, constants, each, num_linear, was)
+            out = bodies_last(over, constants, each, num_linear, was)
             return out, [True] * len(out)
         new = Layout(True, tuple(s and not b for s, b in zip(was.shared, own, strict=True)))
         count = each[0].shape[-1] if was.bodies else 1
@@ -136,7 +107,7 @@ def run_with_bodies_last(
             for c, shared, b, before in zip(constants, new.shared, own, was.shared, strict=True)
         ]
         each = [last(a, b, True) for a, b in zip(each, rest, strict=True)]
-        out = run_with_bodies_last(program, constants, each, num_linear, new)
+        out = bodies_last(program, constants, each, num_linear, new)
 
         def first(a: Any) -> Any:
             a = a.reshape(*a.shape[:-1], count, size) if was.bodies else a
@@ -146,14 +117,12 @@ def run_with_bodies_last(
 
     answer: Any = jax.custom_jvp(lambda *args: call(*args))
     # The derivative rule of `custom_vmap` gives wrong shapes for a batch of tangents, so that
-    # `_program_and_tangent` is used instead.
-    answer.defjvp(
-        partial(_program_and_tangent, program, was, number, num_linear), symbolic_zeros=True
-    )
+    # `_with_tangent` is used instead.
+    answer.defjvp(partial(_with_tangent, program, was, number, num_linear), symbolic_zeros=True)
     return answer(*constants, *each)
 
 
-def _program_and_tangent(
+def _with_tangent(
     program: Program,
     layout: Layout,
     num_constants: int,
@@ -161,43 +130,27 @@ def _program_and_tangent(
     primals: tuple[PyTree, ...],
     tangents: tuple[PyTree, ...],
 ) -> tuple[Arrays, Arrays]:
-    """Return the result of a program and its tangent, which are computed together.
-
-    This is the rule for derivatives of `run_with_bodies_last` in forward mode.
-    `run_with_bodies_last` runs a program with the bodies of any `jax.vmap` in the last axis of all
-    arrays; here one call of it runs the program and its tangent.
-
-    - `program`: a function `program(layout, constants, each)` that returns a list of arrays.
-    - `layout`: says which arrays have a last axis of bodies.
-    - `num_constants`: the number of constants, which are the first of `primals`. The other primals
-      are the arrays `each`, in which each body has values of its own.
-    - `num_linear`: the number of arrays at the end of `each` in which the program is linear.
-    - `primals`, `tangents`: the arrays that the program takes, and their tangents.
-    """
+    """Return the result of a program and its tangent, by one run of both."""
+    # The other primals are the arrays `each`.
     constants, each = list(primals[:num_constants]), list(primals[num_constants:])
     moving = [not isinstance(t, SymbolicZero) for t in tangents]
     # The tangents are passed together with the arrays `each`, in which every body has values of its
     # own. The tangent of a constant that all bodies share therefore needs a last axis of bodies.
     # `with_tangents` adds this axis to the constant, too, so that it has the shape of its tangent.
-    _, along = layout.broadcast_to_bodies(
-        list(tangents[:num_constants]), moving[:num_constants], each[0]
-    )
+    _, along = layout.broadcast(list(tangents[:num_constants]), moving[:num_constants], each[0])
     along = [t for t, m in zip([*along, *tangents[num_constants:]], moving, strict=True) if m]
 
     def with_tangents(layout: Layout, constants: Arrays, rest: Arrays) -> Arrays:
-        layout, constants = layout.broadcast_to_bodies(constants, moving[:num_constants], rest[0])
-        args, given = [*constants, *rest[: len(each)]], iter(rest[len(each) :])
-        both = zip(args, moving, strict=True)
-        moved = [next(given) if m else zero_from_primal(a) for a, m in both]
+        layout, constants = layout.broadcast(constants, moving[:num_constants], rest[0])
+        args = [*constants, *rest[: len(each)]]
+        moved = replaced([zero_from_primal(a) for a in args], moving, rest[len(each) :])
         one = lambda *args: program(layout, list(args[:num_constants]), list(args[num_constants:]))  # noqa: E731
         pairs = zip(*jax.jvp(one, args, moved), strict=True)
         return [a for o, m in pairs for a in ([o, m] if eqx.is_inexact_array(o) else [o])]
 
     out, moved = [], []
     found = iter(
-        run_with_bodies_last(
-            with_tangents, constants, [*each, *along], num_linear + len(along), layout
-        )
+        bodies_last(with_tangents, constants, [*each, *along], num_linear + len(along), layout)
     )
     for a in found:
         out.append(a)
@@ -205,19 +158,8 @@ def _program_and_tangent(
     return out, moved
 
 
-def _run_in_blocks_of_bodies(
-    program: Program, layout: Layout, num_constants: int, *args: Any
-) -> Arrays:
-    """Return the result of a program, computed on CPU for at most `BLOCK` (16) bodies at a time.
-
-    The arrays of so few bodies stay in the first-level cache of the processor. On other backends
-    all bodies are computed at once.
-
-    - `program`: a function `program(layout, constants, each)` that returns a list of arrays.
-    - `layout`: says which arrays have a last axis of bodies.
-    - `num_constants`: the number of constants, which are the first of `args`.
-    - `args`: the constants, then the arrays in which each body has values of its own.
-    """
+def _in_blocks(program: Program, layout: Layout, num_constants: int, *args: Any) -> Arrays:
+    """Return the result of a program, computed on CPU for at most `BLOCK` bodies at a time."""
     constants, each = list(args[:num_constants]), list(args[num_constants:])
     count = each[0].shape[-1] if layout.bodies else 1
     if platform() != "cpu" or count <= BLOCK:
@@ -245,10 +187,17 @@ def _run_in_blocks_of_bodies(
     return [joined(a) for a in lax.map(block, (own, [cut(a) for a in each]))]
 
 
-def add_leading_axes(array: Array, like: Array) -> Array:
-    """Return `array` with leading axes of length 1 added, so that it broadcasts against `like`.
+def lift(array: Array, like: Array) -> Array:
+    """Return `array` with leading axes of length 1, so that it broadcasts against `like`.
 
-    The last axes of `like` are the axes of `array`: an array with one number for each body is
-    lifted to multiply states (n, *bodies), for example. The result has as many axes as `like`.
+    An array with one number for each body then multiplies states (n, *bodies).
     """
     return array.reshape((1,) * (like.ndim - array.ndim) + array.shape)
+
+
+def replaced(
+    arrays: Sequence[Any], selected: Sequence[bool], replacements: Sequence[Any]
+) -> list[Any]:
+    """Return the list `arrays` with its `selected` items replaced, in order."""
+    rest = iter(replacements)
+    return [next(rest) if new else a for a, new in zip(arrays, selected, strict=True)]

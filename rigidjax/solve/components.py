@@ -18,11 +18,8 @@ Atoms = tuple[Array, ...]
 FEW = 32
 
 
-def split_into_scalars(tree: PyTree) -> Atoms:
-    """Return the numbers of a tree of arrays as a tuple of scalars, the inverse of `join_scalars`.
-
-    An array of more than `FEW` numbers is not split: it is one item of the tuple.
-    """
+def split_scalars(tree: PyTree) -> Atoms:
+    """Return the numbers of a tree of arrays as scalars; an array above `FEW` stays as it is."""
     parts: list[Array] = []
     for leaf in jax.tree.leaves(tree):
         leaf = jnp.asarray(leaf)
@@ -34,10 +31,7 @@ def split_into_scalars(tree: PyTree) -> Atoms:
 
 
 def join_scalars(scalars: Atoms, like: PyTree) -> PyTree:
-    """Return the tree of arrays whose numbers are in a tuple: the inverse of `split_into_scalars`.
-
-    `scalars` is that tuple, and `like` is a tree with the structure and the shapes of the result.
-    """
+    """Return the tree, with the structure and shapes of `like`, from its scalars."""
     leaves, structure = jax.tree.flatten(like)
     queue = iter(scalars)
     out = []

@@ -22,14 +22,15 @@ from jaxtyping import Array
 
 from rigidjax.solve.adaptive_loop import (
     NONFINITE,
-    acceptance_and_next_step_size,
-    previous_float,
-    row_of_each_body,
+    Method,
+    accept_and_adapt,
+    choose,
+    rows_at,
     starting_step,
+    step_ends,
 )
-from rigidjax.solve.batching import Arrays, add_leading_axes
-from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
-from rigidjax.solve.tableaus import Tableau
+from rigidjax.solve.batching import Arrays, lift
+from rigidjax.solve.runge_kutta import Step, error_estimate, stages
 
 # The largest number of guesses for one zero by Newton's method; after these guesses the interval
 # that contains the zero is halved again and again. `_GUESSES` is also the largest number of times
@@ -39,24 +40,8 @@ _GUESSES = 8
 _MOST = 70
 
 
-class SearchMethod(NamedTuple):
-    """Hold an explicit method and the field that it solves; states are arrays (n, *bodies).
-
-    A state has n numbers. `*bodies` is one last axis for the bodies of a batch, and no axis for one
-    body.
-    """
-
-    tableau: Tableau
-    field: Field
-    project: Callable[[Array], Array]  # scales a quaternion to length 1
-    sizes: list[int]  # how many numbers each array of the state has
-
-
 class Path(NamedTuple):
-    """Hold the arrays of a run that is searched for zeros of a condition along its motion.
-
-    In a batch each array has a last axis of bodies.
-    """
+    """Hold the arrays of a run that is searched; in a batch each has a last axis of bodies."""
 
     t0: Array
     stops: Array  # (J,) the times at which the field jumps, then the end of the run
@@ -65,30 +50,25 @@ class Path(NamedTuple):
     atol: Array  # the absolute tolerance
     h0: Array  # the length of the first step; NaN if the search chooses it
 
-    @property
-    def last_times_before_jumps(self) -> Array:
-        """Return the last floating-point time before each jump, and the end of the run, (J,).
 
-        The last stage of a step that ends at a jump is evaluated at this earlier time, so that it
-        sees the field as it is before the jump.
-        """
-        return jnp.concatenate([previous_float(self.stops[:-1]), self.stops[-1:]])
+class Measured(NamedTuple):
+    """Hold a condition g at a time and a state, and what tells whether it is a zero."""
+
+    g: Array
+    rate: Array  # dg/dt along the motion
+    slope: Array  # (n, *bodies) dy/dt
+    blur: Array  # the size that g may have from round-off alone
 
 
 class Motion(NamedTuple):
-    """Hold the motion of a body and a condition g along it; states are arrays (n, *bodies).
-
-    A state has n numbers. `*bodies` is one last axis for the bodies of a batch, and no axis for one
-    body.
-    """
+    """Hold the motion of a body and a condition g along it; states are arrays (n, *bodies)."""
 
     # attempt(step) returns the state after the step, and the norm of its error divided by the
     # tolerance.
     attempt: Callable[[Step], tuple[Array, Array]]
     order: int  # the order of this error
     longest: Array  # the length of the longest step
-    # condition(t, y) returns g, dg/dt, dy/dt and the size that g may have from round-off alone.
-    condition: Callable[[Array, Array], tuple[Array, ...]]
+    condition: Callable[[Array, Array], Measured]
     # counts(t, y, steps) returns whether a zero of g at the time t and the state y is a true zero,
     # and not caused by round-off alone. `steps` is the number of steps before it.
     counts: Callable[[Array, Array, Array], Array]
@@ -96,10 +76,7 @@ class Motion(NamedTuple):
 
 
 class Search(NamedTuple):
-    """Describe which crossings to find: their direction, and the largest number of them.
-
-    A crossing is a zero of a condition g along a motion.
-    """
+    """Describe which crossings to find."""
 
     direction: int  # 1: g goes up through zero, −1: down, 0: both
     max_crossings: int  # the largest number of crossings
@@ -107,11 +84,7 @@ class Search(NamedTuple):
 
 
 class Located(NamedTuple):
-    """Hold the crossings found, which are zeros of a condition g, and the end of the search.
-
-    K is the largest number of crossings, and n the number of numbers of a state. `*bodies` is one
-    last axis for the bodies of a batch, and no axis for one body.
-    """
+    """Hold the crossings found, and the end of the search; K is the largest number of crossings."""
 
     times: Array  # (K, *bodies), NaN after the last crossing
     states: Array  # (K, n, *bodies)
@@ -123,23 +96,15 @@ class Located(NamedTuple):
 
 
 class _IntervalEnd(NamedTuple):
-    """Hold one end of an interval of time, within a step, that contains a zero of the condition g.
+    """Hold one end of an interval, within a step, that contains a zero of g."""
 
-    - `x`: the time of the end, counted from the start of the step, s.
-    - `g`, `rate`: g and dg/dt at this time.
-    """
-
-    x: Array
+    x: Array  # its time after the start of the step, s
     g: Array
-    rate: Array
+    rate: Array  # dg/dt
 
 
 class _SearchState(NamedTuple):
-    """Hold the state of the search for zeros of g for one body, or for many in the last axis.
-
-    The condition g is a function of the time and the state of a body. A pass of the search is one
-    attempted step, or a part of a step that ends at a guess for a zero.
-    """
+    """Hold the state of the search; a pass is a step, or a part that ends at a guess for a zero."""
 
     t: Array  # the time that is reached
     y: Array  # (n, *bodies) the state at t
@@ -159,13 +124,7 @@ class _SearchState(NamedTuple):
 
 
 def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
-    """Return the zeros of a condition g along a run, from `run.t0` to the last of `run.stops`.
-
-    - `motion`: takes a step, and evaluates g and the round-off of g.
-    - `search`: the direction of the zeros, their largest number, and the largest number of passes.
-    - `run`: the time and state at the start of the run, the times at which steps end, the
-      tolerances, and the length of the first step.
-    """
+    """Return the zeros of g along a run, from `run.t0` to the last of `run.stops`."""
     t0, y0 = run.t0, run.y0
     g, rate, *_ = motion.condition(t0, y0)
     # If g is zero at the start, to within the round-off of the time, the sign of g is not known.
@@ -180,17 +139,17 @@ def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
     end = _IntervalEnd(x, none, none)
     g = jnp.where(there, none, g)
     body = _SearchState(t0, y0, h, side, g, rate, zero, no, x, end, end, zero, zero, no, no)
-    on = lambda body: jnp.any(_is_searching(search, run, body))  # noqa: E731
+    on = lambda body: jnp.any(_searching(search, run, body))  # noqa: E731
 
     def next_zero(body: _SearchState) -> _SearchState:
-        body = lax.while_loop(on, partial(_next_search_state, motion, search, run), body)
+        body = lax.while_loop(on, partial(_next, motion, search, run), body)
         return body._replace(found=body.found & motion.counts(body.t, body.y, body.steps))
 
     def row(state: Any) -> Any:
         body, times, states, jumps, k, count = state
         body = lax.while_loop(on, next_zero, body._replace(found=no))
         t = jnp.where(body.found, body.t, jnp.nan)
-        y = jnp.where(add_leading_axes(body.found, body.y), body.y, jnp.nan)
+        y = jnp.where(lift(body.found, body.y), body.y, jnp.nan)
         times = lax.dynamic_update_index_in_dim(times, t, k, 0)
         states = lax.dynamic_update_index_in_dim(states, y, k, 0)
         jumps = lax.dynamic_update_index_in_dim(jumps, body.found & body.jumped, k, 0)
@@ -207,42 +166,21 @@ def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
     return Located(times, states, jumps, count, body.t, body.h, body.steps)
 
 
-def _is_searching(search: Search, run: Path, body: _SearchState) -> Array:
-    """Return for each body whether its search for a zero of a condition g goes on.
+def _searching(search: Search, run: Path, body: _SearchState) -> Array:
+    """Return for each body whether its search goes on.
 
-    The search of a body ends in any of four cases: a zero was found; the end of the run is reached;
-    the largest number of passes is used up; or no next step is possible. In the last case the
-    length of the next step is 0 if the step would be shorter than the round-off of the time, and
-    NaN if the run met NaN.
-
-    - `search`: holds the largest number of passes; a pass is one attempted step, or a part of one.
-    - `run`: holds the stops, the times at which steps end; the last stop is the end of the run.
-    - `body`: the state of the search.
+    It ends at a zero, at the end of the run, after the last pass, and if no next step is possible:
+    its length is then 0 (below the round-off of the time) or NaN (the run met NaN).
     """
     ahead = (body.stop < run.stops.shape[0]) & (body.steps < search.max_steps)
     return ahead & (body.h > 0) & ~body.found
 
 
-def _next_search_state(
-    motion: Motion, search: Search, run: Path, body: _SearchState
-) -> _SearchState:
-    """Return the state of the search after one more attempted step, or part of a step.
-
-    The search is for zeros of a condition g along a motion. A body whose search has ended keeps its
-    state of the search.
-
-    - `motion`: takes a step, and evaluates g and the size that g may have from round-off alone.
-    - `search`: the direction of the zeros that are wanted, and the largest number of passes (of
-      attempted steps and parts of steps).
-    - `run`: holds the stops, which are the times at which steps end.
-    - `body`: the state of the search before this pass; its arrays may have a last axis of bodies.
-    """
-    on = _is_searching(search, run, body)
+def _next(motion: Motion, search: Search, run: Path, body: _SearchState) -> _SearchState:
+    """Return the state of the search after one more pass; an ended search keeps its state."""
+    on = _searching(search, run, body)
     t, h, y, side = body.t, body.h, body.y, body.side
-    begin, end = (
-        row_of_each_body(run.stops, body.stop),
-        row_of_each_body(run.last_times_before_jumps, body.stop),
-    )
+    begin, end = rows_at(run.stops, body.stop), rows_at(step_ends(run.stops), body.stop)
     arrived = on & ~body.refining & (t >= begin)
     left = end - t
     last = ~body.refining & (h >= left)
@@ -261,17 +199,15 @@ def _next_search_state(
         _IntervalEnd(length, g, rate),
     )
 
-    # If the error of a step is below the tolerance, one of three things happens: the step is
-    # accepted; or the step is taken again up to an extremum of g, because g may have two zeros
-    # beside it (`shorter`); or the zero of g in the step is searched for (`crossed`).
+    # If the error of a step is below the tolerance, the step is accepted; or it is taken again up
+    # to an extremum of g, because g may have two zeros beside it (`shorter`); or the zero of g in
+    # the step is searched for (`crossed`).
     step = on & ~arrived & ~body.refining
     whole = run.stops[-1] - run.t0
-    good, following = acceptance_and_next_step_of_search(
-        norm, motion.order, t, length, h, last, whole
-    )
+    good, following = _accept(norm, motion.order, t, length, h, last, whole)
     following = jnp.minimum(following, motion.longest)
     good = step & good
-    hidden, turn = _may_hide_zeros(side, start, here, blur)
+    hidden, turn = _hidden_zeros(side, start, here, blur)
     eps = jnp.finfo(h.dtype).eps
     long_enough = turn > 8 * eps * jnp.maximum(jnp.abs(t), eps * whole)
     shorter = good & hidden & long_enough & (body.tries < _GUESSES)
@@ -284,29 +220,27 @@ def _next_search_state(
     # A zero is searched for by Newton's method in the interval from `low` to `high`, at whose ends
     # g has opposite signs.
     refine = on & body.refining
-    low = _choose_end(refine & ~other, here, body.low)
-    high = _choose_end(refine & other, here, body.high)
+    low = choose(refine & ~other, here, body.low)
+    high = choose(refine & other, here, body.high)
     near, pinned, move, guess = _newton_step(body, low, high, here)
     done = refine & (near | pinned)
     move = jnp.where(done, move, jnp.zeros_like(move))
-    low, high = _choose_end(crossed, start, low), _choose_end(crossed, here, high)
+    low, high = choose(crossed, start, low), choose(crossed, here, high)
 
     new = accept | done
     reached = accept & last
-    shifted = motion.project(after + slope * add_leading_axes(move.astype(y.dtype), y))
+    shifted = motion.project(after + slope * lift(move.astype(y.dtype), y))
     flipped = done | (accept & other)
     return _SearchState(
         t=jnp.where(new, jnp.where(reached, begin, late) + move, t),
-        y=jnp.where(
-            add_leading_axes(new, y), jnp.where(add_leading_axes(done, y), shifted, after), y
-        ),
+        y=choose(new, choose(done, shifted, after), y),
         h=next_h,
         side=jnp.where(flipped, -side, jnp.where(accept & (side == 0), jnp.sign(g), side)),
         g=jnp.where(done, jnp.zeros_like(g), jnp.where(accept, g, body.g)),
         rate=jnp.where(new, rate, body.rate),
         stop=body.stop + (arrived | reached).astype(jnp.int32),
         refining=(body.refining | crossed) & ~done,
-        x=jnp.where(crossed, _guess_zero(side, low, high), guess),
+        x=jnp.where(crossed, _guess(side, low, high), guess),
         low=low,
         high=high,
         tries=jnp.where(shorter | (refine & ~done), body.tries + 1, 0).astype(jnp.int32),
@@ -316,24 +250,21 @@ def _next_search_state(
     )
 
 
+class _Newton(NamedTuple):
+    """Hold a step of Newton's method towards a zero of g."""
+
+    near: Array  # whether it is short enough to reach the zero
+    # whether the search has to end at the guess all the same: no floating-point time lies between
+    # the ends, or all guesses are used up
+    pinned: Array
+    move: Array  # its length, s, or 0 if it does not reach the zero
+    guess: Array  # the next guess, s after the start of the step of the motion
+
+
 def _newton_step(
     body: _SearchState, low: _IntervalEnd, high: _IntervalEnd, here: _IntervalEnd
-) -> tuple[Array, Array, Array, Array]:
-    """Take one step of Newton's method towards a zero of g, from a guess between two interval ends.
-
-    - `body`: the state of the search; only three of its fields are used: the time and the length of
-      the step of the motion, and the number of guesses so far.
-    - `low`, `high`: the ends of the interval, at which the condition g has opposite signs.
-    - `here`: the guess, with g and dg/dt there.
-
-    **Returns** four things:
-
-    - whether Newton's step reaches the zero, because it is short enough;
-    - whether the search has to end at the guess even if Newton's step does not reach the zero,
-      because no floating-point time lies between `low` and `high` or all guesses are used up;
-    - the length of Newton's step, s, or 0 if it does not reach the zero;
-    - the next guess, as a time after the start of the step of the motion, s.
-    """
+) -> _Newton:
+    """Take one step of Newton's method towards a zero of g, from the guess `here`."""
     rate, eps = here.rate, jnp.finfo(body.h.dtype).eps
     move = (-here.g / jnp.where(rate == 0, jnp.ones_like(rate), rate)).astype(here.x.dtype)
     goal = here.x + move
@@ -345,44 +276,23 @@ def _newton_step(
     pinned = (width <= unit) | (body.tries >= _MOST)
     inside = (goal > low.x) & (goal < high.x) & (body.tries < _GUESSES)
     guess = jnp.where(inside, goal, low.x + 0.5 * width)
-    return near, pinned, jnp.where(near, move, jnp.zeros_like(move)), guess
+    return _Newton(near, pinned, jnp.where(near, move, jnp.zeros_like(move)), guess)
 
 
-def _choose_end(condition: Array, if_true: _IntervalEnd, if_false: _IntervalEnd) -> _IntervalEnd:
-    """Return `if_true` for the bodies for which `condition` is true, and `if_false` for the others.
-
-    - `condition`: one truth value for each body.
-    - `if_true`, `if_false`: two ends of intervals, each a time with the values of g and dg/dt at
-      this time; g is the function whose zero is searched for.
-    """
-    pairs = zip(if_true, if_false, strict=True)
-    return _IntervalEnd(*(jnp.where(condition, x, y) for x, y in pairs))
-
-
-def _may_hide_zeros(
+def _hidden_zeros(
     sign_at_low: Array, low: _IntervalEnd, high: _IntervalEnd, round_off: Array
 ) -> tuple[Array, Array]:
-    """Return whether a condition g may have two zeros in an interval that its signs do not show.
+    """Return whether g may have two zeros that its signs hide, and the time after `low` between
+    them.
 
-    If g crosses zero two more times, its signs at the ends of the interval stay as they are. This
-    function therefore examines the cubic polynomial that has the values and slopes of g at both
-    ends. Below, an extremum "beyond zero" is one at which the polynomial has the opposite sign of g
-    at `low`, and is farther from zero than `round_off`.
+    The cubic polynomial with the values and slopes of g at both ends is examined. An extremum
+    "beyond zero" is one at which it has the opposite sign of g at `low`, farther from zero than
+    `round_off`.
 
-    If g has the same sign at both ends, it may have two zeros in two cases: if the polynomial has
-    an extremum beyond zero in the interval; or if it has an extremum in the interval, and the
-    tangents at both ends meet beyond zero. If g has opposite signs at the ends, it may have two
-    more zeros in one case: if the polynomial has an extremum beyond zero in the interval, and after
-    it an extremum with the sign of g at `low`.
-
-    - `sign_at_low`: the sign of g at `low`, 1 or −1.
-    - `low`, `high`: the ends of the interval, each a time after the start of the step, s, with the
-      values of g and dg/dt at this time.
-    - `round_off`: the size that g may have from round-off alone.
-
-    **Returns** two things: whether g may have two zeros that its signs do not show; and the time of
-    the extremum, s, counted from `low`. If g has two such zeros, one lies on each side of this
-    extremum.
+    If g has the same sign at both ends, it may have two zeros if the polynomial has an extremum
+    beyond zero; or if it has an extremum, and the tangents at both ends meet beyond zero. If g has
+    opposite signs, it may have two more if an extremum with the sign of g at `low` follows one
+    beyond zero.
     """
     width = (high.x - low.x).astype(low.g.dtype)
     a, b = sign_at_low * low.rate * width, sign_at_low * high.rate * width
@@ -418,18 +328,11 @@ def _may_hide_zeros(
     return within(least) & (two | three), least.astype(low.x.dtype) * (high.x - low.x)
 
 
-def _guess_zero(sign_at_low: Array, low: _IntervalEnd, high: _IntervalEnd) -> Array:
-    """Return a first guess for the time of a zero of a condition g, counted from the step's start.
+def _guess(sign_at_low: Array, low: _IntervalEnd, high: _IntervalEnd) -> Array:
+    """Return a first guess for the time of a zero, s after the start of the step.
 
-    The guess is in seconds. The condition g is a function of the time and the state of a body.
-
-    - `sign_at_low`: the sign of g at `low`, 1 or −1; at `high` the sign is the opposite one.
-    - `low`, `high`: the ends of the interval, each a time x after the start of the step, s, with
-      the values of g and dg/dt at this time.
-
-    The guess is x(0), where x(g) is the cubic polynomial in g that has the times and the slopes
-    dx/dg at `low` and `high`. The guess is the middle of the interval if g moves away from zero at
-    `low` or towards zero at `high`, or if x(0) lies outside of the interval.
+    It is x(0) of the cubic polynomial x(g) with the times and the slopes dx/dg at both ends; the
+    middle if g moves away from zero at `low` or towards it at `high`, or if x(0) lies outside.
     """
     steady = (sign_at_low * low.rate < 0) & (sign_at_low * high.rate < 0)
     rise = jnp.where(steady, high.g - low.g, 1)
@@ -440,24 +343,13 @@ def _guess_zero(sign_at_low: Array, low: _IntervalEnd, high: _IntervalEnd) -> Ar
     x = width * u * u * (3 - 2 * u) + rise * u * (1 - u) * ((1 - u) * left - u * right)
     middle = low.x + 0.5 * (high.x - low.x)
     x = low.x + x.astype(low.x.dtype)
-    inside = steady & (x > low.x) & (x < high.x)
-    return jnp.where(inside, x, middle)
+    return jnp.where(steady & (x > low.x) & (x < high.x), x, middle)
 
 
 def step_with_error(
-    method: SearchMethod, constants: Arrays, run: Path, step: Step
+    method: Method, constants: Arrays, run: Path, step: Step
 ) -> tuple[Array, Array]:
-    """Return the state after a step of an explicit method, and the error divided by the tolerance.
-
-    - `method`: the explicit method and the field, dy/dt.
-    - `constants`: the arrays on which the field depends.
-    - `run`: holds the tolerances `rtol` and `atol`.
-    - `step`: the time and state (n, *bodies) at the start of the step, and its length, s; `*bodies`
-      is one last axis for the bodies of a batch, and no axis for one body.
-
-    **Returns** two things: the state (n, *bodies) after the step; and the root mean square, over
-    the n numbers of the state, of error divided by tolerance. This norm has no derivative.
-    """
+    """Return the state after a step, and its error over the tolerance, a root mean square."""
     there = stages(method.tableau, method.field, constants, step)
     right = method.project(there.end)
     # The error serves only to choose the lengths of steps, which derivatives hold constant. It
@@ -465,12 +357,11 @@ def step_with_error(
     left, after, h, slopes = lax.stop_gradient((step.y, right, step.h, there.slopes))
     error = error_estimate(method.tableau, method.sizes, h, slopes)
     largest = jnp.maximum(jnp.abs(left), jnp.abs(after))
-    scale = add_leading_axes(run.atol, left) + add_leading_axes(run.rtol, left) * largest
-    tiny = float(jnp.finfo(error.dtype).tiny)
-    return right, jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
+    scale = lift(run.atol, left) + lift(run.rtol, left) * largest
+    return right, jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + float(jnp.finfo(error.dtype).tiny))
 
 
-def acceptance_and_next_step_of_search(
+def _accept(
     error_norm: Array,
     order: int,
     t: Array,
@@ -481,19 +372,11 @@ def acceptance_and_next_step_of_search(
 ) -> tuple[Array, Array]:
     """Return whether a step is accepted, and the length of the next step, s.
 
-    If the step is rejected, and a shorter step would be below the round-off of the time, there is
-    no next step. The next length is then 0, or NaN if the error of the step is not finite.
-
-    - `error_norm`: the error divided by the tolerance, as `step_with_error` returns it.
-    - `order`: the order of this error.
-    - `t`, `h`: the time at which the step began, and its length, s.
-    - `uncut_length`: the length, s, that the step would have had if it had not been cut short.
-    - `ends_at_stop`: whether the step was cut short to end at a stop, a time at which a step has to
-      end. Such a step may be short although the next step can be long.
-    - `run_length`: the length of the run, s, which gives a lower limit for the length of a step
-      near t = 0, where the round-off of t vanishes.
+    If a rejected step cannot be shortened, the next length is 0, or NaN if the error is not finite.
+    A step that a stop cut short does not shorten the next one below `uncut_length`. `run_length`
+    limits the length near t = 0, where the round-off of t vanishes.
     """
-    good, following = acceptance_and_next_step_size(error_norm, order, h)
+    good, following = accept_and_adapt(error_norm, order, h)
     uncut_length = lax.stop_gradient(uncut_length)
     eps = jnp.finfo(h.dtype).eps
     unit = 8 * eps * jnp.maximum(jnp.abs(t), eps * run_length)
@@ -504,14 +387,7 @@ def acceptance_and_next_step_of_search(
 
 
 def result_of_search(h: Array, t: Array, end: Array, is_full: Array) -> dfx.RESULTS:
-    """Return how a search for crossings ended, as a `diffrax.RESULTS`.
-
-    - `h`: the length of the step that would follow, s: 0 if no step is left that is long enough,
-      NaN if the run met NaN.
-    - `t`: the time at which the search ended, s.
-    - `end`: the time at which the run ends, s.
-    - `is_full`: whether the search found the largest allowed number of crossings.
-    """
+    """Return how a search ended, by its last length `h` and time `t`, s (see `_searching`)."""
     result = dfx.RESULTS.dt_min_reached
     for there, word in (
         (jnp.isnan(h), NONFINITE),
@@ -523,15 +399,10 @@ def result_of_search(h: Array, t: Array, end: Array, is_full: Array) -> dfx.RESU
     return result
 
 
-def first_step_length(method: SearchMethod, constants: Arrays, run: Path) -> Array:
-    """Return the length of the first step of a search, s, from the state and its slope at `run.t0`.
-
-    - `method`: the explicit method and the field, dy/dt.
-    - `constants`: the arrays on which the field depends.
-    - `run`: holds the time and state at the start of the run, and the tolerances.
-    """
+def first_step(method: Method, constants: Arrays, run: Path) -> Array:
+    """Return the length of the first step of a search, s."""
     y0 = run.y0
-    scale = add_leading_axes(run.atol, y0) + add_leading_axes(run.rtol, y0) * jnp.abs(y0)
+    scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
     slope = method.field(constants, run.t0, y0)
     size, rate = (jnp.sqrt(jnp.mean((a / scale) ** 2, 0)) for a in (y0, slope))
     return starting_step(size, rate, method.tableau.order).astype(run.t0.dtype)

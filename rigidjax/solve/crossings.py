@@ -48,29 +48,29 @@ from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import missing_state_part_message
 from rigidjax.solve import crossing_loop, validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
-from rigidjax.solve.adaptive_loop import result_or_nonfinite_input
-from rigidjax.solve.batching import Arrays, Layout, run_with_bodies_last
+from rigidjax.solve.adaptive_loop import Method, result_of_body
+from rigidjax.solve.batching import Arrays, Layout, bodies_last
 from rigidjax.solve.crossing_loop import (
     Located,
+    Measured,
     Motion,
     Path,
     Search,
-    SearchMethod,
-    first_step_length,
+    first_step,
     result_of_search,
     step_with_error,
 )
 from rigidjax.solve.explicit import AbstractExplicit, require_explicit
-from rigidjax.solve.linear_map import known_with_derivatives_of, nan_derivatives_where_not_finite
+from rigidjax.solve.linear_map import nan_derivatives, with_derivatives
 from rigidjax.solve.momentum import ByMomentum, equations_by_momentum
 from rigidjax.solve.run import (
     ClosedFormRun,
     DiffraxRun,
-    convert_to_forward_time,
-    direction_of_times,
     equations_of_motion,
-    hoist_traced_numbers,
+    forward_time,
+    hoist,
     solve,
+    time_direction,
 )
 from rigidjax.solve.stops import extract_constants, program_with_stops
 
@@ -224,42 +224,29 @@ def crossings(
     if _checks.is_known((begin, end)) and float(begin) == float(end):
         raise ValueError(f"t1: wanted another time than t0, got {float(end):g} for both")
     ts = jnp.stack([begin, end])
-    body, state0, times = validation.checked_body_state_and_times(
-        body, state0, ts, torque, throw=False
-    )
-    torque = hoist_traced_numbers(torque, times[0], state0, body)
-    state0 = check_condition_and_add_torque_states(event, body, state0, torque, times[0])
-    condition = hoist_traced_numbers(condition, times[0], state0, body)
+    body, state0, times = validation.checked_run(body, state0, ts, torque, throw=False)
+    torque = hoist(torque, times[0], state0, body)
+    state0 = checked_state(event, body, state0, torque, times[0])
+    condition = hoist(condition, times[0], state0, body)
     event = Event(condition, direction, max_step)
     if torque is None and solver is None and body is not None:
-        return _crossings_of_run(ClosedFormRun(body, False), event, many, max_steps, state0, times)
+        return _crossings(ClosedFormRun(body, False), event, many, max_steps, state0, times)
     solver = require_explicit(solver)
     rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
-    way = direction_of_times(times)
+    way = time_direction(times)
     setup = DiffraxRun(
         body, torque, solver, rtol, atol, None, None, None, REPLAY, NO_METER, way, max_steps, False
     )
-    return _crossings_of_run(setup, event, many, max_steps, state0, times)
+    return _crossings(setup, event, many, max_steps, state0, times)
 
 
-def check_condition_and_add_torque_states(
-    event: Event,
-    body: Inertia | MassProperties | None,
-    state0: PyTree,
-    torque: Any,
-    t: Array,
+def checked_state(
+    event: Event, body: Inertia | MassProperties | None, state0: PyTree, torque: Any, t: Array
 ) -> PyTree:
-    """Check an event's condition at the start of a run, and return the state at the start.
+    """Check an event's condition at the start; return the state, with the torque's own states.
 
-    If the torque has states of its own, such as the speed of a wheel, the result is a `Coupled` of
-    `state0` and these states; if it has none, the result is `state0` itself.
-
-    - `event`: the `Event` whose condition is checked.
-    - `body`, `state0`, `torque`: as for `simulate`.
-    - `t`: the time of the start, s.
-
-    **Raises:** `TypeError` or `ValueError` if the condition at the start is not one real number,
-    reads a part that the state lacks, or is NaN.
+    Raise `TypeError` or `ValueError` if the condition is not one real number, reads a part that the
+    state lacks, or is NaN.
     """
     state0 = with_own_states(body, state0, torque, t)
     try:
@@ -270,7 +257,7 @@ def check_condition_and_add_torque_states(
             raise
         raise TypeError(told) from wrong
     if _checks.is_known((event, body, t, state0)) and bool(
-        jnp.isnan(_compiled_condition_value(event, body, t, state0))
+        jnp.isnan(_compiled_value(event, body, t, state0))
     ):
         words = "condition: wanted a number wherever the motion goes, got NaN at the start, t = "
         raise ValueError(f"{words}{float(t):g}")
@@ -278,14 +265,7 @@ def check_condition_and_add_torque_states(
 
 
 def condition_value(event: Event, body: Any, t: Any, y: PyTree) -> Array:
-    """Return the value of an event's condition, and check that it is one real number.
-
-    - `event`: the `Event`, whose condition is a function `(t, state, body)`.
-    - `body`: the body of the run, or `None`.
-    - `t`, `y`: the time, s, and the state at which the condition is evaluated.
-
-    **Raises:** `TypeError` or `ValueError` if the condition gives a truth value or an array.
-    """
+    """Return the value of a condition; raise `TypeError` or `ValueError` unless it is real."""
     with _checks.explain_tracing("condition", event.condition):
         found = event.condition(t, y, body)
     if jnp.issubdtype(getattr(found, "dtype", type(found)), jnp.bool_):
@@ -296,67 +276,56 @@ def condition_value(event: Event, body: Any, t: Any, y: PyTree) -> Array:
     return _checks.array_of_shape(found, (), "condition", hint="one real number, zero at the event")
 
 
-_compiled_condition_value = eqx.filter_jit(condition_value)
+_compiled_value = eqx.filter_jit(condition_value)
+
+
+class EventRun(NamedTuple):
+    """Hold a run that ends at its first event."""
+
+    ys: PyTree  # the states at the saved times, NaN after the event
+    stats: dict[str, Any]  # as in `Solution.stats`
+    result: dfx.RESULTS
+    time: Array  # the time of the event, s, NaN if there is none
+    state: PyTree  # the state at the event, NaN if there is none
 
 
 @eqx.filter_jit
 def solve_until_event(
     setup: ClosedFormRun | DiffraxRun, event: Event, state0: PyTree, ts: Array
-) -> tuple[PyTree, dict[str, Any], dfx.RESULTS, Array, PyTree]:
-    """Return the saved states of a run that ends at its first event, and the time of the event.
-
-    - `setup`: how the run is computed: in closed form or by diffrax.
-    - `event`: the `Event` at which the run ends.
-    - `state0`: the state at `ts[0]`.
-    - `ts`: (T,) the times at which states are saved, s, in the order of the run.
-
-    **Returns** five things: the states at `ts`, NaN at the times after the event; the numbers of
-    steps, a dict as in `Solution.stats`; how the run ended, a `diffrax.RESULTS` that is
-    `event_occurred` if there was an event; the time of the event, s; and the state at the event. If
-    there is no event, this time and this state are NaN.
-    """
+) -> EventRun:
+    """Return the run that ends at the first event."""
     state0 = project_to_group(state0)
-    crossed, numbers = condition_and_motion_of_run(setup, event, state0, ts)
+    crossed, numbers = section_of_run(setup, event, state0, ts)
     given = setup.max_steps if isinstance(setup, DiffraxRun) else None
     steps = 1_000_000 if given is None else given
-    found = locate_crossings(crossed, Search(event.direction, 1, steps), numbers)
+    found = locate(crossed, Search(event.direction, 1, steps), numbers)
     met, last = found.number > 0, lax.stop_gradient(ts[-1])
-    end = jnp.where(met, crossed.signed_time(found.times[0]), last)
-    before = ~(crossed.signed_time(ts) > crossed.signed_time(end))
+    end = jnp.where(met, crossed.signed(found.times[0]), last)
+    before = ~(crossed.signed(ts) > crossed.signed(end))
     short = jnp.concatenate([jnp.where(before, ts, end), jnp.where(met, end, ts[-1])[None]])
     ys, stats, result = solve(setup, state0, short)
-    y = crossed.vector_of_state(end, jax.tree.map(lambda leaf: leaf[-1], ys))
+    y = crossed.vector(end, jax.tree.map(lambda leaf: leaf[-1], ys))
     jumps = found.jumps[0]
-    s, y = chebyshev_step_to_crossing(
-        crossed, numbers[0], crossed.signed_time(end), y, met & ~jumps
-    )
+    s, y = chebyshev_step(crossed, numbers.constants, crossed.signed(end), y, met & ~jumps)
     met = met & (result == dfx.RESULTS.successful)
 
     def rows(leaf: Array) -> Array:
         there = before.reshape(-1, *[1] * (leaf.ndim - 1))
         return jnp.where(there, leaf[:-1], jnp.full_like(leaf[:-1], jnp.nan))
 
-    time, y = (jnp.where(met, leaf, jnp.nan) for leaf in (crossed.signed_time(s), y))
+    time, y = (jnp.where(met, leaf, jnp.nan) for leaf in (crossed.signed(s), y))
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
-    ys = nan_derivatives_where_not_finite(jax.tree.map(rows, ys), inputs)
-    time, state = _set_unknown_derivatives_to_nan(
-        (time, crossed.state_of_vector(time, y)), jumps, inputs
-    )
-    return ys, stats, dfx.RESULTS.where(met, dfx.RESULTS.event_occurred, result), time, state
+    ys = nan_derivatives(jax.tree.map(rows, ys), inputs)
+    time, state = _unknown_to_nan((time, crossed.state(time, y)), jumps, inputs)
+    result = dfx.RESULTS.where(met, dfx.RESULTS.event_occurred, result)
+    return EventRun(ys, stats, result, time, state)
 
 
-def _set_unknown_derivatives_to_nan(crossing: PyTree, jumps: Array, inputs: PyTree) -> PyTree:
-    """Return the arrays of `crossing` with their values, and with NaN for unknown derivatives.
+def _unknown_to_nan(crossing: PyTree, jumps: Array, inputs: PyTree) -> PyTree:
+    """Return the arrays of `crossing`, with NaN for the derivatives that are not known.
 
-    - `crossing`: a tree of arrays: the times and states of crossings, which are the zeros of a
-      condition g along a motion.
-    - `jumps`: whether g jumps over zero at each crossing. Its axes are the first axes of each array
-      in `crossing`.
-    - `inputs`: a tree of all numbers with respect to which derivatives are taken.
-
-    The derivatives of a number in `crossing` become NaN in two cases: if the number itself is NaN;
-    and if g jumps over zero at the crossing, because it is then not known how the crossing depends
-    on the inputs. All other derivatives stay as they are.
+    These are those of NaN itself, and of a crossing at which g jumps over zero: how such a crossing
+    depends on the inputs is not known. The axes of `jumps` are the first axes of each array.
     """
 
     def lost(leaf: Array) -> Array:
@@ -364,113 +333,59 @@ def _set_unknown_derivatives_to_nan(crossing: PyTree, jumps: Array, inputs: PyTr
             jumps.reshape(*jumps.shape, *[1] * (leaf.ndim - jumps.ndim)), jnp.nan, leaf
         )
 
-    moved = nan_derivatives_where_not_finite(jax.tree.map(lost, crossing), inputs)
-    return known_with_derivatives_of(lax.stop_gradient(crossing), moved)
+    moved = nan_derivatives(jax.tree.map(lost, crossing), inputs)
+    return with_derivatives(lax.stop_gradient(crossing), moved)
 
 
 @eqx.filter_jit
-def _crossings_of_run(
+def _crossings(
     setup: ClosedFormRun | DiffraxRun, event: Event, max_crossings: int, max_steps: int,
     state0: Any, ts: Array,
 ) -> Crossings:  # fmt: skip
-    """Return the crossings of a run, with their derivatives.
-
-    - `setup`: the body, the torque, and how the motion is computed: in closed form or by diffrax.
-    - `event`: an `Event`, which holds the condition that is zero at a crossing, and the direction
-      in which the condition has to pass zero.
-    - `max_crossings`: K, the largest number of crossings; the run ends at crossing number K.
-    - `max_steps`: the largest number of steps, parts of steps included.
-    - `state0`: the state at `ts[0]`.
-    - `ts`: (2,) the times at which the run begins and ends, s.
-    """
+    """Return the crossings of a run, with their derivatives."""
     state0 = project_to_group(state0)
-    crossed, numbers = condition_and_motion_of_run(setup, event, state0, ts)
-    found = locate_crossings(crossed, Search(event.direction, max_crossings, max_steps), numbers)
-    times, states = _crossings_with_derivatives(
+    crossed, numbers = section_of_run(setup, event, state0, ts)
+    found = locate(crossed, Search(event.direction, max_crossings, max_steps), numbers)
+    times, states = _differentiable(
         found.times, found.states, found.jumps, setup, event, state0, ts
     )
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
-    out = (
-        crossed.signed_time(times),
-        jax.vmap(crossed.state_of_vector)(crossed.signed_time(times), states),
-    )
-    times, states = _set_unknown_derivatives_to_nan(out, found.jumps, inputs)
-    result = result_of_search(
-        found.h, found.t, crossed.signed_time(ts[-1]), found.number >= max_crossings
-    )
-    result = result_or_nonfinite_input(result, setup.body)
+    times = crossed.signed(times)
+    out = times, jax.vmap(crossed.state)(times, states)
+    times, states = _unknown_to_nan(out, found.jumps, inputs)
+    full = found.number >= max_crossings
+    result = result_of_search(found.h, found.t, crossed.signed(ts[-1]), full)
+    result = result_of_body(result, setup.body)
     return Crossings(times, states, found.number, result, found.steps)
 
 
 @eqx.filter_custom_jvp
-def _crossings_with_derivatives(
-    times: Array, states: Array, jumps: Array, *inputs: Any
-) -> tuple[Array, Array]:
-    """Return `times` and `states` as they are; their derivatives come from a second run.
+def _differentiable(times: Array, states: Array, jumps: Array, *inputs: Any) -> tuple[Array, Array]:
+    """Return the crossings (K,), (K, n) as they are; their derivatives come from a second run.
 
-    In the second run the motion is computed up to the fixed `times`, and each crossing is found by
-    one step from there. The second run is made only if derivatives are taken.
-
-    - `times`, `states`: the K crossings found, shapes (K,) and (K, n) for states of n numbers. The
-      times are s = σt, where σ is 1 for a run forwards in time t and −1 for a run backwards.
-    - `jumps`: (K,), whether the condition, which is zero at a crossing, jumps over zero there.
-    - `inputs`: four things: the set-up of the run, which holds the body and the torque; the
-      `Event`, which holds the condition; the state at the start; and the times t, in seconds, at
-      which the run begins and ends.
+    It is made only if derivatives are taken. `inputs` are set-up, event, start and times.
     """
     return times, states
 
 
-@_crossings_with_derivatives.def_jvp
-def _jvp_of_crossings(
-    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[PyTree, PyTree]:
-    """Return the times and states of known crossings, and their tangents from a second run.
+@_differentiable.def_jvp
+def _jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+    """Return known crossings, and their tangents: those of a step from the fixed times found."""
+    found, jumps = primals[:2], primals[2]
+    there = jnp.isfinite(found[0])
 
-    - `primals`: the times and states of the crossings; whether the condition jumps over zero at
-      each of them; then the four inputs of the second run: its set-up, its `Event`, the state at
-      the start, and the times at which it begins and ends.
-    - `tangents`: the tangents of all these; only the tangents of the four inputs are used.
-    """
-    found, jumps, inputs = primals[:2], primals[2], primals[3:]
-    moved, along = eqx.filter_jvp(
-        partial(_recompute_crossings, found[0], jumps), inputs, tangents[3:]
-    )
-    return known_with_derivatives_of(found, moved), along
+    def again(setup: Any, event: Event, state0: Any, ts: Array) -> tuple[Array, Array]:
+        crossed, (constants, *_) = section_of_run(setup, event, state0, ts)
+        start = lax.stop_gradient(crossed.signed(ts[0]))
+        s = jnp.where(there, found[0], jnp.max(jnp.where(there, found[0], start)))
+        t = crossed.signed(s)
+        ys, *_ = solve(setup, state0, jnp.concatenate([ts[:1], t]))
+        ys = jax.vmap(crossed.vector)(t, jax.tree.map(lambda leaf: leaf[1:], ys))
+        times, states = jax.vmap(partial(chebyshev_step, crossed, constants))(s, ys, there & ~jumps)
+        return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
 
-
-def _recompute_crossings(
-    times: Array, jumps: Array, setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any,
-    ts: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Return the times and states of known crossings, computed once more to be differentiated.
-
-    The motion is computed up to the fixed `times`, and each crossing near such a time is found by
-    one step of Chebyshev's method (Newton's method with the second derivative).
-
-    - `times`: (K,) the times of the crossings, s = σt, where σ is 1 for a run forwards in time t
-      and −1 for a run backwards; NaN after the last crossing.
-    - `jumps`: (K,), whether the condition jumps over zero at each crossing.
-    - `setup`: the body, the torque, and how the motion is computed: in closed form or by diffrax.
-    - `event`: an `Event`, which holds the condition that is zero at a crossing.
-    - `state0`: the state at `ts[0]`, of n numbers.
-    - `ts`: (T,) times t, in seconds; the run begins at the first and ends at the last of them.
-
-    **Returns** two things: the times s = σt of the crossings, (K,); and their states, (K, n). Both
-    have derivatives with respect to all numbers of `setup`, `event`, `state0` and `ts`.
-    """
-    crossed, (constants, *_) = condition_and_motion_of_run(setup, event, state0, ts)
-    there = jnp.isfinite(times)
-    last = jnp.max(jnp.where(there, times, lax.stop_gradient(crossed.signed_time(ts[0]))))
-    s = jnp.where(there, times, last)
-    ys, *_ = solve(setup, state0, jnp.concatenate([ts[:1], crossed.signed_time(s)]))
-    ys = jax.vmap(crossed.vector_of_state)(
-        crossed.signed_time(s), jax.tree.map(lambda leaf: leaf[1:], ys)
-    )
-    times, states = jax.vmap(partial(chebyshev_step_to_crossing, crossed, constants))(
-        s, ys, there & ~jumps
-    )
-    return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
+    moved, along = eqx.filter_jvp(again, primals[3:], tangents[3:])
+    return with_derivatives(found, moved), along
 
 
 # The condition of a free body is sampled this many times in one turn of the body at its largest
@@ -485,8 +400,8 @@ class Section(NamedTuple):
     """Hold a condition g and a motion y as functions of the time s = σt, which grows along the run.
 
     σ is 1 if the run goes forwards in time t, and −1 if it goes backwards. The section is the set
-    of states with g = 0. The first argument of each function, `constants`, is a list of the arrays
-    on which the function depends.
+    of states with g = 0. The first argument of each function is the list of the arrays that it
+    reads.
     """
 
     solver: AbstractExplicit | None  # `None` is the closed form
@@ -503,61 +418,53 @@ class Section(NamedTuple):
     # integrated.
     form: ByMomentum | None = None
 
-    def vector_of_state(self, t: Array, state: PyTree) -> Array:
-        """Return the vector (n,) of the numbers that are integrated, made from a state.
+    def vector(self, t: Array, state: PyTree) -> Array:
+        """Return the vector (n,) of the numbers that are integrated, made from the state at `t`."""
+        return ravel_pytree(state if self.form is None else self.form.to_momentum(t, state))[0]
 
-        - `t`: the time of the state, s.
-        - `state`: the state, such as an `Attitude`. If the inertia is a function of time, the body
-          rate is replaced by the momentum divided by the inertia at the start (see `ByMomentum`).
-        """
-        return ravel_pytree(
-            state if self.form is None else self.form.replace_rate_by_momentum(t, state)
-        )[0]
+    def state(self, t: Array, y: Array) -> PyTree:
+        """Return the state at `t` of a vector of integrated numbers, the inverse of `vector`."""
+        return self.tree(y) if self.form is None else self.form.to_rate(t, self.tree(y))
 
-    def state_of_vector(self, t: Array, y: Array) -> PyTree:
-        """Return the state that belongs to a vector of integrated numbers.
-
-        This is the inverse of `vector_of_state`.
-
-        - `t`: the time of the state, s.
-        - `y`: (n,) the numbers that are integrated.
-        """
-        return self.tree(y) if self.form is None else self.form.restore_body_rate(t, self.tree(y))
-
-    def normalise_quaternion(self, y: Array) -> Array:
-        """Return the vector `y` (n,) of a state with its quaternion, if any, scaled to length 1."""
+    def project(self, y: Array) -> Array:
+        """Return the vector of a state with its quaternion, if any, scaled to length 1."""
         return ravel_pytree(project_to_group(self.tree(y)))[0]
 
-    def signed_time(self, s: Array) -> Array:
-        """Return σs: convert the time s, which grows along a run, to the time t, or t to s.
-
-        σ is 1 for a run forwards in time t, and −1 for a run backwards.
-        """
+    def signed(self, s: Array) -> Array:
+        """Return σs: convert the time s to the time t, or t to s."""
         return self.sign.astype(s.dtype) * s
 
+    def measure(self, constants: Arrays, s: Array, y: Array) -> Measured:
+        """Return g and its rate at a state, the slope of the state, and the round-off of g."""
+        of_g = lambda s, y: self.rates(constants, s, y)[0]  # noqa: E731
+        noise = jax.jvp(of_g, (s, y), (s, _probe(self.sizes, y)))[1]
+        blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)
+        g, rate, slope = self.rates(constants, s, y)
+        return Measured(jnp.asarray(g), jnp.asarray(rate), slope, blur)
 
-# Three things: the constants of the functions of a `Section`; the run that is searched for
-# crossings, a `Path`; and the length of its longest step, s.
-Numbers = tuple[Arrays, Path, Array]
+    def clarity(self, constants: Arrays, s: Array, y: Array) -> Array:
+        """Return |dg/ds| at a zero over the rate that round-off could cause: about 1 if it did."""
+        rates = partial(self.rates, constants, s)
+        _, rate, slope = rates(y)
+        shift = jax.jvp(lambda y: rates(y)[2], (y,), (_probe(self.sizes, y),))[1]
+        by_s, by_y = jax.jacfwd(lambda s, y: self.rates(constants, s, y)[0], (0, 1))(s, y)
+        lengths = _norms(self.sizes, slope) + _norms(self.sizes, shift)
+        terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * lengths)
+        return jnp.abs(rate) / (jnp.finfo(y.dtype).eps * terms)
 
 
-def condition_and_motion_of_run(
+class Numbers(NamedTuple):
+    """Hold the arrays with which a `Section` is searched."""
+
+    constants: Arrays  # those of the functions of the section
+    run: Path
+    longest: Array  # the length of the longest step, s
+
+
+def section_of_run(
     setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
 ) -> tuple[Section, Numbers]:
-    """Return the condition of an event and the motion of a run, as functions that can be searched.
-
-    The time of these functions is s = σt, which grows along the run: σ is 1 for a run forwards in
-    time t, and −1 for a run backwards.
-
-    - `setup`: how the run is computed: in closed form or by diffrax.
-    - `event`: an `Event`, which holds the condition g and the longest step.
-    - `state0`: the state at `ts[0]`.
-    - `ts`: (T,) times t, in seconds; the run begins at the first and ends at the last of them.
-
-    **Returns** two things: a `Section`, which holds the functions; and the tuple `Numbers`, which
-    holds three things: the constants of the functions, the run that is searched for crossings, and
-    the length of its longest step in seconds.
-    """
+    """Return the condition of an event and the motion of a run, as what can be searched."""
     form = (
         equations_by_momentum(setup.body, state0, setup.torque)
         if isinstance(setup, DiffraxRun)
@@ -565,18 +472,14 @@ def condition_and_motion_of_run(
     )
 
     def condition(t: Array, y: Any) -> Array:
-        return condition_value(
-            event, setup.body, t, y if form is None else form.restore_body_rate(t, y)
-        )
+        return condition_value(event, setup.body, t, y if form is None else form.to_rate(t, y))
 
-    inside = state0 if form is None else form.replace_rate_by_momentum(ts[0], state0)
+    inside = state0 if form is None else form.to_momentum(ts[0], state0)
     (y0, tree), dtype = ravel_pytree(inside), ts.dtype
     sign = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
     way = setup.sign if isinstance(setup, DiffraxRun) else sign
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
-    field, asked, along, jumps = convert_to_forward_time(
-        way, field, condition, ts[jnp.array([0, -1])]
-    )
+    field, asked, along, jumps = forward_time(way, field, condition, ts[jnp.array([0, -1])])
     whole: Any = lambda s, y, *sides: ravel_pytree(field(s, tree(y), sides or None))[0]  # noqa: E731
     program = program_with_stops(whole, jumps, along[0], along[1], y0)
     longest = length = lax.stop_gradient(along[1] - along[0])
@@ -606,21 +509,14 @@ def condition_and_motion_of_run(
     stops = jnp.concatenate([program.stops, along[1:]])
     sizes = [leaf.size for leaf in jax.tree.leaves(state0)]
     crossed = Section(solver, of_motion, of_rates, tree, sizes, sign, form)
-    run = Path(along[0], stops, y0, rtol, atol, h0)
-    return crossed, (constants, run, longest)
+    return crossed, Numbers(constants, Path(along[0], stops, y0, rtol, atol, h0), longest)
 
 
 def _sampling_interval(body: Any, state0: Any, length: Array) -> Array:
     """Return the interval between two samples, s, of a condition along the motion of a free body.
 
-    A zero of the condition is found if the samples at the ends of an interval show it. The interval
-    is a sixteenth of the time that one turn takes at the largest rate that energy and momentum
-    allow. If the run is so short that the body turns by less than a radian at this rate, the
-    interval is a sixteenth of the length of the run.
-
-    - `body`: an `Inertia`, or a body with an `inertia`.
-    - `state0`: the state at the start, with the body rate `omega`, rad/s.
-    - `length`: the length of the run, s.
+    It is a sixteenth of a turn at the largest rate that energy and momentum allow, or of the run if
+    the body turns by less than a radian in it.
     """
     inertia = body if isinstance(body, Inertia) else body.inertia
     tensor, omega = lax.stop_gradient((inertia.tensor, state0.omega))
@@ -631,52 +527,23 @@ def _sampling_interval(body: Any, state0: Any, length: Array) -> Array:
     return jnp.where(rate * length > 1, 2 * np.pi / (_SAMPLES * rate), length / _SAMPLES)
 
 
-def locate_crossings(section: Section, search: Search, numbers: Numbers) -> Located:
-    """Return the first crossings of a run, without derivatives.
-
-    - `section`: the condition and the motion as functions of the time s = σt, where σ is 1 for a
-      run forwards in time t, and −1 for a run backwards.
-    - `search`: the direction of the crossings, their largest number, and the largest number of
-      steps.
-    - `numbers`: the constants of the functions of the section, the run that is searched, and its
-      longest step.
-    """
+def locate(section: Section, search: Search, numbers: Numbers) -> Located:
+    """Return the first crossings of a run, without derivatives."""
     constants, run, longest = lax.stop_gradient(numbers)
-    program = partial(_locate_crossings_of_bodies, section, search)
-    return Located(*run_with_bodies_last(program, constants, [*run, longest]))
+    return Located(*bodies_last(partial(_locate, section, search), constants, [*run, longest]))
 
 
-def _locate_crossings_of_bodies(
+def _locate(
     section: Section, search: Search, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
     """Return the fields of `Located` in a list: the crossings of one body, or of many at once.
 
-    The list has seven arrays: the times of the crossings, their states, and whether the condition
-    jumps over zero at each of them; the number of crossings; and the time at which the search
-    ended, the length of the step that would follow, and the number of steps.
-    `run_with_bodies_last` calls this function, and puts the bodies of a batch into the last axis of
-    every array.
-
-    - `section`: the condition, which is zero at a crossing, and the motion, as functions of the
-      time s = σt: σ is 1 for a run forwards in time t, and −1 for a run backwards.
-    - `search`: the direction of the crossings, their largest number, and the largest number of
-      steps.
-    - `layout`: which arrays have a last axis of bodies.
-    - `constants`: the arrays on which the functions of the section depend.
-    - `each`: a list of arrays with values of each body: the fields of `Path`, which describe the
-      run that is searched, then the length of its longest step, in seconds.
+    `each` are the fields of `Path`, then the length of the longest step, s.
     """
     run, longest = Path(*each[:-1]), each[-1]
-    solver, motion = section.solver, layout.vmap_over_bodies(section.motion)
-    project = (
-        jax.vmap(section.normalise_quaternion, -1, -1)
-        if layout.bodies
-        else section.normalise_quaternion
-    )
-    seen, clear = (
-        partial(layout.vmap_over_bodies(partial(f, section)), constants)
-        for f in (_condition_and_round_off, _rate_relative_to_round_off)
-    )
+    solver, motion = section.solver, layout.vmap(section.motion)
+    project = jax.vmap(section.project, -1, -1) if layout.bodies else section.project
+    seen, clear = (partial(layout.vmap(f), constants) for f in (section.measure, section.clarity))
 
     def counts(s: Array, y: Array, steps: Array) -> Array:
         # The round-off of n steps adds up as a random walk does, to about √n times that of one
@@ -687,8 +554,11 @@ def _locate_crossings_of_bodies(
     order, still = 1, jnp.zeros_like(run.rtol)
     attempt: Any = lambda step: (motion(constants, step.end, step.y), still)  # noqa: E731
     if solver is not None:
-        method = SearchMethod(solver.tableau, motion, project, section.sizes)
-        h0 = first_step_length(method, constants, run)
+        # `locate_zeros` has its own control of steps.
+        method = Method(
+            solver.tableau, motion, project, None, None, section.sizes, search.max_steps
+        )
+        h0 = first_step(method, constants, run)
         h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), longest)
         run = run._replace(h0=h0)
         attempt, order = partial(step_with_error, method, constants, run), solver.tableau.order
@@ -696,90 +566,29 @@ def _locate_crossings_of_bodies(
     return list(crossing_loop.locate_zeros(moving, search, run))
 
 
-def _norms_of_arrays(sizes: list[int], vector: Array) -> Array:
-    """Return for each number of a vector the Euclidean norm of the array to which it belongs.
-
-    - `sizes`: the numbers of elements of the arrays that are joined in the vector. For the state
-      (Ω, x), for example, they are 3 and 3.
-    - `vector`: (n,) the joined arrays, such as the numbers of a state or of its time derivative.
-
-    **Returns** an array (n,), in which all elements of one array have the same value.
-    """
+def _norms(sizes: list[int], vector: Array) -> Array:
+    """Return for each number of a vector (n,) the norm of the array, of `sizes`, that it is in."""
     which = np.repeat(np.arange(len(sizes)), sizes)
     same = jnp.asarray(which[:, None] == which[None], vector.dtype)
     return jnp.sqrt(jnp.sum(same * (vector * vector)[None], 1))
 
 
-def _change_to_measure_round_off(sizes: list[int], y: Array) -> Array:
-    """Return a change (n,) of the state `y` (n,), with which the effect of round-off is measured.
+def _probe(sizes: list[int], y: Array) -> Array:
+    """Return a change (n,) of the state, by which the effect of round-off is measured.
 
-    Each number changes by at most the norm of the array to which it belongs. The factors, cosines
-    of 1, 2, …, differ from number to number, so that the change has components along all axes of
-    the body.
-
-    - `sizes`: the numbers of elements of the arrays that are joined in `y`.
-    - `y`: (n,) the numbers of a state.
+    Each number changes by at most the norm of its array. The factors, cosines of 1, 2, …, differ,
+    so that the change has components along all axes of the body.
     """
-    return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _norms_of_arrays(sizes, y)
+    return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _norms(sizes, y)
 
 
-def _condition_and_round_off(
-    section: Section, constants: Arrays, s: Array, y: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return the condition g at a state, its rate, the slope of the state, and the round-off of g.
-
-    - `section`: holds g, a condition that is zero at a crossing, and the motion, as functions of
-      the time s (not t) and of the n numbers of a state.
-    - `constants`: the arrays on which the functions of the section depend.
-    - `s`, `y`: the time s = σt, where σ is 1 for a run forwards in time t and −1 for a run
-      backwards, and the numbers (n,) of the state.
-
-    **Returns** four things: g; dg/ds along the motion; dy/ds (n,); and the size that g may have
-    from round-off alone.
-    """
-    of_g = lambda s, y: section.rates(constants, s, y)[0]  # noqa: E731
-    noise = jax.jvp(of_g, (s, y), (s, _change_to_measure_round_off(section.sizes, y)))[1]
-    blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)
-    g, rate, slope = section.rates(constants, s, y)
-    return jnp.asarray(g), jnp.asarray(rate), slope, blur
-
-
-def _rate_relative_to_round_off(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
-    """Return |dg/ds| at a zero of a condition g, divided by the rate that round-off could cause.
-
-    At a true crossing this ratio is large. If g is zero only by round-off, the ratio is about 1.
-
-    - `section`: holds g and the motion, as functions of the time s (not t) and of the n numbers of
-      a state.
-    - `constants`: the arrays on which the functions of the section depend.
-    - `s`, `y`: the time s = σt of the zero, where σ is 1 for a run forwards in time t and −1 for a
-      run backwards, and the numbers (n,) of the state there.
-    """
-    rates, sizes = partial(section.rates, constants, s), section.sizes
-    _, rate, slope = rates(y)
-    shift = jax.jvp(lambda y: rates(y)[2], (y,), (_change_to_measure_round_off(sizes, y),))[1]
-    by_s, by_y = jax.jacfwd(lambda s, y: section.rates(constants, s, y)[0], (0, 1))(s, y)
-    lengths = _norms_of_arrays(sizes, slope) + _norms_of_arrays(sizes, shift)
-    terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * lengths)
-    return jnp.abs(rate) / (jnp.finfo(y.dtype).eps * terms)
-
-
-def chebyshev_step_to_crossing(
+def chebyshev_step(
     section: Section, constants: Arrays, s: Array, y: Array, is_crossing: Array
 ) -> tuple[Array, Array]:
-    """Return the time and the state of a crossing by one step of Chebyshev's method from nearby.
+    """Return the time s and the state (n,) of a crossing, by one step from the fixed time nearby.
 
-    The step makes the first and second derivatives of the crossing correct. Its formula is in the
-    docstring of this module.
-
-    - `section`: holds the condition g, which is zero at a crossing, and the motion.
-    - `constants`: the arrays on which the functions of the section depend.
-    - `s`, `y`: the fixed time s = σt near the crossing, and the numbers (n,) of the state there; σ
-      is 1 for a run forwards in time t, and −1 for a run backwards.
-    - `is_crossing`: whether there is a crossing near `s`. If there is none, the step has the length
-      0.
-
-    **Returns** two things: the time s of the crossing, and the numbers (n,) of the state there.
+    First and second derivatives are then those of the crossing; the module has the formula. If
+    there is no crossing, the step has the length 0.
     """
     rates = partial(section.rates, constants)
     g, rate, slope = rates(s, y)
@@ -795,5 +604,4 @@ def chebyshev_step_to_crossing(
     move = jnp.where(
         is_crossing, newton * (1 - 0.5 * newton * second / rate), jnp.zeros_like(newton)
     )
-    state = y + slope * move + 0.5 * turn * move * move
-    return s + move.astype(s.dtype), section.normalise_quaternion(state)
+    return s + move.astype(s.dtype), section.project(y + slope * move + 0.5 * turn * move * move)

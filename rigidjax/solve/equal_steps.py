@@ -27,22 +27,13 @@ Field = Callable[[Any, Any], Any]
 
 
 class StepWithLoopedStages(eqx.Module):
-    """Wrap the explicit method `solver`, so that the stages of its steps are computed in a loop.
-
-    A loop compiles faster than stages that are written out one after the other.
-    """
+    """Wrap an explicit method, so that the stages of its steps are computed in a loop."""
 
     solver: AbstractExplicit
 
 
-def loop_stages_of_low_order(solver: dfx.AbstractSolver) -> Any:
-    """Return an explicit method of order 4 or 5 with its stages computed in a loop.
-
-    With a loop the program of the method compiles faster. A method of another order, and a method
-    that is not explicit, is returned unchanged.
-
-    - `solver`: the method.
-    """
+def loop_low_order(solver: dfx.AbstractSolver) -> Any:
+    """Return an explicit method of order 4 or 5 with its stages in a loop; others unchanged."""
     if isinstance(solver, AbstractExplicit) and solver.tableau.order <= 5:
         return StepWithLoopedStages(solver)
     return solver
@@ -56,50 +47,23 @@ def change_in_step(
     y: PyTree,
     end: Any,
 ) -> PyTree:
-    """Return the change of a state in one step of an explicit method.
-
-    The quaternion of the state is not scaled to length 1.
-
-    - `solver`: the method; its stages are written out one after the other, or computed in a loop.
-    - `field`: a function `field(t, y)` that returns dy/dt.
-    - `t`, `end`: the times at the start and at the end of the step, s.
-    - `h`: the length of the step, s, which is `end` − `t` but for rounding.
-    - `y`: the state at the start, a tree of arrays.
-
-    **Returns** a tree of the structure of `y`.
-    """
+    """Return the change of a state in one step; its quaternion is not scaled to length 1."""
     if isinstance(solver, StepWithLoopedStages):
-        return _change_by_looped_stages(solver.solver.tableau, field, t, h, y, end)
-    return change_and_slope_at_start(solver.tableau, field, t, h, y, end)[0]
+        return _looped_change(solver.solver.tableau, field, t, h, y, end)
+    return change_and_slope(solver.tableau, field, t, h, y, end)[0]
 
 
 def state_after_step(tableau: Tableau, field: Field, t: Any, h: Array, y: PyTree) -> PyTree:
-    """Return the state after one step of an explicit method.
-
-    The quaternion of the state is not scaled to length 1.
-
-    - `tableau`: the weights of the method.
-    - `field`: a function `field(t, y)` that returns dy/dt.
-    - `t`, `h`: the time at the start of the step, and its length, s.
-    - `y`: the state at the start, a tree of arrays.
-    """
-    return jax.tree.map(jnp.add, y, change_and_slope_at_start(tableau, field, t, h, y)[0])
+    """Return the state after one step; its quaternion is not scaled to length 1."""
+    return jax.tree.map(jnp.add, y, change_and_slope(tableau, field, t, h, y)[0])
 
 
-def change_and_slope_at_start(
+def change_and_slope(
     tableau: Tableau, field: Field, t: Any, h: Array, y: PyTree, end: Any = None
 ) -> tuple[PyTree, PyTree]:
-    """Return the change of a state in one step, and the slope dy/dt at the start of the step.
+    """Return the change of a state in one step, and the slope at its start.
 
-    The stages are written out one after the other, and the quaternion of the state is not scaled to
-    length 1.
-
-    - `tableau`: the weights of the method.
-    - `field`: a function `field(t, y)` that returns dy/dt.
-    - `t`, `h`: the time at the start of the step, and its length, s.
-    - `y`: the state at the start, a tree of arrays.
-    - `end`: the time of the stages at the end of the step, s; `None` is the rounded sum `t + h`.
-
+    The stages are written out one after the other. If `end` is `None`, it is the rounded `t + h`.
     """
     # Without `barrier` around each stage XLA makes one kernel for each array of the result, and
     # each of these kernels computes all stages before it once more.
@@ -112,15 +76,7 @@ def change_and_slope_at_start(
 
 
 def _weighted_sum(h: Array, row: Row, slopes: list[PyTree]) -> PyTree:
-    """Return `h` times the sum of the slopes of some stages, each multiplied by its weight.
-
-    - `h`: the length of the step, s.
-    - `row`: a dict of the weights of one row of a Butcher tableau. Its keys are the indices of the
-      stages whose weights are not zero.
-    - `slopes`: dy/dt at each stage so far, trees of arrays.
-
-    **Returns** a tree of the structure of one slope.
-    """
+    """Return `h` times the weighted sum of the slopes of some stages."""
 
     def moved(*slopes: Array) -> Array:
         first, *rest = [w * k for w, k in zip(row.values(), slopes, strict=True)]
@@ -129,20 +85,10 @@ def _weighted_sum(h: Array, row: Row, slopes: list[PyTree]) -> PyTree:
     return jax.tree.map(moved, *[slopes[i] for i in row])
 
 
-def _change_by_looped_stages(
-    tableau: Tableau, field: Field, t: Any, h: Array, y: PyTree, end: Any
-) -> PyTree:
-    """Return the change of a state in one step of an explicit method, with its stages in a loop.
+def _looped_change(tableau: Tableau, field: Field, t: Any, h: Array, y: PyTree, end: Any) -> PyTree:
+    """Return the change of a state in one step, with the stages in a loop.
 
-    The loop carries the slopes dy/dt of the last few stages, as many as any later stage reads.
-
-    - `tableau`: the Butcher tableau, which holds the times and the weights of the stages.
-    - `field`: a function `field(t, y)` that returns dy/dt.
-    - `t`, `end`: the times at the start and at the end of the step, s.
-    - `h`: the length of the step, s.
-    - `y`: the state at the start, a tree of arrays.
-
-    **Returns** a tree of the structure of `y`.
+    It carries the slopes of the last few stages, as many as any later stage reads.
     """
     count, tableau = len(tableau.a) + 1, round_weights(tableau, h.dtype)
     rows = np.zeros((count, max(i - min(row) for i, row in enumerate(tableau.a, 1))))
@@ -166,8 +112,4 @@ def _change_by_looped_stages(
 
 
 def _add_multiple(y: PyTree, factor: Array, slope: PyTree) -> PyTree:
-    """Return y + factor · slope, where `factor` is a scalar array.
-
-    `y` and `slope` are trees of arrays with equal structure.
-    """
     return jax.tree.map(lambda a, k: a + factor.astype(a.dtype) * k, y, slope)

@@ -27,7 +27,7 @@ from rigidjax import _checks, _show
 from rigidjax._types import ScalarLike
 from rigidjax.motion.manifold import leaf_names, minus, parts_by_name
 from rigidjax.solve import difference, validation
-from rigidjax.solve.linear_map import known_with_derivatives_of
+from rigidjax.solve.linear_map import with_derivatives
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
 from rigidjax.solve.sides import hold_piecewise_constant_laws_at
 from rigidjax.solve.switching import depends_on_time
@@ -381,7 +381,7 @@ def _run_at_larger_tolerance(
     - `search`: two finished runs at larger tolerances: the first is returned if its states are near
       `ys`, else the second. With `None` a new run is made.
     """
-    replayed = isinstance(setup, DiffraxRun) and setup.records_steps_for_derivatives
+    replayed = isinstance(setup, DiffraxRun) and setup.replays
     if not replayed or ts.dtype == jnp.float32:
         return setup, ys, 1.0
     sizes = _error_scales_by_name(ys)
@@ -586,7 +586,7 @@ def _with_derivatives_of_solve(setup: DiffraxRun, state0: PyTree, ts: Array, ys:
 def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     states = lambda *args: solve(*args)[0]  # noqa: E731
     ys, along = eqx.filter_jvp(states, primals[:3], tangents[:3])
-    return known_with_derivatives_of(primals[3], ys), along
+    return with_derivatives(primals[3], ys), along
 
 
 def _with_tolerance(setup: DiffraxRun, rtol: Array) -> DiffraxRun:
@@ -680,7 +680,7 @@ def _more_accurate_setup(
         rtol = jnp.asarray(setup.rtol, ts.dtype)
         less = jnp.maximum(_CLOSER * rtol, _DEEPEST * eps)
         cuts = sudden_times
-        if setup.ends_steps_at_jumps:
+        if setup.stops_at_jumps:
             parts = jnp.arange(1, _CUTS).astype(ts.dtype) / _CUTS
             cuts = jnp.concatenate([ts[0] + (ts[-1] - ts[0]) * parts, sudden_times])
         new = dict(rtol=less, atol=setup.atol * (less / rtol), cuts=cuts if cuts.size else None)

@@ -15,17 +15,12 @@ from rigidjax._types import RealLike
 from rigidjax.motion.equations import project_to_group
 from rigidjax.rotation.barrier import barrier
 from rigidjax.solve import validation
-from rigidjax.solve.runge_kutta import Step, change_within_step, dense_rows, error_estimate, stages
+from rigidjax.solve.runge_kutta import Step, dense_change, dense_rows, error_estimate, stages
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
 
 
 class NestedInterpolation(dfx.AbstractLocalInterpolation):
-    """Interpolate the state within a step (dense output) by a polynomial.
-
-    `coefficients` are the coefficients F0, F1, … of the polynomial, each a row of the shape of the
-    state; `runge_kutta.change_within_step` gives the formula. The quaternion of the interpolated
-    state is scaled to length 1.
-    """
+    """Interpolate the state within a step by the rows F0, F1, … of `runge_kutta.dense_change`."""
 
     t0: Any
     t1: Any
@@ -33,31 +28,25 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
     coefficients: Any
 
     def evaluate(self, t0: RealLike, t1: RealLike | None = None, left: bool = True) -> PyTree:
-        """Return the interpolated state at the time `t0`, or its change from `t0` to `t1`.
-
-        The change is returned if `t1` is given.
-        """
+        """Return the state at `t0`, or its change from `t0` to `t1`."""
         if t1 is not None:
             return jax.tree.map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
         length = self.t1 - self.t0
         safe = jnp.where(length == 0, jnp.ones_like(length), length)
         theta = jnp.where(length == 0, jnp.zeros_like(length), (t0 - self.t0) / safe)
 
-        value = lambda y, rows: y + change_within_step(theta.astype(y.dtype), rows)  # noqa: E731
+        value = lambda y, rows: y + dense_change(theta.astype(y.dtype), rows)  # noqa: E731
         # A maximum has no derivative if XLA rounds its argument differently in two places.
         return barrier(project_to_group(jax.tree.map(value, self.y0, self.coefficients)))
 
 
-def direction_and_length_of_step(
+def direction_and_length(
     terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike
 ) -> tuple[Array, Array]:
     """Return the direction of a step of diffrax, 1 or −1, and its length, s.
 
-    `terms` is the `diffrax.ODETerm` of the vector field, and `t0` and `t1` are the times of diffrax
-    at which the step begins and ends. In a run backwards in time diffrax uses −t as the time, so
-    that `t1` > `t0` in both directions; only the control `contr(t0, t1)` of the term is negative. A
-    step backwards is therefore computed as a step forwards from `t0` to `t1` with slopes of the
-    opposite sign.
+    In a run backwards diffrax uses −t as the time: `t1` > `t0`, and only `contr(t0, t1)` is
+    negative. Such a step is computed forwards, with slopes of the opposite sign.
     """
     h = jnp.asarray(terms.contr(t0, t1))
     way = jnp.where(h < 0, -jnp.ones_like(h), jnp.ones_like(h))
@@ -67,15 +56,8 @@ def direction_and_length_of_step(
 def cubic_coefficients(
     change: Array, h: Array, left_slope: Array, right_slope: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the three coefficients of a cubic polynomial that interpolates within a step.
-
-    They are the coefficients F0, F1 and F2 of `runge_kutta.change_within_step`, which evaluates the
-    polynomial.
-
-    - `change`: the change of the polynomial over the step, an array of a state.
-    - `h`: the length of the step, s.
-    - `left_slope`, `right_slope`: the slopes of the polynomial at the start and the end of the
-      step, with the shape of `change`.
+    """Return F0, F1 and F2 of `runge_kutta.dense_change`, from the change and the slopes at both
+    ends.
     """
     return change, h * left_slope - change, 2 * change - h * (left_slope + right_slope)
 
@@ -91,12 +73,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
         return self.tableau.order
 
     def init(
-        self,
-        terms: PyTree[dfx.AbstractTerm],
-        t0: RealLike,
-        t1: RealLike,
-        y0: PyTree,
-        args: PyTree,
+        self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike, y0: PyTree, args: PyTree
     ) -> tuple[()]:
         return ()
 
@@ -112,7 +89,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
     ) -> Any:
         validation.common_dtype(y0, "state")
         numbers, tree = ravel_pytree(y0)
-        way, h = direction_and_length_of_step(terms, t0, t1)
+        way, h = direction_and_length(terms, t0, t1)
 
         def field(_: Any, t: Any, y: Array) -> Array:
             return way.astype(y.dtype) * ravel_pytree(terms.vf(t, tree(y), args))[0]
@@ -187,10 +164,7 @@ class DormandPrince8(AbstractExplicit):
 
 
 def require_explicit(solver: AbstractExplicit | None) -> AbstractExplicit:
-    """Return the solver, or `DormandPrince8` for `None`.
-
-    Raise `TypeError` for a solver that is no explicit method of `rigidjax.solvers`.
-    """
+    """Return the solver, or `DormandPrince8` for `None`; raise `TypeError` if not explicit."""
     solver = DormandPrince8() if solver is None else solver
     wanted = "an explicit method of rigidjax.solvers"
     return _checks.require_instance(solver, AbstractExplicit, "solver", requirement=wanted)

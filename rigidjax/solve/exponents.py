@@ -145,19 +145,16 @@ def lyapunov_exponents(
             "f(t, y, None)"
         )
     how = (solver, many, intervals, transient, max_steps)
-    return _exponents_of_run(how, field, state0, begin, length, rtol, atol)
+    return _exponents(how, field, state0, begin, length, rtol, atol)
 
 
-def _product_of_small_matrices(a: Array, b: Array) -> Array:
-    """Return the product `a @ b` of small matrices, in a form that XLA fuses with other code.
-
-    - `a`, `b`: two matrices, (n, m) and (m, k), of any sizes n, m and k. The result is (n, k).
-    """
+def _product(a: Array, b: Array) -> Array:
+    """Return the product `a @ b` of small matrices, in a form that XLA fuses with other code."""
     return jnp.sum(a[:, :, None] * b[None], 1)
 
 
 @eqx.filter_jit
-def _exponents_of_run(
+def _exponents(
     options: tuple[AbstractExplicit, int, int, int, int],
     field: Callable[..., Any],
     state0: Any,
@@ -166,18 +163,7 @@ def _exponents_of_run(
     rtol: Any,
     atol: Any,
 ) -> Exponents:
-    """Return the Lyapunov exponents along a motion, without a check of the arguments.
-
-    The exponents are the mean rates, 1/s, at which small changes of the state grow.
-
-    - `options`: a tuple of the solver and of four integers: the number of exponents, the number of
-      intervals into which the run is divided, the number of intervals at the beginning whose growth
-      is left out of the means, and the largest number of steps in one interval.
-    - `field`: a vector field `f(t, y, args)` that returns dy/dt.
-    - `state0`: the state at `t0`.
-    - `t0`, `length`: the time at which the run begins, and its length, s.
-    - `rtol`, `atol`: the relative and the absolute tolerance of each step.
-    """
+    """Return the Lyapunov exponents along a motion; `options` are static."""
     # The options are no arrays: `filter_jit` takes them as static, and compiles again if one of
     # them changes.
     solver, many, intervals, transient, max_steps = options
@@ -195,16 +181,12 @@ def _exponents_of_run(
 
         # Small errors make the frame lose its orthonormality, and the equations of a frame that is
         # not orthonormal are unstable. This formula restores it, up to the square of the errors.
-        frame = 1.5 * frame - 0.5 * _product_of_small_matrices(
-            frame, _product_of_small_matrices(frame.T, frame)
-        )
+        frame = 1.5 * frame - 0.5 * _product(frame, _product(frame.T, frame))
         push = jax.linearize(rate, jnp.zeros(frame.shape[0], t.dtype))[1]
         pushed = jax.vmap(push, -1, -1)(frame)
-        grown = _product_of_small_matrices(frame.T, pushed)
+        grown = _product(frame.T, pushed)
         upper = jnp.triu(grown) + jnp.tril(grown, -1).T
-        return Coupled(
-            slope, (pushed - _product_of_small_matrices(frame, upper), jnp.diagonal(grown))
-        )
+        return Coupled(slope, (pushed - _product(frame, upper), jnp.diagonal(grown)))
 
     def interval(carry: Any, i: Array) -> Any:
         state, frame = carry
@@ -230,8 +212,7 @@ def _exponents_of_run(
     rates = logs[transient:] / step
     count = rates.shape[0]
     times = t0 + jnp.arange(transient + 1, intervals + 1).astype(t0.dtype) * step
-    index = jnp.arange(1, count + 1).astype(t0.dtype)
-    running = jnp.cumsum(rates, axis=0) / index[:, None]
+    running = jnp.cumsum(rates, axis=0) / jnp.arange(1, count + 1).astype(t0.dtype)[:, None]
     whole = count // _PARTS * _PARTS
     means = jnp.mean(rates[count - whole :].reshape(_PARTS, -1, many), axis=1)
     apart = jnp.var(means, axis=0, ddof=1) / _PARTS

@@ -6,7 +6,7 @@ a step, so that no interpolation adds to the error of the method.
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from rigidjax.rotation.barrier import platform
 from rigidjax.solve.equal_steps import StepWithLoopedStages
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.pieces import steps_per_piece, take_equal_steps_on_gpu
+from rigidjax.solve.pieces import march_on_gpu, steps_per_piece
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.steppers import AnyStepper, stepper_of
 
@@ -64,31 +64,25 @@ def fixed(
         if isinstance(substeps, int):
             y = march_steps(stepper, h, left, jnp.zeros((), jnp.int32), substeps, y)
         else:
-            y = lax.fori_loop(0, substeps, lambda i, y: take_equal_step(stepper, h, left, i, y), y)
+            y = lax.fori_loop(0, substeps, lambda i, y: equal_step(stepper, h, left, i, y), y)
         return y, y
 
     if last is None:
-        _, rest = lax.scan(span, stepper.initial_numbers, (ts[:-1], ts[1:]))
+        _, rest = lax.scan(span, stepper.start, (ts[:-1], ts[1:]))
     else:
-        start = stepper.initial_numbers
+        start = stepper.start
         still = jax.tree.map(lambda a: jnp.broadcast_to(a, (ts.size - 1, *a.shape)), start)
-        rest = fill_first_rows(last, lambda y, i: span(y, (ts[i], ts[i + 1])), start, still)
-    later = jax.vmap(stepper.state_of_numbers)(rest)
+        rest = fill_rows(last, lambda y, i: span(y, (ts[i], ts[i + 1])), start, still)
+    later = jax.vmap(stepper.state)(rest)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y0, later)
 
 
-def fill_first_rows(
+def fill_rows(
     count: Any, row_of: Callable[[PyTree, Array], tuple[PyTree, PyTree]], y: PyTree, rows: PyTree
 ) -> PyTree:
-    """Compute the first rows of a table in a loop, and return the table.
+    """Compute the first `count` rows of a table in a loop by `row_of(y, i) → (y, row)`.
 
-    **Arguments:**
-
-    - `count`: the number of rows to compute; it may be traced.
-    - `row_of`: a function `(y, i) → (y, row)`, which takes the carried value `y` before row number
-      `i` and returns the next carried value and this row.
-    - `y`: the carried value at the start.
-    - `rows`: the table, a tree of arrays whose first axis is the rows; later rows stay as they are.
+    The rows are the first axis of each array of the tree; later rows stay as they are.
     """
 
     def put(i: Array, now: tuple[Any, Any]) -> tuple[Any, Any]:
@@ -99,7 +93,7 @@ def fill_first_rows(
     return lax.fori_loop(zero, jnp.asarray(count, jnp.int32), put, (y, rows))[1]
 
 
-def take_equal_step(
+def equal_step(
     stepper: AnyStepper,
     h: Array,
     t0: Array,
@@ -108,21 +102,10 @@ def take_equal_step(
     inputs: PyTree = None,
     first_row: int = 0,
 ) -> PyTree:
-    """Take one of a sequence of equal steps, and return the state after it as numbers.
+    """Take equal step number `i`; return the numbers that stand for the state after it.
 
-    The numbers stand for the state but may differ from it: they may hold the momentum in the place
-    of the body rate.
-
-    **Arguments:**
-
-    - `stepper`: holds the functions that take a step of one body, and that make a state from its
-      numbers.
-    - `h`: the length of each step, s.
-    - `t0`: the time at which step number 0 begins, s.
-    - `i`: the number of the step, from 0.
-    - `y`: the numbers that stand for the state before the step.
-    - `inputs`: `None`, or an array for each named input of the torque, with one row for each step.
-    - `first_row`: the row of `inputs` for step number 0; step `i` uses row `first_row + i`.
+    Step 0 begins at `t0`, s. `inputs` is `None`, or an array for each input of the torque, whose
+    row `first_row + i` belongs to step i.
     """
 
     def at(i: Array) -> Array:
@@ -130,12 +113,12 @@ def take_equal_step(
         # steps to 1e-3 in float32).
         return t0 + i.astype(h.dtype) * h
 
-    now = jax.tree.map(lambda a: _row_or_nearest_row(a, first_row + i), inputs)
+    now = jax.tree.map(lambda a: _row(a, first_row + i), inputs)
     if not stepper.delays:
         return stepper.step(at(i), at(i + 1), h, y, now)
     # A delayed input changes within the step. The step is therefore divided at these changes, and
     # its parts are taken one after another, so that all inputs are constant within each part.
-    parts, early, late = changes_of_delayed_inputs(stepper.delays, h, i, inputs, first_row)
+    parts, early, late = delayed_changes(stepper.delays, h, i, inputs, first_row)
     edges = jnp.concatenate([jnp.zeros(1, h.dtype), jnp.sort(parts), jnp.ones(1, h.dtype)])
 
     def part(y: Any, ends: tuple[Array, Array]) -> tuple[Any, None]:
@@ -151,23 +134,20 @@ def take_equal_step(
     return lax.scan(part, y, (edges[:-1], edges[1:]))[0]
 
 
-def changes_of_delayed_inputs(
+class Changes(NamedTuple):
+    """Hold how m delayed inputs change within a step."""
+
+    places: Array  # (m,) from 0 at the start of the step to 1 at its end
+    before: list[Array]  # the values before the changes
+    after: list[Array]
+
+
+def delayed_changes(
     delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: PyTree, first_row: int
-) -> tuple[Array, list[Array], list[Array]]:
-    """Return where in a step each delayed input changes, with its values before and after it.
+) -> Changes:
+    """Return where in step `i` each of m delayed inputs changes, and its values before and after.
 
-    An input of a torque is constant during each step; if it is delayed, it changes within a step.
-
-    **Arguments:**
-
-    - `delays`: the name and the delay, s, of each of the m delayed inputs.
-    - `h`: the length of each step, s.
-    - `i`: the number of the step.
-    - `inputs`: an array for each named input, with one row for each step.
-    - `first_row`: row `first_row + i` of an array belongs to step `i`.
-
-    **Returns** three things: the places (m,) of the changes, from 0 at the start of the step to 1
-    at its end; a list of the m values before the changes; and a list of the m values after them.
+    An input is constant during each step; if it is delayed, it changes within a step.
     """
     parts, early, late = [], [], []
     for name, delay in delays:
@@ -175,36 +155,27 @@ def changes_of_delayed_inputs(
         whole = lax.stop_gradient(jnp.floor(steps))
         parts.append(steps - whole)
         last = first_row + i - whole.astype(jnp.int32)
-        early.append(_row_or_nearest_row(inputs[name], last - 1))
-        late.append(_row_or_nearest_row(inputs[name], last))
-    return jnp.stack(parts), early, late
+        early.append(_row(inputs[name], last - 1))
+        late.append(_row(inputs[name], last))
+    return Changes(jnp.stack(parts), early, late)
 
 
-def torque_inputs_at_start(torque: Any, h: Array, inputs: PyTree) -> PyTree:
-    """Return the values that the inputs of a torque have at the start of a run.
+def inputs_at_start(torque: Any, h: Array, inputs: PyTree) -> PyTree:
+    """Return the values of a torque's inputs at the start of a run, as `bind` takes them.
 
-    A delayed input has at the start the value of the row that belongs to the time one delay
-    earlier, or of the first row if there is no such row. The result is in the form that `bind`
-    takes, the function that sets the inputs of a torque.
-
-    - `torque`: the torque.
-    - `h`: the length of a step, s.
-    - `inputs`: an array for each named input, with one row for each step.
+    A delayed input has the value of one delay earlier, or of its first row.
     """
     delays = delays_of(torque)
     now = jax.tree.map(lambda a: a[0], inputs)
     if not delays:
         return now
-    parts, early, late = changes_of_delayed_inputs(delays, h, jnp.zeros((), jnp.int32), inputs, 0)
+    parts, early, late = delayed_changes(delays, h, jnp.zeros((), jnp.int32), inputs, 0)
     values = [jnp.where(p > 0, a, b) for p, a, b in zip(parts, early, late, strict=True)]
     return InputRow(now, tuple(values))
 
 
-def _row_or_nearest_row(a: Array, i: Any) -> Array:
-    """Return row `i` of an array `a` along its first axis.
-
-    If `i` lies before the first or after the last row, the first or the last row is returned.
-    """
+def _row(a: Array, i: Any) -> Array:
+    """Return row `i` of an array, or the nearest row."""
     return lax.dynamic_index_in_dim(a, jnp.clip(i, 0, a.shape[0] - 1), 0, keepdims=False)
 
 
@@ -212,33 +183,17 @@ def march_steps(
     stepper: AnyStepper, h: Array, t0: Array, first: Array, count: int, y: PyTree,
     inputs: PyTree = None,
 ) -> PyTree:  # fmt: skip
-    """Take many equal steps one after another, and return the state after them as numbers.
-
-    The numbers stand for the state but may differ from it: they may hold the momentum in the place
-    of the body rate.
-
-    **Arguments:**
-
-    - `stepper`: holds the functions that take a step of one body, and that make a state from its
-      numbers.
-    - `h`: the length of each step, s.
-    - `t0`: the time at which step number 0 begins, s.
-    - `first`: the number of the first step that is taken; it begins at `t0` + `first` · `h`.
-    - `count`: how many steps are taken.
-    - `y`: the numbers that stand for the state before the first step.
-    - `inputs`: `None`, or an array for each named input of the torque, with one row for each step.
+    """Take `count` equal steps from number `first`; return the numbers of the state after them.
 
     In reverse mode the run is divided into about √count pieces. The states at the starts of all
-    pieces are stored; the states within a piece are stored for one piece at a time.
+    pieces are stored; those within a piece are stored for one piece at a time.
     """
     if platform() != "cpu":
-        return take_equal_steps_on_gpu(
-            lambda y, i: take_equal_step(stepper, h, t0, i, y, inputs), first, count, y
-        )
+        return march_on_gpu(lambda y, i: equal_step(stepper, h, t0, i, y, inputs), first, count, y)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def one(y: Any, i: Array) -> tuple[Any, None]:
-        return take_equal_step(stepper, h, t0, i, y, inputs), None
+        return equal_step(stepper, h, t0, i, y, inputs), None
 
     @functools.partial(jax.checkpoint, prevent_cse=False, static_argnums=2)
     def some(y: Any, begin: Array, many: int) -> Any:

@@ -27,21 +27,10 @@ _ZERO: Any = ad.Zero
 
 
 def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) -> Arrays:
-    """Call a function that is linear in some of its arguments, and give it a transpose.
+    """Call a function `(*given, *tangents)`, linear in `tangents`, and give it a transpose.
 
-    Reverse mode then calls `transposed`, and does not transpose `function` itself.
-
-    **Arguments:**
-
-    - `function`: a function `(*given, *tangents)` that returns a list of arrays. It is linear in
-      the arrays of `tangents`.
-    - `transposed`: a function `(*given, *bars)` that returns the list of the cotangents of
-      `tangents`. Here `bars` are the cotangents of the results of `function`.
-    - `given`: a list of arrays, in which the function may be nonlinear.
-    - `tangents`: a list of arrays, in which the function is linear.
-
-    **Returns** the list `function(*given, *tangents)`. Neither `function` nor `transposed` may
-    close over tracers. Derivatives with respect to `given` exist in forward mode only.
+    Reverse mode calls `transposed(*given, *bars)` for the cotangents of `tangents`. Neither
+    function may close over tracers. Derivatives with respect to `given` exist in forward mode only.
     """
     outs = jax.eval_shape(lambda g, t: function(*g, *t), given, tangents)
     inputs, results = (
@@ -52,60 +41,44 @@ def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) 
     return _linear_map.bind(*given, *tangents, function=function, transposed=transposed, **how)
 
 
-def known_with_derivatives_of(known: PyTree, recomputed: PyTree) -> PyTree:
-    """Return the numbers of `known`, with the derivatives of the numbers of `recomputed`.
+def with_derivatives(known: PyTree, recomputed: PyTree) -> PyTree:
+    """Return the numbers of `known`, with the derivatives of every order of `recomputed`.
 
-    Both trees hold the same numbers, computed in two ways. Derivatives of every order are those of
-    `recomputed`; they may be NaN. The values of `recomputed` are not used, and may be NaN, too.
-
-    - `known`: a tree of arrays, whose values are returned.
-    - `recomputed`: a tree of the same structure, whose arrays have derivatives.
+    Both trees hold the same numbers, computed in two ways; the values of `recomputed` may be NaN.
     """
-    return jax.tree.map(_array_with_derivatives_of, known, recomputed)
+    return jax.tree.map(_known, known, recomputed)
 
 
 @jax.custom_jvp
-def _array_with_derivatives_of(known: Array, recomputed: Array) -> Array:
-    """Return the array `known`, with the derivatives of an array `recomputed` of equal shape."""
+def _known(known: Array, recomputed: Array) -> Array:
+    """Return the array `known`, with the derivatives of `recomputed`."""
     return match_batch_axes(known, (known, recomputed))
 
 
-@_array_with_derivatives_of.defjvp
-def _array_with_derivatives_of_jvp(
-    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> Any:
-    return _array_with_derivatives_of(*primals), tangents[1]
+_known.defjvp(lambda primals, tangents: (_known(*primals), tangents[1]))
 
 
-def nan_derivatives_where_not_finite(tree: PyTree, inputs: PyTree) -> PyTree:
-    """Return the arrays of `tree`, in which each number that is not finite gets NaN derivatives.
+def nan_derivatives(tree: PyTree, inputs: PyTree) -> PyTree:
+    """Return `tree`, in which each number that is not finite gets NaN derivatives by all `inputs`.
 
-    The derivatives of such a number with respect to all numbers in the tree `inputs` are NaN, in
-    forward and in reverse mode. A run uses this function because it sets a state that it did not
-    reach to NaN by `jnp.where`, which gives this state the wrong derivative 0. If later code does
-    not use a number that is not finite, the cotangent of this number is 0, and the number does not
-    change the gradient.
+    A run sets a state that it did not reach to NaN by `jnp.where`, whose derivative 0 is wrong. A
+    number that later code does not use has the cotangent 0, and does not change the gradient.
     """
     smooth, rest = eqx.partition(tree, eqx.is_inexact_array)
     outs, structure = jax.tree.flatten(smooth)
     anchors = jax.tree.leaves(eqx.filter(inputs, eqx.is_inexact_array))
-    return eqx.combine(structure.unflatten(_with_nan_derivatives(len(outs), *outs, *anchors)), rest)
+    return eqx.combine(structure.unflatten(_nan_derivatives(len(outs), *outs, *anchors)), rest)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _with_nan_derivatives(count: int, *numbers: Array) -> Arrays:
-    """Return the first `count` of the arrays `numbers`, with NaN derivatives where not finite.
-
-    The values are returned as they are. The other arrays of `numbers` are inputs, with respect to
-    which derivatives are taken. If a number in a returned array is NaN or infinite, its derivatives
-    with respect to all inputs are NaN.
-    """
+def _nan_derivatives(count: int, *numbers: Array) -> Arrays:
+    """Return the first `count` arrays; those after them are the inputs of derivatives."""
     return match_batch_axes(list(numbers[:count]), numbers)
 
 
-@_with_nan_derivatives.defjvp
+@_nan_derivatives.defjvp
 def _(count: int, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-    outs = _with_nan_derivatives(count, *primals)
+    outs = _nan_derivatives(count, *primals)
 
     def along(*args: Array) -> Arrays:
         moved = args[count : 2 * count]
@@ -125,37 +98,12 @@ _linear_map = Primitive("rigidjax_linear_map")
 _linear_map.multiple_results = True
 
 
-@_linear_map.def_impl
-def _linear_map_impl(*args: Any, function: Map, **_: Any) -> Arrays:
-    """Call the `function` of a linear map with `args`, and return the list of its results.
-
-    This is the rule by which JAX evaluates the primitive `_linear_map` for arrays that are not
-    traced.
-    """
-    return function(*args)
+# The rules of the primitive follow. `params` are the map, its transpose, the `number` of the
+# arguments in which the map may be nonlinear, and the shapes and dtypes of the other arguments
+# (`inputs`) and of the results.
 
 
-@_linear_map.def_abstract_eval
-def _linear_map_abstract_eval(*_: Any, results: Any, **__: Any) -> list[ShapedArray]:
-    """Return the shapes and dtypes of the results of a linear map, as JAX wants them for a trace.
-
-    `results` is a tuple of pairs (shape, dtype), one for each result.
-    """
-    return [ShapedArray(*result) for result in results]
-
-
-def _linear_map_jvp(
-    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...], **params: Any
-) -> Any:
-    """Return the results of a linear map and the tangents of the results, in forward mode.
-
-    This is the rule of the JAX primitive `_linear_map`.
-
-    - `primals`: the arguments of the map. The first `params["number"]` arrays are those in which
-      the map may be nonlinear; in the other arrays it is linear.
-    - `tangents`: the tangents of all arguments; `ad.Zero` for an argument without a tangent.
-    - `params`: a dict with the map, its transpose, and the shapes and dtypes of the arrays.
-    """
+def _jvp_rule(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...], **params: Any) -> Any:
     number, function = params["number"], params["function"]
     out, parts = _linear_map.bind(*primals, **params), []
     moving = [not isinstance(t, ad.Zero) for t in tangents]
@@ -175,18 +123,14 @@ def _linear_map_jvp(
             return jax.jvp(lambda *g: function(*g, *along), given, tuple(moved))[1]
 
         moved = [t for t, w in zip(tangents, which, strict=False) if w]
-        parts.append(linear_map(push, raise_for_missing_transpose, list(primals), moved))
+        parts.append(linear_map(push, no_transpose, list(primals), moved))
     if not parts:
         return out, [_ZERO.from_primal_value(o) for o in out]
     return out, [sum(more, first) for first, *more in zip(*parts, strict=True)]
 
 
-def raise_for_missing_transpose(*_: Any) -> Arrays:
-    """Raise `TypeError`, because reverse mode needs the transpose of a map that has none.
-
-    This function takes the place of the missing transpose. It is called in reverse mode over a
-    derivative, such as `jax.grad` of a `jax.grad`.
-    """
+def no_transpose(*_: Any) -> Arrays:
+    """Raise `TypeError`: it is the transpose of a map without one, in reverse over a derivative."""
     raise TypeError(
         "second derivatives through a solver are forward over reverse: wanted "
         "jax.jacfwd(jax.grad(f)) or jax.hessian(f), got reverse mode over a derivative, such as "
@@ -194,21 +138,11 @@ def raise_for_missing_transpose(*_: Any) -> Arrays:
     )
 
 
-def _linear_map_transpose(cotangents: Any, *args: Any, **params: Any) -> Any:
-    """Return the cotangents of the arguments of a linear map, in reverse mode.
-
-    An argument in which the map may be nonlinear gets `None`. This is the rule of the JAX primitive
-    `_linear_map`.
-
-    - `cotangents`: the cotangents of the results; `ad.Zero` for a result without a cotangent.
-    - `args`: the arguments of the map. The first `params["number"]` are arrays in which the map may
-      be nonlinear. In the other arguments the map is linear; JAX passes them as undefined values.
-    - `params`: a dict with the map, its transpose, and the shapes and dtypes of the arrays.
-    """
+def _transpose_rule(cotangents: Any, *args: Any, **params: Any) -> Any:
     number = params["number"]
     given = args[:number]
     if any(ad.is_undefined_primal(g) for g in given):
-        raise_for_missing_transpose()
+        no_transpose()
     whole = [
         jnp.zeros(*result) if isinstance(c, ad.Zero) else c
         for c, result in zip(cotangents, params["results"], strict=True)
@@ -218,16 +152,7 @@ def _linear_map_transpose(cotangents: Any, *args: Any, **params: Any) -> Any:
     return [None] * number + _linear_map.bind(*given, *whole, number=number, **turned)
 
 
-def _linear_map_batching(args: Any, dims: Any, **params: Any) -> Any:
-    """Return the results of a linear map for a batch, and the batch axes of the results (all 0).
-
-    This is the rule of the JAX primitive `_linear_map` for `jax.vmap`.
-
-    - `args`: the arguments of the map.
-    - `dims`: the batch axis of each argument, or `None` for an argument without a batch axis.
-    - `params`: a dict with the map, its transpose, and the shapes and dtypes of the arrays of one
-      element of the batch.
-    """
+def _batch_rule(args: Any, dims: Any, **params: Any) -> Any:
     number = params["number"]
     size = next(a.shape[d] for a, d in zip(args, dims, strict=True) if d is not None)
     given, own = args[:number], dims[:number]
@@ -248,9 +173,13 @@ def _linear_map_batching(args: Any, dims: Any, **params: Any) -> Any:
     return _linear_map.bind(*given, *along, number=number, **both), [0] * len(results)
 
 
-ad.primitive_jvps[_linear_map] = _linear_map_jvp
-ad.primitive_transposes[_linear_map] = _linear_map_transpose
-batching.primitive_batchers[_linear_map] = _linear_map_batching
-mlir.register_lowering(
-    _linear_map, mlir.lower_fun(lambda *args, function, **_: function(*args), multiple_results=True)
-)
+def _call(*args: Any, function: Map, **_: Any) -> Arrays:
+    return function(*args)
+
+
+_linear_map.def_impl(_call)
+_linear_map.def_abstract_eval(lambda *_, results, **__: [ShapedArray(*one) for one in results])
+ad.primitive_jvps[_linear_map] = _jvp_rule
+ad.primitive_transposes[_linear_map] = _transpose_rule
+batching.primitive_batchers[_linear_map] = _batch_rule
+mlir.register_lowering(_linear_map, mlir.lower_fun(_call, multiple_results=True))

@@ -20,39 +20,25 @@ from rigidjax.motion.equations import AttitudeEquations, project_to_group
 from rigidjax.motion.torques.base import may_read_attitude
 from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import quaternion_product
-from rigidjax.solve.components import join_scalars, split_into_scalars
-from rigidjax.solve.equal_steps import change_and_slope_at_start
-from rigidjax.solve.explicit import (
-    NestedInterpolation,
-    cubic_coefficients,
-    direction_and_length_of_step,
-)
+from rigidjax.solve.components import join_scalars, split_scalars
+from rigidjax.solve.equal_steps import change_and_slope
+from rigidjax.solve.explicit import NestedInterpolation, cubic_coefficients, direction_and_length
 from rigidjax.solve.tableaus import KUTTA4
 
 
-def momentum_change_and_turn(
+def change_and_turn(
     slope: Callable[[Any, Triple], Triple], rate: Callable[[Triple], Triple],
     t: Any, end: Any, h: Array, p: Triple,
 ) -> tuple[Triple, QuaternionEntries]:  # fmt: skip
     """Return the change of the momentum (or body rate) `p` in a step, and the turn of the body.
 
-    The turn is a quaternion, scalar first, from which the identity (1, 0, 0, 0) is subtracted.
-
-    **Arguments:**
-
-    - `slope(t, p)`: the derivative dp/dt.
-    - `rate(p)`: the body rate Ω, rad/s, that belongs to `p`.
-    - `t`, `end`, `h`: the times at which the step begins and ends, s, and the length of the step,
-      s.
-    - `p`: the momentum, or the body rate, at the time `t`.
-
-    The rotation vector of the step is `∫Ω dt + h²/12 Ω(t) × Ω(t+h)`. The integral is computed by
-    Simpson's rule, from Ω at the start, the middle and the end of the step. The value of p at the
-    middle is that of the cubic polynomial with the right p and dp/dt at both ends. Source: Magnus
-    1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas, Nørsett and Zanna 2000,
+    The turn is a quaternion less the identity. `rate(p)` is Ω, rad/s. The rotation vector of the
+    step is `∫Ω dt + h²/12 Ω(t) × Ω(t+h)`, by Simpson's rule; p in the middle is that of the cubic
+    polynomial with the right p and dp/dt at both ends. Source: Magnus 1954,
+    doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas, Nørsett and Zanna 2000,
     doi:10.1017/S0962492900002154, section 5.
     """
-    change, first = change_and_slope_at_start(KUTTA4, slope, t, h, p, end)
+    change, first = change_and_slope(KUTTA4, slope, t, h, p, end)
     after = barrier(add(p, change))
     last = slope(end, after)
     middle = tuple(
@@ -80,7 +66,7 @@ class Magnus4(dfx.AbstractSolver):
     The steps have a fixed length. With steps of the same length, this method does less work than
     `rigidjax.solvers.RungeKutta4` and has a smaller error; it is the default of
     `rigidjax.batch.rollout`. A step should turn the body by less than a radian. Source: Magnus
-    1954, doi:10.1002/cpa.3160070404; see `momentum_change_and_turn`.
+    1954, doi:10.1002/cpa.3160070404; see `change_and_turn`.
 
     **Raises:** `TypeError` for a torque that may depend on the attitude, and for a state that is
     not an `Attitude`.
@@ -100,17 +86,10 @@ class Magnus4(dfx.AbstractSolver):
         return 4
 
     def init(
-        self,
-        terms: PyTree[dfx.AbstractTerm],
-        t0: RealLike,
-        t1: RealLike,
-        y0: PyTree,
-        args: PyTree,
+        self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike, y0: PyTree, args: PyTree
     ) -> tuple[()]:
         field, _ = field_and_direction(terms)
-        require_independent_of_attitude(
-            require_attitude_equations("Magnus4", field, y0, "RungeKutta4").euler.torque
-        )
+        refuse_attitude(attitude_equations("Magnus4", field, y0, "RungeKutta4").euler.torque)
         return ()
 
     def step(
@@ -123,25 +102,21 @@ class Magnus4(dfx.AbstractSolver):
         solver_state: PyTree,
         made_jump: Bool[ArrayLike, ""],
     ) -> Any:
-        start = split_into_scalars(y0)
+        start = split_scalars(y0)
         q, omega = start[:4], start[4:]
-        way, h = (
-            part.astype(y0.omega.dtype) for part in direction_and_length_of_step(terms, t0, t1)
-        )
+        way, h = (part.astype(y0.omega.dtype) for part in direction_and_length(terms, t0, t1))
         # The torque has declared that it does not read the attitude. It gets NaN as the attitude,
         # so that the result is NaN if the torque reads the attitude nevertheless.
         nowhere = jnp.full_like(y0.q, jnp.nan)
 
         def slope(t: Any, omega: Triple) -> Triple:
-            return split_into_scalars(
-                way * terms.vf(t, Attitude(nowhere, jnp.stack(omega)), args).omega
-            )
+            return split_scalars(way * terms.vf(t, Attitude(nowhere, jnp.stack(omega)), args).omega)
 
         def rate(omega: Triple) -> Triple:
             a, b, c = omega
             return way * a, way * b, way * c
 
-        change, turn = momentum_change_and_turn(slope, rate, t0, t1, h, omega)
+        change, turn = change_and_turn(slope, rate, t0, t1, h, omega)
         change = join_scalars((*quaternion_product(q, turn), *change), y0)
         y1 = project_to_group(jax.tree.map(jnp.add, y0, change))
         left, right = terms.vf(t0, y0, args), terms.vf(t1, y1, args)
@@ -156,15 +131,10 @@ class Magnus4(dfx.AbstractSolver):
         return terms.vf(t0, y0, args)
 
 
-def require_attitude_equations(
+def attitude_equations(
     solver_name: str, field: Any, y0: PyTree, advised_solver: str
 ) -> AttitudeEquations:
-    """Return the vector field `field`, after a check that the solver `solver_name` can solve it.
-
-    The solver needs the field of an attitude and its body rate: raise `TypeError` unless `field` is
-    an `AttitudeEquations` and the state `y0` is an `Attitude`. The message advises the user to take
-    the solver `advised_solver` instead.
-    """
+    """Return `field`; raise `TypeError` unless field and state are those of an attitude."""
     if isinstance(field, AttitudeEquations) and isinstance(y0, Attitude):
         return field
     raise TypeError(
@@ -173,11 +143,10 @@ def require_attitude_equations(
     )
 
 
-def require_independent_of_attitude(torque: Any) -> None:
+def refuse_attitude(torque: Any) -> None:
     """Raise `TypeError` for a torque that may depend on the attitude of the body.
 
-    A torque states by `feels = HasSpin` that it does not depend on the attitude; without this
-    statement it is refused. `None` stands for no torque, and is accepted.
+    A torque states by `feels = HasSpin` that it does not.
     """
     if may_read_attitude(torque):
         raise TypeError(

@@ -27,14 +27,8 @@ from rigidjax.motion.torques.states import freeze_own_states
 from rigidjax.rotation.linalg3 import apply, solve
 
 
-class _EquationsUnderChangingInertia(eqx.Module):
-    """Compute the time derivative of the state of a body whose inertia changes with the time.
-
-    It is called with the time t, s, and a state with the body rate Ω. In the returned derivative
-    dΩ̃/dt stands in the place of dΩ/dt. The rate Ω̃ = I₀⁻¹ p, rad/s, is computed from the momentum
-    p = I(t) Ω. Here I(t) is the inertia at the time t, and I₀ is the inertia of `body`, which is
-    constant. When I(t) jumps, Ω jumps, too, but p and Ω̃ do not.
-    """
+class _ChangingEquations(eqx.Module):
+    """Compute dΩ̃/dt, in the place of dΩ/dt, from a state with the body rate Ω."""
 
     body: Any  # the body with the inertia I₀, an `Inertia` or `MassProperties`
     law: ChangingInertia  # gives the inertia I(t) at any time, and the torque
@@ -51,45 +45,28 @@ class _EquationsUnderChangingInertia(eqx.Module):
 
 
 class ByMomentum(eqx.Module):
-    """Compute the time derivative of the state of a body whose inertia changes with the time.
+    """Compute the time derivative of a state with the rate Ω̃ = I₀⁻¹ p in the place of Ω.
 
-    While such a motion is integrated, its states have the rate Ω̃ = I₀⁻¹ p in the place of the body
-    rate Ω. Here p = I(t) Ω is the momentum, I(t) the inertia at the time t, and I₀ the inertia of
-    the body that `simulate` was given. When I(t) jumps, Ω jumps, too, but Ω̃ does not. The method
-    `replace_rate_by_momentum` replaces Ω by Ω̃, and `restore_body_rate` replaces Ω̃ by Ω.
+    Where the inertia I(t) jumps, Ω jumps, but Ω̃ does not.
     """
 
-    field: Any  # an `_EquationsUnderChangingInertia`, or a `CoupledEquations` that contains it
+    field: Any  # an `_ChangingEquations`, or a `CoupledEquations` that contains it
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None) -> Any:
-        return self.field(t, self.restore_body_rate(t, y))
+        return self.field(t, self.to_rate(t, y))
 
-    def replace_rate_by_momentum(self, t: Any, y: PyTree) -> PyTree:
-        """Return the state `y`, with its body rate Ω replaced by I₀⁻¹ p, where p is the momentum.
-
-        The momentum is p = I(t) Ω. Here I(t) is the inertia at the time `t`, s, and I₀ is the
-        inertia of the body that `simulate` was given.
-        """
+    def to_momentum(self, t: Any, y: PyTree) -> PyTree:
+        """Return the state with Ω replaced by Ω̃ = I₀⁻¹ I(t) Ω."""
         return self._replace_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
 
-    def restore_body_rate(self, t: Any, y: PyTree) -> PyTree:
-        """Return the state `y` of the run, with the body rate Ω in the place of its rate w.
-
-        The body rate is Ω = I(t)⁻¹ I₀ w. Here I(t) is the inertia at the time `t`, s, and I₀ is the
-        inertia of the body that `simulate` was given. This is the inverse of
-        `replace_rate_by_momentum`.
-        """
+    def to_rate(self, t: Any, y: PyTree) -> PyTree:
+        """Return the state with Ω̃ replaced by Ω = I(t)⁻¹ I₀ Ω̃."""
         return self._replace_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
 
     def _replace_rate(
         self, y: PyTree, new_rate: Callable[[Array, Array, Array], Array], t: Any
     ) -> PyTree:
-        """Return the state `y` with its body rate, rad/s, replaced by another one.
-
-        `new_rate(I, I₀, w)` computes the new rate from three arrays: the inertia (3, 3) at the time
-        `t`, s; the inertia (3, 3) of the body that `simulate` was given; and the rate w (3,) of
-        `y`.
-        """
+        """Return the state with the rate `new_rate(I, I₀, rate)`, rad/s."""
         motion, own = motion_of(y), y.own if isinstance(y, Coupled) else ()
         dtype = motion.omega.dtype
         inner: Any = self.field.field if isinstance(self.field, CoupledEquations) else self.field
@@ -98,36 +75,22 @@ class ByMomentum(eqx.Module):
             if own
             else inner.law.tensor(t)
         )
-        fixed = tensor_of(inner.body).astype(dtype)
-        omega = new_rate(now.astype(dtype), fixed, motion.omega)
+        omega = new_rate(now.astype(dtype), tensor_of(inner.body).astype(dtype), motion.omega)
         return eqx.tree_at(lambda s: motion_of(s).omega, y, omega)
 
 
 def equations_by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
-    """Return the equations of motion by momentum for an inertia that is a function of time.
-
-    In the states of these equations I₀⁻¹ p stands in the place of the body rate, so that the states
-    do not jump when the inertia jumps; p is the momentum and I₀ the inertia of `body`. The result
-    is `None` for an inertia that is constant or that depends on more than the time.
-
-    - `body`, `torque`: the arguments of `simulate` with these names.
-    - `state0`: the state at the start, with the body rate.
-    """
-    if not isinstance(law := changing_inertia_of_torque(torque), ChangingInertia) or hasattr(
+    """Return the equations by momentum; `None` unless the inertia is a function of time alone."""
+    if not isinstance(law := changing_inertia(torque), ChangingInertia) or hasattr(
         law.inertia, "feels"
     ):
         return None
-    field: Any = _EquationsUnderChangingInertia(body, law)
+    field: Any = _ChangingEquations(body, law)
     return ByMomentum(CoupledEquations(field, body) if isinstance(state0, Coupled) else field)
 
 
-def changing_inertia_of_torque(torque: Any) -> ChangingInertia | None:
-    """Return the torque if it is a `ChangingInertia`, or `None` if it is another torque.
-
-    A `ChangingInertia` is the law by which the inertia of a body changes with the time; `simulate`
-    takes it in the place of a torque. If the torque is a `Sum` whose only part is a
-    `ChangingInertia`, this part is returned.
-    """
+def changing_inertia(torque: Any) -> ChangingInertia | None:
+    """Return the torque, or the only part of a `Sum`, if it is a `ChangingInertia`, else `None`."""
     # The argument `torque` may also be a scene of particles, another torque or `None`, which are
     # not searched for parts.
     parts = parts_of(torque) if isinstance(torque, ChangingInertia | Sum) else ()
@@ -135,14 +98,5 @@ def changing_inertia_of_torque(torque: Any) -> ChangingInertia | None:
 
 
 def with_body_rates(form: ByMomentum | None, ts: Array, ys: PyTree) -> PyTree:
-    """Return the saved states of a run, with the body rates restored.
-
-    If the inertia is a function of time, the states of the run have a rate that is computed from
-    the momentum, in the place of the body rate.
-
-    - `form`: the equations by momentum of the run; if it is `None`, the states already have the
-      body rate and are returned as they are.
-    - `ts`: (T,) the saved times, s.
-    - `ys`: the states at these times, with a leading time axis.
-    """
-    return ys if form is None else jax.vmap(form.restore_body_rate)(ts, ys)
+    """Return the saved states of a run with their body rates (see `ByMomentum`)."""
+    return ys if form is None else jax.vmap(form.to_rate)(ts, ys)

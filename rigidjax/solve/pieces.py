@@ -5,14 +5,14 @@ iteration of the loop (unrolling), free bodies take three times as many steps a 
 mode unrolling does not help, because a backward step has so many numbers that the time of a kernel
 grows in proportion to its number of operations. If a loop is unrolled, JAX also unrolls its
 transpose. The backward loop is therefore written here by hand, with one step in each iteration. It
-stores states on two levels (see `take_equal_steps_on_gpu`). On a CPU neither the unrolling nor this
+stores states on two levels (see `march_on_gpu`). On a CPU neither the unrolling nor this
 backward loop saves time.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from rigidjax.solve.batching import Arrays
+from rigidjax.solve.batching import Arrays, replaced
 from rigidjax.solve.linear_map import linear_map
 from rigidjax.solve.stops import trace_program
 
@@ -35,22 +35,28 @@ _LONG, _MOST = 2800, 8
 def steps_per_piece(count: int) -> int:
     """Return how many steps are in each piece of a run of `count` steps: about √count.
 
-    If `count` has divisors between √count and 2√count, the smallest of them is returned. The pieces
-    then contain all steps, so that no loop for remaining steps has to be compiled.
+    The smallest divisor of `count` between √count and 2√count is taken, if there is one: no loop
+    for remaining steps has then to be compiled.
     """
     root = math.isqrt(count - 1) + 1
     near = [d for d in range(root, min(2 * root, count) + 1) if count % d == 0]
     return near[0] if near else root
 
 
-@dataclasses.dataclass(frozen=True)
-class _StepsInPieces:
-    """Take many equal steps in forward direction, and run them in reverse mode.
+class _Division(NamedTuple):
+    """Hold how steps are divided into pieces of equally many steps."""
 
-    The steps are divided into pieces of about √N steps, where N is the number of all steps. Only
-    the states at the starts of the pieces are stored; reverse mode computes the states within a
-    piece once more. A state is a list of arrays, and so are the constants, which are the arrays
-    that the function of a step holds.
+    firsts: Array  # the number of the first step of each piece
+    length: int  # the number of steps in a piece
+    left: int  # the number of steps after the last piece, too few for another one
+
+
+@dataclasses.dataclass(frozen=True)
+class _Pieces:
+    """Take many equal steps, and run them in reverse mode, in pieces of about √count steps.
+
+    Only the states at the starts of the pieces are stored; reverse mode computes those within a
+    piece once more. States and constants are lists of arrays.
     """
 
     # call(constants, y, i) → the state after step number i, which begins with the state y.
@@ -61,29 +67,21 @@ class _StepsInPieces:
     def take_steps(
         self, constants: Arrays, y: Arrays, first: Array, number: int, keep_starts: bool = False
     ) -> tuple[Arrays, Arrays | None]:
-        """Take `number` steps from the state `y`; the first of them is step number `first`.
-
-        `constants` are the arrays that the function of a step holds. **Returns** two things. The
-        first is the state after the steps. If `keep_starts` is true, the second is the states at
-        the starts of these steps, along a new first axis; else it is `None`.
-        """
+        """Take `number` steps from `y`; return the end and, if wanted, the starts of all."""
 
         def one(y: Arrays, i: Array) -> tuple[Arrays, Any]:
             return self.call(constants, y, i), y if keep_starts else None
 
         return lax.scan(one, y, first + jnp.arange(number, dtype=jnp.int32), unroll=self.turn)
 
-    def take_all_steps(
+    def run(
         self, constants: Arrays, first: Array, y: Arrays
     ) -> tuple[Arrays, tuple[Arrays, Arrays]]:
-        """Take all steps from the state `y`, beginning with step number `first`.
+        """Take all steps; return the end, and the states that `pull_back` needs.
 
-        `constants` are the arrays that the function of a step holds. **Returns** two things: the
-        state at the end, and a pair that `pull_back_all_steps` needs. The first item of the pair is
-        the states at the starts of the pieces, along a new first axis. The second item is the state
-        after the last piece, from which the remaining steps are taken.
+        These are the starts of the pieces, and the state after the last piece.
         """
-        firsts, length, left = self.divide_into_pieces(first)
+        firsts, length, left = self.divide(first)
 
         def piece(y: Arrays, begin: Array) -> tuple[Arrays, Arrays]:
             return self.take_steps(constants, y, begin, length)[0], y
@@ -94,7 +92,7 @@ class _StepsInPieces:
             end, _ = self.take_steps(constants, end, first + self.count - left, left)
         return end, (starts, last)
 
-    def pull_back_all_steps(
+    def pull_back(
         self,
         constants: Arrays,
         has_derivative: Sequence[bool],
@@ -102,28 +100,12 @@ class _StepsInPieces:
         starts: tuple[Arrays, Arrays],
         cotangent_of_end: Arrays,
     ) -> tuple[Arrays, Arrays]:
-        """Run all steps in reverse mode: return the cotangents of constants and state at the start.
-
-        **Arguments:**
-
-        - `constants`: the arrays that the function of a step holds.
-        - `has_derivative`: for each constant, whether it has a derivative.
-        - `first`: the number of the first step.
-        - `starts`: the pair of states that the method `take_all_steps` returned as its second
-          result. The first item is the states at the starts of the pieces, along a new first axis;
-          the second item is the state after the last piece.
-        - `cotangent_of_end`: the cotangent of the state after all steps.
-
-        **Returns** two lists: the cotangents of the constants with a derivative, and the cotangent
-        of the state at the start.
-        """
-        firsts, length, left = self.divide_into_pieces(first)
+        """Return the cotangents of the constants with a derivative, and of the start."""
+        firsts, length, left = self.divide(first)
         chosen = [c for c, m in zip(constants, has_derivative, strict=True) if m]
 
         def step_of(i: Array) -> Callable[[Arrays, Arrays], Arrays]:
-            return lambda some, y: self.call(
-                _replace_selected(constants, has_derivative, some), y, i
-            )
+            return lambda some, y: self.call(replaced(constants, has_derivative, some), y, i)
 
         def one(sums: tuple[Arrays, Arrays], at: tuple[Arrays, Array]) -> tuple[Any, None]:
             (total, bar), (y, i) = sums, at
@@ -147,33 +129,18 @@ class _StepsInPieces:
 
         return lax.scan(whole, sums, (rows, firsts), reverse=True)[0]
 
-    def divide_into_pieces(self, first: Array) -> tuple[Array, int, int]:
-        """Return how all steps are divided into pieces.
-
-        A piece is a group of steps that follow one another; all pieces have equally many steps. The
-        first of all steps has the number `first`. **Returns** three things: an array with the
-        number of the first step of each piece; how many steps are in a piece; and how many steps
-        remain after the last piece, because they are too few for another piece.
-        """
+    def divide(self, first: Array) -> _Division:
+        """Return how all steps are divided into pieces, if the first has the number `first`."""
         length = steps_per_piece(self.count)
         many, left = divmod(self.count, length)
-        return first + length * jnp.arange(many, dtype=jnp.int32), length, left
+        return _Division(first + length * jnp.arange(many, dtype=jnp.int32), length, left)
 
 
-def take_equal_steps_on_gpu(
-    step: Callable[[Any, Array], Any], first: Array, count: int, y: Any
-) -> Any:
-    """Take many equal steps on a GPU, several in one kernel, and return the state after them.
+def march_on_gpu(step: Callable[[Any, Array], Any], first: Array, count: int, y: Any) -> Any:
+    """Take many equal steps `step(state, i)`, several in one kernel; return the state after them.
 
-    - `step`: a function `step(state, i)` that takes step number i from `state`, and returns the
-      state after the step.
-    - `first`: the number of the first step.
-    - `count`: how many steps are taken.
-    - `y`: the state before the first step.
-
-    In reverse mode the run is divided into about √count pieces. The states at the starts of all
-    pieces are stored; the states within a piece are stored for one piece at a time. Second
-    derivatives are forward over reverse.
+    In reverse mode the run is divided into pieces (see `_Pieces`). Second derivatives are forward
+    over reverse.
     """
     start, tree = jax.tree.flatten(y)
     one = trace_program(lambda y, i: jax.tree.leaves(step(tree.unflatten(y), i)), start, first)
@@ -181,12 +148,12 @@ def take_equal_steps_on_gpu(
     # `turn` is how many steps are taken in one iteration of the loop over the steps. It is a power
     # of two, because the number of steps in a piece is often a multiple of a power of two.
     turn = 1 << (turn.bit_length() - 1)
-    program, constants = _StepsInPieces(one.call, count, turn), one.jax_constants
+    program, constants = _Pieces(one.call, count, turn), one.jax_constants
     number = len(constants)
     smooth = [*[eqx.is_inexact_array(c) for c in constants], False, *[True for _ in start]]
 
     def end(args: Arrays) -> Arrays:
-        return program.take_all_steps(args[:number], args[number], args[number + 1 :])[0]
+        return program.run(args[:number], args[number], args[number + 1 :])[0]
 
     @jax.custom_jvp
     def run(*args: Array) -> Arrays:
@@ -196,20 +163,20 @@ def take_equal_steps_on_gpu(
         both = zip(smooth, tangents, strict=True)
         moving = [s and not isinstance(t, SymbolicZero) for s, t in both]
         size = len(primals)
-        out, starts = program.take_all_steps(
+        out, starts = program.run(
             list(primals[:number]), primals[number], list(primals[number + 1 :])
         )
         rows, shape = jax.tree.flatten(starts)
 
         def push(*args: Array) -> Arrays:
             given = list(args[:size])
-            of = lambda *some: end(_replace_selected(given, moving, some))  # noqa: E731
+            of = lambda *some: end(replaced(given, moving, some))  # noqa: E731
             at = [g for g, m in zip(given, moving, strict=True) if m]
             return jax.jvp(of, at, list(args[size + len(rows) :]))[1]
 
         def pull(*args: Array) -> Arrays:
             given, kept, bars = args[:number], args[size : size + len(rows)], args[-len(start) :]
-            total, bar = program.pull_back_all_steps(
+            total, bar = program.pull_back(
                 list(given), moving[:number], args[number], shape.unflatten(kept), list(bars)
             )
             return [*total, *[b for b, m in zip(bar, moving[number + 1 :], strict=True) if m]]
@@ -219,15 +186,3 @@ def take_equal_steps_on_gpu(
 
     run.defjvp(run_jvp, symbolic_zeros=True)
     return tree.unflatten(run(*constants, first, *start))
-
-
-def _replace_selected(
-    arrays: Sequence[Any], selected: Sequence[bool], replacements: Sequence[Any]
-) -> list[Any]:
-    """Return a copy of the list `arrays` in which some of its arrays are replaced.
-
-    `selected` has a truth value for each array of the list `arrays`: whether it is replaced.
-    `replacements` are the new arrays, in order, one for each true value.
-    """
-    rest = iter(replacements)
-    return [next(rest) if new else a for a, new in zip(arrays, selected, strict=True)]

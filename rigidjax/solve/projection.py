@@ -14,11 +14,7 @@ from rigidjax.solve.adaptive_loop import NONFINITE, finite
 
 
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
-    """Interpolate the state within a step by `inner`, and scale the quaternion to length 1.
-
-    The quaternion is that of the interpolated state. `inner` is the interpolation of the solver
-    that took the step.
-    """
+    """Interpolate the state within a step by `inner`, and scale the quaternion to length 1."""
 
     t0: Any
     t1: Any
@@ -31,13 +27,8 @@ class GroupInterpolation(dfx.AbstractLocalInterpolation):
         return jtu.tree_map(lambda a, b: a - b, end, start)
 
 
-class _MakeGroupInterpolation(eqx.Module):
-    """Make the object that interpolates within a step, and scales the quaternion to length 1.
-
-    Diffrax calls it with the times `t0` and `t1` at which the step begins and ends, s, and with the
-    arrays that the solver has stored for this step. From these arrays the state at any time within
-    the step (dense output) is computed.
-    """
+class _GroupInterpolationOf(eqx.Module):
+    """Make a `GroupInterpolation` from what the solver has stored for a step."""
 
     inner_cls: Any = eqx.field(static=True)  # the class of the solver's own interpolation
 
@@ -45,13 +36,9 @@ class _MakeGroupInterpolation(eqx.Module):
         return GroupInterpolation(t0, t1, self.inner_cls(t0=t0, t1=t1, **dense_info))
 
 
-def _make_property_of_member(member: str, attribute: str) -> Any:
-    """Define a property that reads an attribute of a member of an object.
-
-    `member` is the name of the member, and `attribute` that of its attribute. With the names
-    "solver" and "order", for example, the property of an object x has the value `x.solver.order`.
-    """
-    return property(lambda self: getattr(getattr(self, member), attribute))
+def _of_solver(attribute: str) -> Any:
+    """Define a property that reads an attribute of the wrapped solver."""
+    return property(lambda self: getattr(self.solver, attribute))
 
 
 class Projected(dfx.AbstractWrappedSolver):
@@ -74,20 +61,18 @@ class Projected(dfx.AbstractWrappedSolver):
     def __check_init__(self) -> None:
         _checks.require_instance(self.solver, dfx.AbstractSolver, "solver")
 
-    term_structure = _make_property_of_member("solver", "term_structure")
-    term_compatible_contr_kwargs = _make_property_of_member(
-        "solver", "term_compatible_contr_kwargs"
-    )
+    term_structure = _of_solver("term_structure")
+    term_compatible_contr_kwargs = _of_solver("term_compatible_contr_kwargs")
     # Adjoints of diffrax set `scan_kind` on a Runge–Kutta method, and step controllers set the
     # members of the root finder on an implicit method. They look for these members on the
     # `Projected`, which therefore passes on those of the solver inside it.
-    scan_kind = _make_property_of_member("solver", "scan_kind")
-    root_finder = _make_property_of_member("solver", "root_finder")
-    root_find_max_steps = _make_property_of_member("solver", "root_find_max_steps")
+    scan_kind = _of_solver("scan_kind")
+    root_finder = _of_solver("root_finder")
+    root_find_max_steps = _of_solver("root_find_max_steps")
 
     @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _MakeGroupInterpolation(self.solver.interpolation_cls)
+        return _GroupInterpolationOf(self.solver.interpolation_cls)
 
     def order(self, terms: PyTree[dfx.AbstractTerm]) -> int | None:
         return self.solver.order(terms)
@@ -99,12 +84,7 @@ class Projected(dfx.AbstractWrappedSolver):
         return self.solver.error_order(terms)
 
     def init(
-        self,
-        terms: PyTree[dfx.AbstractTerm],
-        t0: RealLike,
-        t1: RealLike,
-        y0: PyTree,
-        args: PyTree,
+        self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike, y0: PyTree, args: PyTree
     ) -> Any:
         return self.solver.init(terms, t0, t1, y0, args)
 

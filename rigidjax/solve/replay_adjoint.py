@@ -18,10 +18,10 @@ from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax.motion.equations import project_to_group
-from rigidjax.solve.adaptive_loop import LoopState, Method, Run
+from rigidjax.solve.adaptive_loop import Decision, LoopState, Method, Run
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.recorded_run import run_with_replayed_derivatives
+from rigidjax.solve.recorded_run import run_replayed
 from rigidjax.solve.step_control import NORM, StandardController, Stopping, Watched
 from rigidjax.solve.stops import trace_program
 
@@ -89,7 +89,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
     ) -> Any:  # fmt: skip
         how = dict(terms=terms, solver=solver, stepsize_controller=stepsize_controller)
         how |= dict(saveat=saveat, t0=t0, t1=t1, dt0=dt0, max_steps=max_steps)
-        if not _can_be_replayed(solver, saveat, event, max_steps, init_state):
+        if not can_run(solver, max_steps, init_state.y, saveat, event, init_state.event_values):
             more = dict(args=args, event=event, init_state=init_state)
             return self.otherwise.loop(progress_meter=progress_meter, **how, **more, **rest)
         y0, tree = ravel_pytree(init_state.y)
@@ -108,7 +108,10 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             condition = trace_program(lambda t, y: event.cond_fn(t, tree(y), args, **how), t0, y0)
             constants = constants + condition.jax_constants
             halt = lambda given, t, y: condition.call(given[count:], t, y)  # noqa: E731
-        controlled_by = _nested_controllers(stepsize_controller)
+        controlled_by, inner = [], stepsize_controller  # the outermost first
+        while isinstance(inner, dfx.AbstractStepSizeController):
+            controlled_by.append(inner)
+            inner = getattr(inner, "controller", None)
         plain = all(isinstance(c, _WITHOUT_ARGS) for c in controlled_by)
         control = (stepsize_controller, progress_meter, None if plain else args)
         arrays, static = eqx.partition(control, eqx.is_array)
@@ -129,7 +132,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             sizes=[leaf.size for leaf in jax.tree.leaves(init_state.y)],
             max_steps=max_steps,
         )
-        subs = _sub_save_ats(saveat)
+        subs = _subs(saveat)
         asked = jnp.concatenate([t0[None][:0], *(s.ts for s in subs if s.ts is not None)])
         # If the `SaveAt` has several `SubSaveAt`s, each with saved times of its own, these times
         # are joined and sorted.
@@ -138,25 +141,21 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         state = lax.stop_gradient(jax.tree.map(jnp.asarray, state))
         between, first = asked if order is None else asked[order], init_state.tnext
         run = Run(
-            t0, _times_where_steps_end(controlled_by, t0, t1), between, y0,
+            t0, _stops(controlled_by, t0, t1), between, y0,
             lax.stop_gradient(first), None if event is None else init_state.result,
         )  # fmt: skip
         # The first `count` constants are those of the field. Only they have derivatives: the
         # condition that ends a run has none, nor has the controller.
         smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
-        ys, end = run_with_replayed_derivatives(method, smooth, constants, state, run)
+        ys, end = run_replayed(method, smooth, constants, state, run)
         if order is not None:
             ys = jnp.zeros_like(ys).at[order].set(ys)
-        final = _final_diffeqsolve_state(init_state, saveat, event, args, tree, run, asked, ys, end)
+        final = _final_state(init_state, saveat, event, args, tree, run, asked, ys, end)
         return final, {"next_step": end.end - end.t}
 
 
 class _Control(NamedTuple):
-    """Choose whether an attempted step is accepted, and at which time the next step ends.
-
-    It is called for one body. It holds a step controller of diffrax, which decides, and a progress
-    meter, which shows how much of the run is done.
-    """
+    """Choose by a controller of diffrax whether a step of one body is accepted."""
 
     static: Any  # controller, progress meter and `args`, without the arrays in them
     # A function that selects the arrays of controller, progress meter and `args` from the constants
@@ -167,25 +166,8 @@ class _Control(NamedTuple):
     tree: Callable[[Array], Any]
     order: Any  # the order of the error of a step
 
-    def __call__(self, again: bool, constants: Arrays, given: Any, numbers: Any) -> Any:
-        """Return the decision of the controller on an attempted step.
-
-        **Returns** five things: whether the step is accepted; the times at which the next step
-        begins and ends; the new states of controller and progress meter; and the result of the run
-        so far.
-
-        **Arguments:**
-
-        - `again`: whether a derivative repeats a recorded step; the progress meter then shows
-          nothing.
-        - `constants`: the constants of the run, from which the function `self.arrays` selects the
-          arrays of the controller.
-        - `given`: a pair. The first item is the states of controller and progress meter; the second
-          is four times: those at which the run begins and ends, and those at which the step begins
-          and ends.
-        - `numbers`: three vectors: the state before the step, the state after the step, and the
-          error of the step.
-        """
+    def __call__(self, again: bool, constants: Arrays, given: Any, numbers: Any) -> Decision:
+        """Return the decision on a step; repeated for a derivative (`again`) it moves no meter."""
         controller, meter, args = eqx.combine(self.arrays(constants), self.static)
         (control, progress), (t0, last, begin, end) = given
         *states, error = (self.tree(y) for y in numbers)
@@ -199,69 +181,38 @@ class _Control(NamedTuple):
         following = jnp.where(keep & (following > near), last, following)
         if not again:
             progress = meter.step(progress, (t - t0) / (last - t0))
-        return jax.tree.map(jnp.asarray, (keep, t, following, (control, progress), result))
+        return jax.tree.map(jnp.asarray, Decision(keep, t, following, (control, progress), result))
 
 
-def can_run(solver: dfx.AbstractSolver, max_steps: int | None, state: Any) -> bool:
-    """Return whether `ReplayAdjoint` can do a run of this solver from this state: an explicit
-    method of this package, a largest number of steps, and numbers of one floating-point dtype.
+def can_run(
+    solver: dfx.AbstractSolver, max_steps: int | None, state: Any,
+    saveat: dfx.SaveAt | None = None, event: dfx.Event | None = None, event_values: Any = None,
+) -> bool:  # fmt: skip
+    """Return whether `ReplayAdjoint` itself can do a run.
+
+    It takes an explicit method of this package, a largest number of steps, and numbers of one
+    floating-point dtype; no dense output or save at every step; and an event of one boolean
+    condition without a root finder.
     """
     kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(state)}
     plain = isinstance(solver, AbstractExplicit) and max_steps is not None and len(kinds) == 1
-    return plain and jnp.issubdtype(min(kinds, key=str), jnp.floating)
-
-
-def _can_be_replayed(
-    solver: dfx.AbstractSolver,
-    saveat: dfx.SaveAt,
-    event: dfx.Event | None,
-    max_steps: int | None,
-    state: Any,
-) -> bool:
-    """Return whether `ReplayAdjoint` can do a run without its other adjoint, `otherwise`.
-
-    Besides `can_run`: it cannot save dense output or every step. An event must have one condition
-    that returns a truth value, and no root finder. `state` is the state of `diffeqsolve` at the
-    start.
-    """
-    plain = can_run(solver, max_steps, state.y) and not saveat.dense
+    plain = plain and jnp.issubdtype(min(kinds, key=str), jnp.floating)
     if event is not None:
-        values = jax.tree.leaves(state.event_values)
+        kind = jnp.result_type(jax.tree.leaves(event_values)[0])
         plain = plain and event.root_finder is None and callable(event.cond_fn)
-        plain = plain and jnp.issubdtype(jnp.result_type(values[0]), jnp.bool_)
-    return plain and not any(sub.steps for sub in _sub_save_ats(saveat))
+        plain = plain and jnp.issubdtype(kind, jnp.bool_)
+    every = saveat is not None and (saveat.dense or any(sub.steps for sub in _subs(saveat)))
+    return plain and not every
 
 
-def _sub_save_ats(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
-    """Return a list of the `diffrax.SubSaveAt`s of a `diffrax.SaveAt`.
-
-    Each of them says which function of the state is saved, and at which times.
-    """
+def _subs(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
+    """Return the `diffrax.SubSaveAt`s of a `diffrax.SaveAt`."""
     is_sub = lambda s: isinstance(s, dfx.SubSaveAt)  # noqa: E731
     return [s for s in jax.tree.leaves(saveat.subs, is_leaf=is_sub) if is_sub(s)]
 
 
-def _nested_controllers(
-    controller: dfx.AbstractStepSizeController,
-) -> list[dfx.AbstractStepSizeController]:
-    """Return a list of a step controller and all the controllers inside it, the outermost first."""
-    found, inner = [], controller
-    while isinstance(inner, dfx.AbstractStepSizeController):
-        found.append(inner)
-        inner = getattr(inner, "controller", None)
-    return found
-
-
-def _times_where_steps_end(controllers: list[Any], t0: Array, t1: Array) -> Array:
-    """Return in increasing order the times at which steps end, s: the times of jumps, and then t1.
-
-    - `controllers`: step controllers. The controllers `Stopping` and
-      `diffrax.ClipStepSizeController` hold times at which the field jumps.
-    - `t0`, `t1`: the times at which the run begins and ends, s.
-
-    If a jump of a `ClipStepSizeController` is at or before t0, or after t1, no step has to end at
-    this jump. Its time is replaced by t0, so that the array keeps its length.
-    """
+def _stops(controllers: list[Any], t0: Array, t1: Array) -> Array:
+    """Return in increasing order the times at which steps end, s: those of jumps, and then t1."""
     jumps = [c.stops for c in controllers if type(c) is Stopping]
     for c in controllers:
         if type(c) is dfx.ClipStepSizeController and c.jump_ts is not None:
@@ -274,29 +225,19 @@ def _times_where_steps_end(controllers: list[Any], t0: Array, t1: Array) -> Arra
     return jnp.concatenate([*jumps, t1[None]])
 
 
-def _final_diffeqsolve_state(
+def _final_state(
     state: Any, saveat: dfx.SaveAt, event: dfx.Event | None, args: Any,
     make_state: Callable[[Array], Any], run: Run, saved_times: Array, ys: Array, end: LoopState,
 ) -> Any:  # fmt: skip
     """Return the state of `diffrax.diffeqsolve` at the end of a run, with all that it saves.
 
-    **Arguments:**
-
-    - `state`: the state of `diffeqsolve` at the start.
-    - `saveat`, `event`, `args`: the arguments of `diffeqsolve` with these names.
-    - `make_state`: a function that makes a state of the motion from its n numbers.
-    - `run`: the arrays of the run, among them the time and the state at the start, and the times at
-      which steps end.
-    - `saved_times`: (K,) s, the K saved times, those of all `diffrax.SubSaveAt`s joined.
-    - `ys`: (K, n) the states, of n numbers each, at the saved times; NaN at times that the run did
-      not reach.
-    - `end`: the state of the loop at the end of the run.
+    `ys` (K, n) are the states at `saved_times` (K,), those of all `diffrax.SubSaveAt`s joined.
     """
     t1 = run.stops[-1]
     # Before its first accepted step a run saves nothing, unless the run has no step because t1 is
     # not after t0.
     reached = (saved_times <= end.t) & ((end.t > run.t0) | (t1 <= run.t0))
-    counts = [s.ts.shape[0] for s in _sub_save_ats(saveat) if s.ts is not None]
+    counts = [s.ts.shape[0] for s in _subs(saveat) if s.ts is not None]
     parts = [jnp.split(a, np.cumsum(counts)[:-1]) for a in (reached, ys)]
     each = iter(zip(*parts, strict=True))
 

@@ -4,7 +4,7 @@ import dataclasses
 import warnings
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -33,16 +33,12 @@ from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.composite import Sum
 from rigidjax.rotation.barrier import warn_of_slow_loops
 from rigidjax.solve import validation
-from rigidjax.solve.adaptive import integrate_with_diffrax
-from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_or_nonfinite_input
+from rigidjax.solve.adaptive import integrate
+from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_of_body
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.linear_map import nan_derivatives_where_not_finite
+from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.momentum import (
-    changing_inertia_of_torque,
-    equations_by_momentum,
-    with_body_rates,
-)
+from rigidjax.solve.momentum import changing_inertia, equations_by_momentum, with_body_rates
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.sides import declared_jumps, evaluate_on_correct_sides
@@ -55,11 +51,7 @@ _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 class ClosedFormRun(eqx.Module):
-    """Hold the set-up of a run of a free body in closed form.
-
-    The state at the start and the saved times are not part of the set-up. To compute a state takes
-    equally long at any time of the run.
-    """
+    """Hold the set-up of a run of a free body in closed form, without start and saved times."""
 
     body: Inertia | MassProperties
     throw: bool = eqx.field(static=True)  # whether a run that fails raises an error
@@ -67,10 +59,9 @@ class ClosedFormRun(eqx.Module):
 
 
 class DiffraxRun(eqx.Module):
-    """Hold the set-up of a run by diffrax.
+    """Hold the set-up of a run by diffrax, without start and saved times.
 
-    The state at the start and the saved times are not part of the set-up. The fields without a
-    comment are the arguments of `simulate` with the same names.
+    The fields without a comment are the arguments of `simulate` with the same names.
     """
 
     body: Inertia | MassProperties | None
@@ -89,12 +80,8 @@ class DiffraxRun(eqx.Module):
     cuts: Array | None = None  # more times at which a step ends, besides the jumps of the torque
 
     @property
-    def ends_steps_at_jumps(self) -> bool:
-        """Return whether steps end at the times at which the torque jumps or switches.
-
-        If so, the run uses the time s = σt, which increases along the run: σ is 1, or −1 in a run
-        backwards in the time t.
-        """
+    def stops_at_jumps(self) -> bool:
+        """Return whether steps end where the torque jumps; the run then uses the time s = σt."""
         # Where steps end at jumps, the vector field is replaced by a traced program. `Magnus4`,
         # `FreeSolver` and the splittings read attributes of the field, which a traced program does
         # not have.
@@ -104,36 +91,36 @@ class DiffraxRun(eqx.Module):
         return stops and not reads_field
 
     @property
-    def records_steps_for_derivatives(self) -> bool:
-        """Return whether the run records its steps, which derivatives then repeat.
-
-        This is so for an explicit Runge–Kutta method of this package (an `AbstractExplicit`) under
-        tolerances and a `ReplayAdjoint`, with a limit to the number of steps.
-        """
+    def replays(self) -> bool:
+        """Return whether the run records its steps, which derivatives then repeat."""
         explicit = isinstance(self.solver, AbstractExplicit) and self.max_steps is not None
         return explicit and self.controller is None and isinstance(self.adjoint, ReplayAdjoint)
 
     def step_controller(self) -> dfx.AbstractStepSizeController:
-        """Return the step controller of the run.
-
-        An adaptive controller is wrapped, so that it also ends a run that cannot continue.
-        """
+        """Return the step controller; an adaptive one also ends a run that cannot continue."""
         control = self.controller
         if control is None:
             control = StandardController(self.rtol, self.atol, self.max_step)
         if isinstance(control, dfx.AbstractAdaptiveStepSizeController):
             control = Watched(control)
-        if self.cuts is not None and not self.ends_steps_at_jumps:
+        if self.cuts is not None and not self.stops_at_jumps:
             control = dfx.ClipStepSizeController(control, step_ts=jnp.sort(self.cuts))
         return control
 
 
-class Ends(eqx.Module):
-    """Evaluate the condition that ends the run of a particle in its scene, such as a collision.
+class ForwardRun(NamedTuple):
+    """Hold a run in the time s = σt, which increases along it."""
 
-    `diffrax.Event` calls it with the time `t`, s, and the state `y`, a `Point`. It returns whether
-    the scene ends the run there.
-    """
+    # field(s, y, sides): `sides` has one array for each part that jumps, the s at which steps end
+    # because of it. They may differ from the jumps by some units of round-off; `None`: they do not.
+    field: Callable[..., Any]
+    condition: Any  # condition(s, y), or `None`
+    ts: Array  # (T,) the saved times
+    jumps: list[Array]  # the jump times of each part of the field
+
+
+class Ends(eqx.Module):
+    """Evaluate whether the scene of a particle ends its run, for example by a collision."""
 
     scene: Any  # has ends(t, state) → bool and end_words(t, state) → str
 
@@ -161,7 +148,7 @@ def equations_of_motion(
     """
     if isinstance(state0, Coupled):
         return CoupledEquations(equations_of_motion(body, state0.motion, torque), body)
-    validation.require_compatible_types(body, state0, torque)
+    validation.require_compatible(body, state0, torque)
     if torque is not None:
         warn_of_slow_loops()
     if isinstance(state0, Point):
@@ -174,26 +161,21 @@ def equations_of_motion(
     return kind(body, torque)
 
 
-def hoist_traced_numbers(function: Any, *args: Any) -> Any:
+def hoist(function: Any, *args: Any) -> Any:
     """Return an equal function of `args` whose arrays include the traced numbers that it holds.
 
-    `function` is a torque or a condition. A derivative rule of our own sees no traced number in the
-    closure of a function of Python.
+    A derivative rule of our own sees no traced number in the closure of a function of Python.
     """
     if isinstance(function, Sum):
-        return Sum(*(hoist_traced_numbers(part, *args) for part in function.parts))
+        return Sum(*(hoist(part, *args) for part in function.parts))
     if function is None or isinstance(function, eqx.Module):
         return function
     converted = eqx.filter_closure_convert(function, *args)
     return function if _checks.is_known(converted) else converted
 
 
-def direction_of_times(times: Array) -> Int[Array, ""] | None:
-    """Return the direction of the `times` as an integer: 1 if they increase, −1 if they decrease.
-
-    The result is `None` if the times increase and are known before the run, that is if they are not
-    traced.
-    """
+def time_direction(times: Array) -> Int[Array, ""] | None:
+    """Return 1 or −1 for times that increase or decrease; `None` if they are known to increase."""
     ends = _checks.array_module(times).asarray(times)
     change = ends[-1] - ends[0]
     if _checks.is_known(times) and change > 0:
@@ -202,31 +184,14 @@ def direction_of_times(times: Array) -> Int[Array, ""] | None:
     return jnp.asarray(jnp.sign(change), jnp.int32)
 
 
-def convert_to_forward_time(
-    sign: Array | None,
-    field: Callable[..., Any],
-    condition: Callable[..., Any] | None,
-    ts: Array,
-) -> tuple[Callable[..., Any], Any, Array, list[Array]]:
-    """Convert a run backwards in time to a run forwards in time, which uses the time s = σt.
+def forward_time(
+    sign: Array | None, field: Callable[..., Any], condition: Callable[..., Any] | None, ts: Array
+) -> ForwardRun:
+    """Convert a run to one forwards in the time s = σt.
 
-    All times are in seconds.
-
-    **Arguments:**
-
-    - `sign`: σ, 1 or −1, chosen so that s increases along the run; `None` stands for 1.
-    - `field`: the vector field `f(t, y, args)`.
-    - `condition`: a function `(t, y)` that returns whether the run ends at the time t, or `None`.
-    - `ts`: (T,) the saved times, values of t.
-
-    **Returns** four things: the field as a function `(s, y, sides)`; the condition as a function
-    `(s, y)`, or `None`; the saved times, values of s; and a list with the jump times, values of s,
-    of each part of the field that jumps in time. The argument `sides` is a list with one array for
-    each part that jumps: the values of s at which steps end because of the jumps of this part. They
-    may differ from the jump times by some units of round-off. If `sides` is `None`, steps end
-    exactly at the jump times.
+    `sign` is σ, 1 or −1; `None` stands for 1. `condition(t, y)` ends the run, or is `None`.
     """
-    time = partial(_multiply_by_direction, sign)
+    time = partial(_signed, sign)
 
     def directed(s: Array, y: Any, sides: Any = None) -> Any:
         sided = evaluate_on_correct_sides(
@@ -235,28 +200,27 @@ def convert_to_forward_time(
         return jax.tree.map(time, sided(time(s), y, None))
 
     asked = None if condition is None else lambda s, y: condition(time(s), y)
-    return directed, asked, time(ts), [time(jumps) for jumps in declared_jumps(field)]
+    return ForwardRun(directed, asked, time(ts), [time(jumps) for jumps in declared_jumps(field)])
+
+
+class Solved(NamedTuple):
+    """Hold the motion of one body at the saved times."""
+
+    ys: Any  # the states, with a leading time axis; NaN at times that the run did not reach
+    stats: dict[str, Any]  # as in `Solution.stats`
+    result: dfx.RESULTS
 
 
 @eqx.filter_jit
-def solve(
-    setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array
-) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    """Compute the motion of one body from the state `state0`, at the times `ts` (T,), s.
-
-    `setup` holds the body, the torque and the way in which the motion is solved.
-
-    **Returns** three things:
-
-    - the states at `ts`, with a leading time axis; NaN at times that the run did not reach;
-    - the dict with the numbers of steps, which becomes the `stats` of the `Solution`;
-    - the result of diffrax, which says that the run reached the last time, or why it did not.
-    """
+def solve(setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array) -> Solved:
+    """Compute the motion of one body from `state0`, at the times `ts` (T,), s."""
     # The whole function is under one `jit`, because a single operation outside of `jit` takes as
     # long as a hundred steps.
     state0 = given = project_to_group(state0)
     if isinstance(setup, ClosedFormRun):
-        ys, stats, result = _solve_in_closed_form(setup, state0, ts)
+        ys: Any = FreeMotion(setup.body, state0)(ts - ts[0])
+        stats: dict[str, Any] = dict.fromkeys(_COUNTS, jnp.zeros((), int))
+        result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
     else:
         # If the torque has states of its own, they are integrated together with the state of the
         # body.
@@ -266,40 +230,46 @@ def solve(
         ys, stats, result, end = _integrate(setup, watch, state0, ts)
         if watch is not None:
             ended = result == dfx.RESULTS.event_occurred
-            stats |= {"ended": ended, "end_time": end[0], "end_state": end[1]}
+            stats |= {"ended": ended, "end_time": end.time, "end_state": end.state}
         if scene is not None:
             stats["drift"] = scene.drift(ts, ys)
     if setup.throw:
-        ys = raise_unless_complete(setup, ys, result)
-    inputs = (setup.body, setup.torque, given, ts)
-    ys = nan_derivatives_where_not_finite(ys, inputs)
-    return ys, stats, result_or_nonfinite_input(result, setup.body)
+        ys = require_complete(setup, ys, result)
+    ys = nan_derivatives(ys, (setup.body, setup.torque, given, ts))
+    return Solved(ys, stats, result_of_body(result, setup.body))
 
 
-def _integrate(
-    setup: DiffraxRun, watch: Ends | None, state0: Any, ts: Array
-) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
-    """Integrate the motion step by step from the state `state0`, saved at the times `ts` (T,), s.
+class _End(NamedTuple):
+    """Hold the end of a run."""
 
-    `setup` holds the body, the torque, the solver and its tolerances. `watch` is a condition that
-    ends the run when it becomes true; with `None` the run goes to the last time.
+    time: Array  # s
+    state: Any
+    step: Array  # the length of the step that would follow, s
 
-    **Returns** four things: the states at `ts`, with a leading time axis; a dict with the numbers
-    of steps; the result of diffrax, which says why the run ended; and the end of the run, a tuple
-    of its time, s, its state, and the length of the step that would follow, s.
-    """
+
+class _Integrated(NamedTuple):
+    """Hold the result of a run by diffrax."""
+
+    ys: Any
+    stats: dict[str, Any]
+    result: dfx.RESULTS
+    end: _End
+
+
+def _integrate(setup: DiffraxRun, watch: Ends | None, state0: Any, ts: Array) -> _Integrated:
+    """Integrate the motion step by step, until `watch`, if any, becomes true."""
     form = equations_by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
-    state0 = state0 if form is None else form.replace_rate_by_momentum(ts[0], state0)
+    state0 = state0 if form is None else form.to_momentum(ts[0], state0)
     along, jumps, dt0, sign, halt = ts, None, setup.dt0, None, watch
-    if setup.ends_steps_at_jumps:
+    if setup.stops_at_jumps:
         sign = setup.sign
-        field, halt, along, jumps = convert_to_forward_time(sign, field, watch, ts)
+        field, halt, along, jumps = forward_time(sign, field, watch, ts)
         if setup.cuts is not None:
-            jumps = [*jumps, _multiply_by_direction(sign, setup.cuts)]
+            jumps = [*jumps, _signed(sign, setup.cuts)]
     elif dt0 is not None:
         dt0 = dt0 * jnp.sign(ts[-1] - ts[0])
-    out = integrate_with_diffrax(
+    out = integrate(
         setup.solver, field, along, state0, setup.step_controller(), jumps=jumps, halt=halt,
         dt0=dt0, max_steps=setup.max_steps, adjoint=setup.adjoint,
         progress_meter=setup.progress_meter,
@@ -308,17 +278,14 @@ def _integrate(
     stats: dict[str, Any] = dict(zip(_COUNTS, taken, strict=True))
     if out.missed is not None:
         stats["switches_missed"] = out.missed
-    last_time = _multiply_by_direction(sign, out.last_time)
-    last = out.last if form is None else form.restore_body_rate(last_time, out.last)
-    return with_body_rates(form, ts, out.ys), stats, out.result, (last_time, last, out.next_step)
+    last_time = _signed(sign, out.last_time)
+    last = out.last if form is None else form.to_rate(last_time, out.last)
+    end = _End(last_time, last, out.next_step)
+    return _Integrated(with_body_rates(form, ts, out.ys), stats, out.result, end)
 
 
-def _multiply_by_direction(sign: Array | None, t: Array) -> Array:
-    """Convert times `t` to times s = σt, which increase along a run, or convert s back to t.
-
-    `t` is an array of any shape; `sign` is σ: 1, or −1 in a run backwards in time. `None` stands
-    for 1.
-    """
+def _signed(sign: Array | None, t: Array) -> Array:
+    """Convert times `t` to s = σt, or back; `None` stands for σ = 1."""
     return t if sign is None else sign.astype(t.dtype) * t
 
 
@@ -346,37 +313,24 @@ _CLOSED_FORM = (
 )
 
 
-def _message_of_too_short_step(time_dtype: Any) -> str:
-    """Return the error message for a run that needs a step too short for the precision of the time.
-
-    `time_dtype` is the dtype of the times, which sets the shortest step; the message names this
-    dtype.
-    """
-    gap = np.spacing(np.asarray(1e9, time_dtype))
-    return (
-        "simulate: no step is short enough: the minimum step size, some units of round-off of the "
-        f"time, was reached. Does the torque jump or grow without bound? In {np.dtype(time_dtype)} "
-        f"the times near 1e9 s are {gap:.2g} s apart: {_checks.advice_for_large_times(time_dtype)}"
-    )
-
-
-def raise_unless_complete(setup: ClosedFormRun | DiffraxRun, ys: Any, result: dfx.RESULTS) -> Any:
-    """Return the states `ys` of a run; raise a readable error if the run ended early.
-
-    `setup` holds the torque of the run and the way in which it was solved, on which the advice in
-    the message depends. `result` is the result of diffrax, which says why the run ended. A run that
-    an event ended raises no error.
-    """
+def require_complete(setup: ClosedFormRun | DiffraxRun, ys: Any, result: dfx.RESULTS) -> Any:
+    """Return the states of a run; raise a readable error if it ended early, but for an event."""
     # Known results are compared as whole numbers: an operation of JAX outside of `jit` takes 50 µs.
     number, successful = jax.tree.leaves((result, dfx.RESULTS.successful))
     if _checks.is_known(number) and int(number) == int(successful):
         return ys
     if isinstance(setup, ClosedFormRun):
         return eqx.error_if(ys, result != dfx.RESULTS.successful, _CLOSED_FORM)
-    if changing_inertia_of_torque(setup.torque) is not None:
+    if changing_inertia(setup.torque) is not None:
         ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
-    shortest = _message_of_too_short_step(jax.tree.leaves(ys)[0].dtype)
+    dtype = jax.tree.leaves(ys)[0].dtype
+    gap = np.spacing(np.asarray(1e9, dtype))
+    shortest = (
+        "simulate: no step is short enough: the minimum step size, some units of round-off of the "
+        f"time, was reached. Does the torque jump or grow without bound? In {np.dtype(dtype)} "
+        f"the times near 1e9 s are {gap:.2g} s apart: {_checks.advice_for_large_times(dtype)}"
+    )
     for why, words in (
         (dfx.RESULTS.max_steps_reached, _MANY_STEPS),
         (NONFINITE, _NONFINITE_WORDS),
@@ -387,14 +341,10 @@ def raise_unless_complete(setup: ClosedFormRun | DiffraxRun, ys: Any, result: df
     return result.error_if(ys, ill)
 
 
-def warn_of_missed_switches(
+def warn_of_missed(
     setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array, stats: dict[str, Any]
 ) -> None:
-    """Warn if a torque switches in time so often that steps do not end at all of its switches.
-
-    `setup` holds the body and the torque of the run, `state0` is its state at the start, and `ts`
-    (T,), s, are its saved times. `stats["switches_missed"]` says whether switches are missed.
-    """
+    """Warn if a torque switches in time so often that steps do not end at all of its switches."""
     missed = stats.get("switches_missed", False)
     if not _checks.is_known((missed, state0, ts)) or not np.any(np.asarray(missed)):
         return
@@ -413,43 +363,26 @@ def warn_of_missed_switches(
 
 
 @eqx.filter_jit
-def _rerun_and_return_end(
-    setup: DiffraxRun, state0: Any, ts: Array
-) -> tuple[Any, Any, Array, Array]:
-    """Run a motion once more, and return the time and the state at which the run ended.
-
-    `setup` holds the body, the torque and the solver; the run begins with the state `state0` and
-    has the saved times `ts` (T,), s. **Returns** four things: the time at the end, s; the state at
-    the end; the length of the step that would follow, s; and the number of steps.
-    """
+def _rerun(setup: DiffraxRun, state0: Any, ts: Array) -> tuple[_End, Array]:
+    """Return the end of a run that is done once more, and the number of its steps."""
     state0 = with_own_states(setup.body, project_to_group(state0), setup.torque, ts[0])
     *_, stats, _, end = _integrate(setup, None, state0, ts)
-    return *end, stats["num_steps"]
+    return end, stats["num_steps"]
 
 
 # If the next step is shorter than this fraction of the mean step, the run makes no more progress.
 _STUCK = 1e-2
 
 
-def explain_max_steps_error(
+def explain_max_steps(
     setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array, error: RuntimeError
 ) -> RuntimeError:
-    """Return the error of a failed run, with a better message if the run used up all its steps.
-
-    The better message says which time the run reached, and why it came no further.
-
-    - `setup`: the body, the torque and the solver of the run.
-    - `state0`: the state at the start of the run.
-    - `ts`: (T,) s, the saved times of the run.
-    - `error`: the error that the run raised.
-    """
+    """Return the error of a run; if it used up all steps, say which time it reached, and why."""
     if _MANY_STEPS not in str(error) or not isinstance(setup, DiffraxRun):
         return error
-    if not setup.records_steps_for_derivatives or not _checks.is_known((setup, state0, ts)):
+    if not setup.replays or not _checks.is_known((setup, state0, ts)):
         return error
-    t, state, step, count = _rerun_and_return_end(
-        dataclasses.replace(setup, throw=False), state0, ts
-    )
+    (t, state, step), count = _rerun(dataclasses.replace(setup, throw=False), state0, ts)
     # A torque that is a function may hold traced numbers, which are then in the result alone.
     if not _checks.is_known((t, state, step, count)):
         return error
@@ -474,32 +407,8 @@ def explain_max_steps_error(
     return type(error)(f"{words}; give max_steps={int(float(f'{needed:.1g}')):_} or more")
 
 
-def _solve_in_closed_form(
-    setup: ClosedFormRun, state0: Any, ts: Array
-) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    """Compute the motion of a free body in closed form, at the times `ts` (T,), s.
-
-    `setup` holds the body, and `state0` is the state at `ts[0]`. **Returns** three things: the
-    states, with a leading time axis; a dict with the numbers of steps, which are all 0; and the
-    result of diffrax, which says whether all states are finite.
-    """
-    ys = FreeMotion(setup.body, state0)(ts - ts[0])
-    stats: Any = dict.fromkeys(_COUNTS, jnp.zeros((), int))
-    return ys, stats, dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-
-
-def raise_if_scene_ended_run(scene: Any, ys: Any, stats: dict[str, Any], ts: Array) -> Any:
-    """Return the states of a particle's run; raise an error if its scene ended the run early.
-
-    **Arguments:**
-
-    - `scene`: the scene of the particle; its method `end_words(t, state)` gives the sentence of the
-      message that says why the run ended.
-    - `ys`: the states at the saved times, which are returned.
-    - `stats`: a dict with three items: `ended` is whether the scene ended the run; `end_time`, s,
-      and `end_state` are the time and the state at which it ended the run.
-    - `ts`: (T,) s, the saved times.
-    """
+def raise_if_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Array) -> Any:
+    """Return the states of a particle's run; raise an error if its scene ended the run early."""
     ended, advice = stats["ended"], "; give throw=False to keep what came before it"
     if _checks.is_known(ended) and not np.any(np.asarray(ended)):
         return ys

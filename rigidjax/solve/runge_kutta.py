@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve.batching import Arrays, add_leading_axes
+from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.tableaus import Tableau, round_weights
 
 # field(constants, t, y) → dy/dt, for t (*bodies), y (n, *bodies).
@@ -34,10 +34,7 @@ class Step(NamedTuple):
 
 
 class Stages(NamedTuple):
-    """Hold the s stages of a step, and the state at the end of the step.
-
-    A stage is a time and a state at which the step evaluates the field, and the value there.
-    """
+    """Hold the s stages of a step, and the state at its end."""
 
     times: Array  # (s, *bodies) the times of the stages, in seconds
     places: Array  # (n, s, *bodies) the states at which the field is evaluated
@@ -49,8 +46,7 @@ class Stages(NamedTuple):
 class Weights(NamedTuple):
     """Hold the numbers of a Runge–Kutta method as arrays over its s stages.
 
-    The stages of a step come first, then the stages that only dense output needs. Dense output is
-    the state at any time within the step.
+    The stages of a step come first, then those that only dense output needs.
     """
 
     a: Array  # (s, s) the weights of the slopes in the state of each stage
@@ -62,8 +58,8 @@ class Weights(NamedTuple):
     plain: int  # how many stages a step without dense output has
 
 
-def arrays_of_tableau(tableau: Tableau, dtype: Any) -> Weights:
-    """Return the numbers of a Runge–Kutta method, its `tableau`, as arrays of the `dtype`."""
+def weights_of(tableau: Tableau, dtype: Any) -> Weights:
+    """Return the numbers of a Runge–Kutta method as arrays of the `dtype`."""
     tableau = round_weights(tableau, dtype)
     c = np.array([0.0, *tableau.c, 1.0, *tableau.extra_c])
     rows = [{}, *tableau.a, tableau.b, *tableau.extra_a, *tableau.dense, *tableau.errors]
@@ -80,13 +76,8 @@ def arrays_of_tableau(tableau: Tableau, dtype: Any) -> Weights:
     return Weights(a, b, nodes, jnp.asarray(c == 1.0), dense, errors, plain)
 
 
-def _weighted_sum_of_slopes(weights: Array, slopes: Array) -> Array:
-    """Return the weighted sum Σ w_i k_i of the slopes k_i at all stages i of a step, (n, …).
-
-    `slopes` (n, s, …) are the slopes at s stages. A slope is dy/dt, the n values of the field at a
-    stage. `weights` are the w_i. If there are fewer slopes than weights, the last weights are left
-    out.
-    """
+def _weighted_sum(weights: Array, slopes: Array) -> Array:
+    """Return Σ wᵢ kᵢ (n, …) of the slopes (n, s, …); weights beyond the slopes are left out."""
     weights = weights[: slopes.shape[1]]
     return jnp.sum(weights.reshape(1, -1, *[1] * (slopes.ndim - 2)) * slopes, 1)
 
@@ -94,21 +85,12 @@ def _weighted_sum_of_slopes(weights: Array, slopes: Array) -> Array:
 def stages(
     tableau: Tableau, field: Field, constants: Arrays, step: Step, dense: Any = False
 ) -> Stages:
-    """Compute all stages of a step of a Runge–Kutta method, and the state at its end.
+    """Compute all stages of a step; the quaternion at its end is not scaled to length 1.
 
-    **Arguments:**
-
-    - `tableau`: the numbers of the method.
-    - `field`: the vector field `(constants, t, y)`, and `constants` the list of its arrays.
-    - `step`: the times, the length and the state (n, *bodies) at the start of the step.
-    - `dense`: whether the stages for dense output (the state within the step) are computed, too. If
-      `dense` is a traced truth value, the arrays have places for these stages in any case. If its
-      value is false, these places hold the time and the state at the start of the step, and 0 as
-      the slope.
-
-    The quaternion of the state at the end is not scaled to length 1.
+    If `dense` is traced, the arrays have places for the stages of dense output in any case; if it
+    is false, these hold the time and the state at the start, and the slope 0.
     """
-    w = arrays_of_tableau(tableau, step.y.dtype)
+    w = weights_of(tableau, step.y.dtype)
     count = w.plain if dense is False else w.c.size
     number: Any = np.int32(count)
 
@@ -125,47 +107,29 @@ def stages(
         # may be infinite or NaN at a state of zeros.
         times, places = times + step.t[None], places + step.y[:, None]
         number = jnp.where(dense, number, np.int32(w.plain))
-    begun = (times, places, empty)
-    times, places, slopes = lax.fori_loop(np.int32(0), number, stage, begun)
-    h = add_leading_axes(step.h.astype(step.y.dtype), step.y)
-    return Stages(times, places, slopes, step.y + h * _weighted_sum_of_slopes(w.b, slopes), number)
+    times, places, slopes = lax.fori_loop(np.int32(0), number, stage, (times, places, empty))
+    h = lift(step.h.astype(step.y.dtype), step.y)
+    return Stages(times, places, slopes, step.y + h * _weighted_sum(w.b, slopes), number)
 
 
 def _stage(
     w: Weights, field: Field, constants: Arrays, step: Step, i: Array, slopes: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the time, the state (n, *bodies) and the slope (n, *bodies) of one stage of a step.
-
-    - `w`: the weights and the times of the stages of the method.
-    - `field`: the vector field `field(constants, t, y)`, which returns dy/dt, the slope.
-    - `constants`: the arrays on which the field depends.
-    - `step`: holds the times, the length and the state at the start of the step.
-    - `i`: the index of the stage.
-    - `slopes`: (n, s, *bodies) the slopes of all s stages, of which those before `i` are used.
-
-    A state has n numbers; `*bodies` is one last axis for the bodies of a batch, or no axis.
+    """Return the time, the state and the slope of stage `i`, from the slopes (n, s, *bodies)
+    before.
     """
     # The dtype of the time may differ from that of the state.
-    y = step.y + add_leading_axes(step.h.astype(step.y.dtype), step.y) * _weighted_sum_of_slopes(
-        w.a[i], slopes
-    )
+    y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _weighted_sum(w.a[i], slopes)
     t = jnp.where(w.last[i], step.end, step.t + w.c[i].astype(step.t.dtype) * step.h)
     return t, y, field(constants, t, y)
 
 
 def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
-    """Return the coefficients of dense output within a step of one body, as rows (r, n).
+    """Return the coefficients (r, n) of dense output in a step of one body (see `dense_change`).
 
-    Dense output is the state, n numbers, at any time within the step. `change_within_step` computes
-    its change since the start of the step from the r rows F0, F1, …. The rows already contain the
-    length of the step as a factor.
-
-    - `tableau`: the numbers of the method.
-    - `field`: the vector field `(constants, t, y)`, which is called with no constants.
-    - `step`: the times, the length and the state at the start of the step.
-    - `slopes`: (n, s) the slopes at the stages of the step.
+    The length of the step is in them as a factor.
     """
-    w = arrays_of_tableau(tableau, slopes.dtype)
+    w = weights_of(tableau, slopes.dtype)
     slopes = jnp.pad(slopes, ((0, 0), (0, w.c.size - w.plain)))
 
     def more(i: Array, slopes: Array) -> Array:
@@ -176,13 +140,11 @@ def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Arr
     return step.h.astype(slopes.dtype) * jnp.sum(w.dense[:, None] * slopes[None], 2)
 
 
-def change_within_step(theta: Array, rows: Array) -> Array:
-    """Return the change of the state since the start of a step, at a time within the step.
+def dense_change(theta: Array, rows: Array) -> Array:
+    """Return the change of the state since the start of a step, at its fraction θ.
 
-    The change is θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))). Here `theta` is θ, the fraction of
-    the step that has passed, from 0 to 1, and `rows` are F0, F1, …. The state at the start of the
-    step plus this change is the state at the time within the step. Source: Hairer, Nørsett and
-    Wanner (1993), II.6.
+    It is θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))), where `rows` are F0, F1, …. Source: Hairer,
+    Nørsett and Wanner (1993), II.6.
     """
     total = jnp.zeros((), rows.dtype)
     for i in reversed(range(rows.shape[0])):
@@ -193,21 +155,16 @@ def change_within_step(theta: Array, rows: Array) -> Array:
 def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) -> Array:
     """Return an estimate of the error of each number of the state after a step, (n, *bodies).
 
-    - `tableau`: the numbers of the method.
-    - `sizes`: how many numbers each array of the state has.
-    - `h`: (*bodies) the length of the step, in seconds.
-    - `slopes`: (n, s, *bodies) the slopes at the s stages of the step.
-
-    If the tableau has two estimates, e5 of order 5 and e3 of order 3, they are combined to
-    e5 |e5|/√(|e5|² + 0.01 |e3|²), which is proportional to h⁸ for short steps (Hairer, Nørsett and
-    Wanner 1993, II.10). The norms |e5| and |e3| are taken over each array of the state separately.
+    Estimates e5 of order 5 and e3 of order 3 are combined to e5 |e5|/√(|e5|² + 0.01 |e3|²), which
+    is proportional to h⁸ for short steps (Hairer, Nørsett and Wanner 1993, II.10). The norms are
+    taken over each array of the state, of `sizes`.
     """
     dtype, ones = slopes.dtype, [1] * (slopes.ndim - 2)
     # All sums over stages are computed in one operation, because for one body each separate sum
     # would be a kernel of its own.
-    rows = arrays_of_tableau(tableau, dtype).errors[:, : slopes.shape[1]]
+    rows = weights_of(tableau, dtype).errors[:, : slopes.shape[1]]
     found = jnp.sum(rows.reshape(len(rows), 1, -1, *ones) * slopes[None], 2)
-    found = add_leading_axes(h.astype(dtype), found) * found
+    found = lift(h.astype(dtype), found) * found
     if len(rows) == 1:
         return found[0]
     which = np.repeat(np.eye(len(sizes)), sizes, axis=1)
@@ -223,29 +180,15 @@ def pull_back(
     tableau: Tableau, field: Field, constants: Arrays, step: Step, step_stages: Stages,
     cotangent: Array, cotangents_of_slopes: Array | None = None,
 ) -> tuple[Arrays, Array, Array, Array]:  # fmt: skip
-    """Compute a step of a Runge–Kutta method in reverse mode: the cotangents of its inputs.
-
-    **Arguments:**
-
-    - `tableau`: the numbers of the method.
-    - `field`: the vector field `(constants, t, y)`, and `constants` the list of its arrays.
-    - `step`: the times, the length and the state (n, *bodies) at the start of the step.
-    - `step_stages`: the s stages of the step.
-    - `cotangent`: (n, *bodies) the cotangent of the state at the end of the step.
-    - `cotangents_of_slopes`: (n, s, *bodies) the cotangents of all slopes, or `None` if these are
-      0.
-
-    **Returns** four cotangents: those of the constants, a list; of the time at the start of the
-    step; of the length of the step; and of the state at the start.
-    """
-    w, count = arrays_of_tableau(tableau, step.y.dtype), step_stages.slopes.shape[1]
+    """Return the cotangents of a step's inputs from those of its end and of its slopes."""
+    w, count = weights_of(tableau, step.y.dtype), step_stages.slopes.shape[1]
     h, put = step.h.astype(step.y.dtype), lax.dynamic_update_index_in_dim
 
     def stage(i: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
         m = step_stages.number - 1 - i
         below, seeds = both
-        seed = w.b[m] * cotangent + _weighted_sum_of_slopes(w.a[:, m], below)
-        bar = add_leading_axes(h, seed) * seed
+        seed = w.b[m] * cotangent + _weighted_sum(w.a[:, m], below)
+        bar = lift(h, seed) * seed
         if cotangents_of_slopes is not None:
             bar = bar + cotangents_of_slopes[:, m]
         pull = jax.vjp(
@@ -261,7 +204,7 @@ def pull_back(
     every = jax.vmap(lambda c, t, y: field(c, t, y), (0, 0, 1), 1)
     own = [jnp.broadcast_to(c, (count, *c.shape)) for c in constants]
     pull = jax.vjp(lambda c, t: every(c, t, step_stages.places), own, step_stages.times)[1]
-    bars = add_leading_axes(h, seeds) * seeds
+    bars = lift(h, seeds) * seeds
     by_own, by_times = pull(bars if cotangents_of_slopes is None else bars + cotangents_of_slopes)
     by_constants = [jnp.sum(by, 0) for by in by_own]
     by_length = jnp.sum(seeds * step_stages.slopes, (0, 1)).astype(by_times.dtype)

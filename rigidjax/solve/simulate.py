@@ -17,7 +17,7 @@ from rigidjax.frames import AbstractScene, MovingFrame
 from rigidjax.motion.coupled import Coupled
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
-from rigidjax.solve.crossings import Event, check_condition_and_add_torque_states, solve_until_event
+from rigidjax.solve.crossings import Event, checked_state, solve_until_event
 from rigidjax.solve.error import estimate_error_of_run, solve_to_accuracy
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected
@@ -25,15 +25,15 @@ from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.run import (
     ClosedFormRun,
     DiffraxRun,
-    direction_of_times,
-    explain_max_steps_error,
-    hoist_traced_numbers,
-    raise_if_scene_ended_run,
-    raise_unless_complete,
+    explain_max_steps,
+    hoist,
+    raise_if_ended,
+    require_complete,
     solve,
-    warn_of_missed_switches,
+    time_direction,
+    warn_of_missed,
 )
-from rigidjax.solve.solution import Solution, State, store_error_and_warn
+from rigidjax.solve.solution import Solution, State, with_error
 from rigidjax.solve.splitting import AbstractSplitting
 
 # A function of the type `Law` must accept the type of the state. Type checkers therefore refuse
@@ -153,7 +153,7 @@ def simulate(
     True
     """
     max_steps = None if max_steps is None else _checks.integer(max_steps, "max_steps", 1)
-    body, state0, times = validation.checked_body_state_and_times(body, state0, ts, torque, throw)
+    body, state0, times = validation.checked_run(body, state0, ts, torque, throw)
     given = rtol is not None or atol is not None
     if stepsize_controller is not None and (given or accuracy is not None):
         raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
@@ -174,17 +174,17 @@ def simulate(
         rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
         found = _solve_run(ClosedFormRun(body, throw), event, state0, times)
-        return found if accuracy is None else store_error_and_warn(found, found.error, accuracy)
+        return found if accuracy is None else with_error(found, found.error, accuracy)
     # The tolerances are arrays, so that another tolerance does not compile again.
     if stepsize_controller is None:
         rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
     setup = DiffraxRun(
         body, torque, _solver_of_run(solver, adjoint, event, max_steps), rtol, atol,
         stepsize_controller, None if dt0 is None else validation.checked_first_step(dt0, times),
-        max_step, adjoint, progress_meter or NO_METER, direction_of_times(times), max_steps, throw,
+        max_step, adjoint, progress_meter or NO_METER, time_direction(times), max_steps, throw,
     )  # fmt: skip
     setup = dataclasses.replace(setup, adjoint=_adjoint_of_run(setup))
-    sought = setup.records_steps_for_derivatives and progress_meter is None
+    sought = setup.replays and progress_meter is None
     for name, asked in (("accuracy", accuracy), ("event", event)):
         if asked is not None and not sought:
             raise ValueError(_message_of_conflict(name, setup, solver, progress_meter))
@@ -290,13 +290,13 @@ def _solve_to_accuracy(
     """
     # The derivative of the search is a rule of our own, which does not see traced numbers that a
     # function holds. They become arrays of the set-up, which the rule does see.
-    torque = hoist_traced_numbers(setup.torque, times[0], state0, setup.body)
+    torque = hoist(setup.torque, times[0], state0, setup.body)
     setup = dataclasses.replace(setup, torque=torque)
     found, run, search = solve_to_accuracy(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
     sol = _solve_run(found, event, state0, times, None if event is not None else run)
     error = estimate_error_of_run(found, times, sol._states, sol.stats["num_steps"], search)
-    return store_error_and_warn(sol, error, accuracy)
+    return with_error(sol, error, accuracy)
 
 
 def _solve_run(
@@ -326,22 +326,20 @@ def _solve_run(
             quiet = dataclasses.replace(setup, throw=setup.throw and not known)
             ys, stats, result = solved_run or solve(quiet, state0, times)
             if setup.throw and not quiet.throw:
-                ys = raise_unless_complete(setup, ys, result)
+                ys = require_complete(setup, ys, result)
         else:
             event = event if isinstance(event, Event) else Event(event)
-            state0 = check_condition_and_add_torque_states(
-                event, setup.body, state0, setup.torque, times[0]
-            )
+            state0 = checked_state(event, setup.body, state0, setup.torque, times[0])
             ys, stats, result, event_time, event_state = solve_until_event(
                 setup, event, state0, times
             )
     except RuntimeError as error:
-        raise explain_max_steps_error(
+        raise explain_max_steps(
             setup, state0, times, _checks.error_without_equinox_text(error)
         ) from None
-    warn_of_missed_switches(setup, state0, times, stats)
+    warn_of_missed(setup, state0, times, stats)
     if setup.throw and "ended" in stats:
-        ys = raise_if_scene_ended_run(setup.torque, ys, stats, times)
+        ys = raise_if_ended(setup.torque, ys, stats, times)
     motion, own = (ys.motion, ys.own) if isinstance(ys, Coupled) else (ys, None)
     # The solution keeps the set-up of the run, split into its arrays and the rest, so that
     # `jax.jit` and `jax.vmap` can return it.

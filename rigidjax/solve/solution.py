@@ -22,6 +22,7 @@ from rigidjax.motion.torques.states import require_no_own_states
 from rigidjax.solve.error import Error, estimate_error_of_run, largest_length_in_run
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, solve
 
+_drift: Any = eqx.filter_jit(drift)
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
 
 
@@ -91,7 +92,7 @@ class Solution(eqx.Module, Generic[State]):
         """
         if "drift" in self.stats:
             return self.stats["drift"]
-        return _drift_of_conserved_quantities(self._setup, self.ts, self._states)
+        return _drift(self.ts, self._states, self._setup.body, self._setup.torque)
 
     @property
     def growth(self) -> Float[Array, " times"]:
@@ -108,7 +109,7 @@ class Solution(eqx.Module, Generic[State]):
         Source: the largest finite-time Lyapunov exponent is the logarithm of the growth, divided by
         t − t₀ (Eckmann and Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
-        found = _growth_of_small_errors(self._setup, self.ts, self._states)
+        found = _growth(self._setup, self.ts, self._states)
         rtol = None
         if isinstance(self._setup, DiffraxRun):
             rtol = getattr(self._setup.step_controller(), "rtol", None)
@@ -150,7 +151,7 @@ class Solution(eqx.Module, Generic[State]):
         if self._error is not None:
             return self._error
         found = estimate_error_of_run(self._setup, self.ts, self._states, self.stats["num_steps"])
-        _warn_if_error_exceeds(found, 0.5, "error: nothing is known of the states")
+        _warn_of_error(found, 0.5, "error: nothing is known of the states")
         return found
 
     def transition_matrix(self) -> Float[Array, "times n n"]:
@@ -190,36 +191,22 @@ class Solution(eqx.Module, Generic[State]):
 
     @property
     def _setup(self) -> ClosedFormRun | DiffraxRun:
-        """Return the set-up of the run: the body, the torque, the solver and its tolerances."""
         return eqx.combine(self._arrays, self._rest)
 
     @property
     def _states(self) -> Any:
-        """Return the states of the body at the saved times, with the torque's own states, if any.
-
-        A torque that follows a filtered signal, for example, has states of its own. The states are
-        then `Coupled`.
-        """
+        """Return the saved states, `Coupled` with the torque's own states if it has any."""
         return self.ys if self.own is None else Coupled(self.ys, self.own)
 
 
-def store_error_and_warn(sol: Solution, error: Error, accuracy: Any) -> Solution:
-    """Return the solution `sol` with its `error` stored; warn if the error exceeds the accuracy.
-
-    `accuracy` is the error that the user allows. For a rotation it is an angle, rad; for any other
-    array of the state it is a fraction of the largest length of this array in the run.
-    """
-    _warn_if_error_exceeds(error, accuracy, "simulate: the accuracy cannot be had")
+def with_error(sol: Solution, error: Error, accuracy: Any) -> Solution:
+    """Return the solution with its `error` stored; warn if it exceeds the accuracy."""
+    _warn_of_error(error, accuracy, "simulate: the accuracy cannot be had")
     return dataclasses.replace(sol, _error=error)
 
 
-def _warn_if_error_exceeds(error: Error, limit: Any, message_start: str) -> None:
-    """Warn if the error of a run exceeds a limit, and name the first time at which it does.
-
-    `limit` is the largest allowed error. For a rotation it is an angle, rad; for any other array of
-    the state it is a fraction of the largest length of this array in the run. `message_start` is
-    the beginning of the message.
-    """
+def _warn_of_error(error: Error, limit: Any, message_start: str) -> None:
+    """Warn if the error of a run exceeds a limit, and name the first time at which it does."""
     if not _checks.is_known((error, limit)) or not np.any(np.asarray(error.relative) > limit):
         return
     i = int(np.argmax(np.asarray(error.relative) > limit))
@@ -236,34 +223,14 @@ def _warn_if_error_exceeds(error: Error, limit: Any, message_start: str) -> None
 
 
 @eqx.filter_jit
-def _drift_of_conserved_quantities(
-    setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any
-) -> dict[str, Array]:
-    """Return the relative drift of each quantity that the motion conserves, by its name.
-
-    The drift is the largest distance of the quantity, such as the energy of a free body, from its
-    value at the start, divided by a size of the quantity in the run. `setup` holds the body and the
-    torque; `ys` are the states at the T times `ts` (T,), s. **Returns** a dict with one number for
-    each quantity.
-    """
-    return drift(ts, ys, setup.body, setup.torque)  # pyright: ignore[reportArgumentType]
-
-
-@eqx.filter_jit
 def _transition_matrix(
     setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any
 ) -> Float[Array, "times n n"]:
-    """Return the derivatives (T, n, n) of the states at all times with respect to the first state.
-
-    `setup` holds the body, the torque and the solver; `ys` are the states at the T times `ts` (T,),
-    s. A small change of a state has n numbers: the changes of all its arrays, joined. For a
-    quaternion the change is a rotation vector, rad. A row is one of the n numbers at a saved time,
-    and a column is one of the n numbers at the start.
-    """
+    """Return the derivatives (T, n, n) of the states by the first, all as small changes."""
     # The run is repeated below with a changed start. It must not raise an error, and it must be
     # differentiable in forward mode: a run of diffrax that does not record its steps needs
     # `ForwardMode` for this.
-    plain = isinstance(setup, DiffraxRun) and not setup.records_steps_for_derivatives
+    plain = isinstance(setup, DiffraxRun) and not setup.replays
     more = dict(adjoint=dfx.ForwardMode()) if plain else {}
     setup = dataclasses.replace(setup, throw=False, **more)
     start = jax.tree.map(lambda leaf: leaf[0], ys)
@@ -275,16 +242,8 @@ def _transition_matrix(
 
 
 @eqx.filter_jit
-def _growth_of_small_errors(
-    setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any
-) -> Float[Array, " times"]:
-    """Return the largest factor by which a small error at the start grows until each saved time.
-
-    The factor is the largest singular value of ∂y(t)/∂y(t₀). Here t₀ is the time at the start, and
-    y is the state, in which each array is divided by its largest length in the run. `setup` holds
-    the body, the torque and the solver; `ys` are the states at the times `ts` (T,), s. The result
-    has one factor for each time, (T,).
-    """
+def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, " times"]:
+    """Return the factors (T,) by which a small error at the start grows, as `Solution.growth`."""
     start = jax.tree.map(lambda leaf: leaf[0], ys)
     each = parts_by_name(start, jnp.ones(dimension(start), ts.dtype)).values()
     both = zip(each, jax.tree.leaves(ys), strict=True)

@@ -37,38 +37,23 @@ from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import evaluate_torque, may_read_rate
 from rigidjax.rotation import quaternion
-from rigidjax.solve.explicit import (
-    NestedInterpolation,
-    cubic_coefficients,
-    direction_and_length_of_step,
-)
-from rigidjax.solve.magnus import require_attitude_equations
+from rigidjax.solve.explicit import NestedInterpolation, cubic_coefficients, direction_and_length
+from rigidjax.solve.magnus import attitude_equations
 from rigidjax.solve.tableaus import parse_numbers
 
 
 class Composition(NamedTuple):
-    """Hold a splitting method B(b1) A(a1) B(b2) … A(a1) B(b1) by its order and its weights.
-
-    A(a) is the exact motion of the free body during the time a h, where h is the length of a step.
-    B(b) is a kick, which adds b h times the torque to the momentum. `flows` are the weights a1, a2,
-    …, and `kicks` the weights b1, b2, ….
-    """
+    """Hold a splitting method by its order and its weights, `flows` a1, a2, … and `kicks` b1, …."""
 
     order: int
     flows: tuple[float, ...]
     kicks: tuple[float, ...]
 
 
-def _symmetric_composition(
-    order: int, flows: tuple[float, ...], kicks: tuple[float, ...]
-) -> Composition:
-    """Return a symmetric splitting method of the given `order`, from the first of its weights.
+def _symmetric(order: int, flows: tuple[float, ...], kicks: tuple[float, ...]) -> Composition:
+    """Return a symmetric splitting from the first of its weights.
 
-    A step of the method alternates between exact free motions and kicks. A free motion lasts for a
-    weight times the length of the step. A kick adds, at a fixed time and attitude, a weight times
-    the torque times the length of the step to the momentum. `flows` are the first weights of the
-    free motions, and `kicks` those of the kicks. The middle weights follow because the weights of
-    each kind sum up to 1; the last weights follow because the step is symmetric.
+    The middle weights follow because the weights of each kind sum up to 1.
     """
     if len(flows) < len(kicks):
         middle = 1 - 2 * sum(kicks)
@@ -84,12 +69,12 @@ STRANG = Composition(2, (1.0,), (0.5, 0.5))
 # Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, methods SRKN6b and SRKN11b. These methods
 # are for kicks B that commute with [B, [B, A]], where [·, ·] is the commutator. This holds here,
 # because B and [B, [B, A]] both change only the momentum, by a function of the attitude.
-SRKN6 = _symmetric_composition(
+SRKN6 = _symmetric(
     4,
     parse_numbers("0.245298957184271 0.604872665711080"),
     parse_numbers("0.0829844064174052 0.396309801498368 -0.0390563049223486"),
 )
-SRKN11 = _symmetric_composition(
+SRKN11 = _symmetric(
     6,
     parse_numbers("""
     0.123229775946271 0.290553797799558 -0.127049212625417 -0.246331761062075 0.357208872795928
@@ -103,8 +88,7 @@ SRKN11 = _symmetric_composition(
 class PrincipalFrame(NamedTuple):
     """Hold the principal axes of a body, and the inertia and its inverse along these axes.
 
-    The off-diagonal entries of both matrices are zero. Derivatives hold the axes fixed: if the
-    inertia changes, these entries have tangents that are not zero.
+    The off-diagonal entries are zero, but have tangents: derivatives hold the axes fixed.
     """
 
     moments: SymmetricEntries  # the inertia, kg m²
@@ -112,11 +96,8 @@ class PrincipalFrame(NamedTuple):
     axes: Array  # (3, 3), the axes as columns
 
 
-def principal_frame_of_tensor(tensor: Array) -> PrincipalFrame:
-    """Return the principal axes of a body, and the inertia and its inverse along these axes.
-
-    `tensor` (3, 3) is the inertia in body axes, kg m².
-    """
+def principal_frame(tensor: Array) -> PrincipalFrame:
+    """Return the principal axes of an inertia (3, 3), kg m²."""
     six, axes = principal_axes(tensor)
     # The tensor is divided by its trace before it is inverted, because the determinant of an
     # inertia of 1e37 kg m² would overflow.
@@ -127,28 +108,22 @@ def principal_frame_of_tensor(tensor: Array) -> PrincipalFrame:
 
 
 @jax.custom_jvp
-def body_rate_along_axes(inverse: SymmetricEntries, momentum: Triple) -> Triple:
-    """Return the body rate Ω = I⁻¹Π along the principal axes, three numbers, rad/s.
+def rate_along(inverse: SymmetricEntries, momentum: Triple) -> Triple:
+    """Return the body rate Ω = I⁻¹Π along the principal axes.
 
-    `momentum` is Π along these axes, three numbers, N m s. `inverse` has the six entries (11, 22,
-    33, 12, 13, 23) of I⁻¹, the inverse of the inertia along these axes. The off-diagonal entries
-    are zero, and the value does not use them; but they may have tangents, which the derivative
-    uses.
+    The value does not use the off-diagonal entries of I⁻¹, which are zero; the derivative does.
     """
     return inverse[0] * momentum[0], inverse[1] * momentum[1], inverse[2] * momentum[2]
 
 
-@body_rate_along_axes.defjvp
-def body_rate_along_axes_jvp(primals, tangents):
+@rate_along.defjvp
+def rate_along_jvp(primals, tangents):
     (weights, p), (dw, dp) = primals, tangents
-    return body_rate_along_axes(weights, p), add(body_rate_along_axes(weights, dp), matvec(dw, p))
+    return rate_along(weights, p), add(rate_along(weights, dp), matvec(dw, p))
 
 
 class AbstractSplitting(dfx.AbstractSolver):
-    """Solve the rotation of a body by a sequence of kicks and exact free motions.
-
-    Each subclass sets the `composition`, which holds the weights of the sequence.
-    """
+    """Solve the rotation of a body by a sequence of kicks and exact free motions."""
 
     term_structure: ClassVar = dfx.ODETerm
     interpolation_cls: ClassVar = NestedInterpolation
@@ -158,14 +133,9 @@ class AbstractSplitting(dfx.AbstractSolver):
         return self.composition.order
 
     def init(
-        self,
-        terms: PyTree[dfx.AbstractTerm],
-        t0: RealLike,
-        t1: RealLike,
-        y0: PyTree,
-        args: PyTree,
+        self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike, y0: PyTree, args: PyTree
     ) -> PrincipalFrame:
-        return principal_frame_of_field(field_and_direction(terms)[0], y0)
+        return frame_of_field(field_and_direction(terms)[0], y0)
 
     def step(
         self,
@@ -178,16 +148,16 @@ class AbstractSplitting(dfx.AbstractSolver):
         made_jump: Bool[ArrayLike, ""],
     ) -> Any:
         field, way = field_and_direction(terms)
-        state, h = (y0.q, momentum_along_axes(solver_state, y0.omega)), jnp.asarray(t1 - t0) * way
-        dq, dp = change_in_splitting_step(
+        state, h = (y0.q, momentum_along(solver_state, y0.omega)), jnp.asarray(t1 - t0) * way
+        dq, dp = splitting_change(
             self.composition, field, solver_state, jnp.asarray(t0) * way, h, state
         )
         # Only the change of the momentum is converted to a change of the body rate Ω. To convert
         # the momentum itself would give I⁻¹(IΩ), which differs from Ω by a rounding error that is
         # the same in each step and would add up.
-        omega = y0.omega + body_rate_in_body_axes(solver_state, dp)
+        omega = y0.omega + rate_in_body(solver_state, dp)
         y1 = Attitude(quaternion.normalise(y0.q + dq), omega)
-        dense = dict(y0=y0, coefficients=_quintic_coefficients(terms, t0, t1, args, y0, y1))
+        dense = dict(y0=y0, coefficients=_quintic(terms, t0, t1, args, y0, y1))
         return y1, None, dense, solver_state, dfx.RESULTS.successful
 
     def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree) -> Any:
@@ -249,45 +219,34 @@ class Splitting6(AbstractSplitting):
     composition: ClassVar[Composition] = SRKN11
 
 
-def principal_frame_of_field(field: Any, y0: Any) -> PrincipalFrame:
-    """Return the principal axes of the body to which a vector field belongs.
+def frame_of_field(field: Any, y0: Any) -> PrincipalFrame:
+    """Return the principal axes of the body of a vector field, in the dtype of `y0`.
 
-    The result also holds the inertia and its inverse along these axes. `field` is the vector field,
-    an `AttitudeEquations`, and `y0` is the `Attitude` at the start; the result has the dtype of
-    `y0`. Raise `TypeError` for any other field or state, and for a torque that may read the body
-    rate.
+    Raise `TypeError` unless it is an `AttitudeEquations` of a torque that reads no body rate.
     """
     # A torque that reads the body rate is refused, because a kick would then be no exact flow, and
     # the order of the method would fall to 1.
-    torque = require_attitude_equations("Splitting", field, y0, "DormandPrince8").euler.torque
+    torque = attitude_equations("Splitting", field, y0, "DormandPrince8").euler.torque
     if may_read_rate(torque):
         raise TypeError(
             f"Splitting: the torque {type(torque).__name__} depends on the body rate (damping, a "
             "flywheel), or does not say that it does not; only time and attitude may enter a kick: "
             "a law of your own says so by rate_free = True; for others use DormandPrince8"
         )
-    return principal_frame_of_tensor(field.euler.inertia.tensor.astype(y0.omega.dtype))
+    return principal_frame(field.euler.inertia.tensor.astype(y0.omega.dtype))
 
 
-def momentum_along_axes(frame: PrincipalFrame, omega: Array) -> Triple:
-    """Return the momentum Π = IΩ along the principal axes, three numbers, N m s.
-
-    `frame` holds the principal axes and the inertia I along them; `omega` (3,) is the body rate Ω
-    in body axes, rad/s.
-    """
+def momentum_along(frame: PrincipalFrame, omega: Array) -> Triple:
+    """Return the momentum Π = IΩ along the principal axes, N m s, from Ω in body axes, rad/s."""
     return matvec(frame.moments, components_along(frame.axes, omega))
 
 
-def body_rate_in_body_axes(frame: PrincipalFrame, momentum: Triple) -> Array:
-    """Return the body rate Ω = I⁻¹Π in body axes (3,), rad/s.
-
-    `frame` holds the principal axes and the inverse inertia I⁻¹ along them; `momentum` is Π along
-    the principal axes, three numbers, N m s.
-    """
-    return jnp.stack(combine_columns(frame.axes, body_rate_along_axes(frame.weights, momentum)))
+def rate_in_body(frame: PrincipalFrame, momentum: Triple) -> Array:
+    """Return the body rate Ω = I⁻¹Π in body axes (3,), rad/s."""
+    return jnp.stack(combine_columns(frame.axes, rate_along(frame.weights, momentum)))
 
 
-def change_in_splitting_step(
+def splitting_change(
     composition: Composition,
     field: AttitudeEquations,
     frame: PrincipalFrame,
@@ -295,19 +254,9 @@ def change_in_splitting_step(
     h: Any,
     state: Any,
 ) -> tuple[Array, Triple]:
-    """Take one step of a splitting method: exact free motions and kicks by the torque in turn.
+    """Return the change of q, not scaled to length 1, and of Π in one step from `state` (q, Π).
 
-    **Arguments:**
-
-    - `composition`: the weights of the method.
-    - `field`: the equations of the attitude, which hold the torque and the inertia.
-    - `frame`: the principal axes of the body, and the inertia along them.
-    - `t`, `h`: the time at the start of the step, s, and the length of the step, s.
-    - `state`: the pair of the quaternion q (4,) and the momentum Π at the start; Π is three numbers
-      along the principal axes, N m s.
-
-    **Returns** the change of q and the change of Π in the step. The changed q is not scaled to
-    length 1.
+    Π has components along the principal axes.
     """
     dtype = state[0].dtype
 
@@ -351,26 +300,14 @@ def change_in_splitting_step(
     return dq, change
 
 
-def _quintic_coefficients(
+def _quintic(
     terms: PyTree[dfx.AbstractTerm], t0: Any, t1: Any, args: PyTree, y0: PyTree, y1: PyTree
 ) -> Any:
-    """Return the coefficients of a polynomial of degree 5 that interpolates within a step.
+    """Return the five coefficients (5, …) of a polynomial for dense output (see `dense_change`).
 
-    At both ends of the step the polynomial has the state of the motion and its first and second
-    time derivatives, so that the dense output is of order 6.
-
-    **Arguments:**
-
-    - `terms`, `args`: the `diffrax.ODETerm` of the vector field, and the argument `args` with which
-      diffrax calls the field.
-    - `t0`, `t1`: the times at which the step begins and ends, s; diffrax uses −t for the time t in
-      a run backwards.
-    - `y0`, `y1`: the states at the start and at the end of the step.
-
-    **Returns** a tree like the state, whose arrays (5, …) hold the five coefficients. The function
-    `runge_kutta.change_within_step` evaluates the polynomial from these coefficients.
+    It has the state and its first two time derivatives at both ends, and is of order 6.
     """
-    way, length = direction_and_length_of_step(terms, t0, t1)
+    way, length = direction_and_length(terms, t0, t1)
     h = way * length
 
     def slopes(t: Any, y: Any) -> tuple[Any, Any]:

@@ -14,10 +14,10 @@ from jaxtyping import Array, ArrayLike, PyTree
 from rigidjax._types import RealLike
 from rigidjax.solve.adaptive_loop import (
     NONFINITE,
-    acceptance_and_next_step_size,
+    accept_and_adapt,
     finite,
     previous_float,
-    row_of_each_body,
+    rows_at,
     starting_step,
 )
 
@@ -27,29 +27,18 @@ NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
 _SLIVER = 16  # units of round-off: no step is left that is so short
 
 
-def _make_property_of_controller(attribute: str) -> Any:
-    """Define a property that reads an attribute of the step controller `self.controller`.
-
-    The property is for a class that wraps a step controller. `attribute` is the name of the
-    attribute. Equal steps have no tolerance: 0.
-    """
+def _inner(attribute: str) -> Any:
+    """Define a property that reads an attribute of the wrapped controller; 0 where it has none."""
     return property(lambda self: getattr(self.controller, attribute, 0.0))
 
 
 class StandardController(dfx.AbstractAdaptiveStepSizeController):
     """Choose the length of each step by the error of the step before it.
 
-    It is used inside `Watched`, which chooses the first step. The rule is that of Hairer, Nørsett
-    and Wanner (1993), II.4: after an accepted step, the next step may be shorter.
-    `diffrax.PIDController` never shortens the step after an accepted step: on Arenstorf's orbit at
-    a tolerance of 1e-13 it rejects 85 of 477 steps. On this orbit, which is periodic,
-    `StandardController` rejects 29 of 420 steps, and its error after one period is a third of that
-    of `PIDController`.
-
-    **Arguments:** `rtol` and `atol` are the tolerances; `dtmax` is the longest step, or `None`.
-
-    >>> StandardController(1e-6, 1e-9).rtol
-    1e-06
+    The rule is that of Hairer, Nørsett and Wanner (1993), II.4: after an accepted step, the next
+    step may be shorter. `diffrax.PIDController` never shortens it: on Arenstorf's orbit at a
+    tolerance of 1e-13 it rejects 85 of 477 steps, this one 29 of 420, with a third of the error
+    after one period. `Watched` chooses the first step.
     """
 
     rtol: Any
@@ -58,7 +47,7 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
 
     @property
     def norm(self) -> Callable[[PyTree], Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the function that measures an error: the root mean square of its numbers."""
+        """Return the root mean square, by which an error is measured."""
         return NORM
 
     def wrap(self, direction: PyTree) -> "StandardController":
@@ -76,10 +65,9 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
         error_order: RealLike | None,
     ) -> tuple[Any, Any]:
         assert dt0 is not None
-        return t0 + self._limited_length(dt0), ()
+        return t0 + self._limited(dt0), ()
 
-    def _limited_length(self, length: Any) -> Any:
-        """Return the `length` of a step, s, but not more than the longest step that is allowed."""
+    def _limited(self, length: Any) -> Any:
         return length if self.dtmax is None else jnp.minimum(length, self.dtmax)
 
     def adapt_step_size(
@@ -104,26 +92,20 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
             return error / (self.atol + self.rtol * jnp.maximum(jnp.abs(left), jnp.abs(right)))
 
         still = lax.stop_gradient((y_error, y0, y1_candidate))
-        keep, length = acceptance_and_next_step_size(
+        keep, length = accept_and_adapt(
             self.norm(jax.tree.map(over_tolerance, *still)), error_order, t1 - t0
         )
         left = jnp.where(keep, t1, t0)
-        right = left + self._limited_length(length)
+        right = left + self._limited(length)
         return keep, left, right, False, controller_state, dfx.RESULTS.successful
 
 
 class Watched(dfx.AbstractAdaptiveStepSizeController):
     """Wrap an adaptive step controller so that a run that cannot continue ends at once.
 
-    A run ends if the state at the start, or its time derivative, is not finite. It also ends if the
-    step after a rejected step would be shorter than a few units of round-off of the time. The
-    result is `RESULTS.nonfinite` after NaN or infinity, else `RESULTS.dt_min_reached`.
-    (`diffrax.PIDController` goes on until `max_steps`.)
-
-    **Arguments:** `controller` is any adaptive controller of diffrax.
-
-    >>> Watched(dfx.PIDController(rtol=1e-6, atol=1e-9)).rtol
-    1e-06
+    It ends if the start or its time derivative is not finite, or if the step after a rejected one
+    would be shorter than a few units of round-off of the time. (`diffrax.PIDController` goes on
+    until `max_steps`.) The result is `nonfinite` after NaN or infinity, else `dt_min_reached`.
     """
 
     controller: Any
@@ -131,9 +113,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     def __init__(self, controller: dfx.AbstractStepSizeController):
         self.controller = controller
 
-    rtol = _make_property_of_controller("rtol")
-    atol = _make_property_of_controller("atol")
-    norm = _make_property_of_controller("norm")
+    rtol = _inner("rtol")
+    atol = _inner("atol")
+    norm = _inner("norm")
 
     def wrap(self, direction: PyTree) -> "Watched":
         return Watched(self.controller.wrap(direction))
@@ -174,17 +156,11 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         # The first step is at least the shortest that the time can resolve, because steps of length
         # 0 would be accepted without end. If the start is not finite, the step has the length NaN,
         # which ends the run.
-        shortest = begin + self._shortest_resolvable_step(begin, least)
-        first = jnp.where(sound, jnp.maximum(first, shortest), jnp.nan)
+        first = jnp.where(sound, jnp.maximum(first, begin + self._shortest(begin, least)), jnp.nan)
         return first.astype(begin.dtype), (inner, least)
 
     def _first_step(self, y: PyTree, slope: PyTree, order: RealLike) -> Array:
-        """Choose the length of the first step of a run, s, by the sizes of the state and its slope.
-
-        `y` is the state at the start, and `slope` is the time derivative of this state. `order` is
-        the order p of the error estimate: the error of a step of length h grows as h^p. The
-        returned length is 0 or NaN if the state or the slope is not finite.
-        """
+        """Return the length of the first step, s; 0 or NaN if state or slope are not finite."""
         y, tree = ravel_pytree(y)
         scale = self.atol + self.rtol * jnp.abs(y)
         # The default norm may be called with the vector of all numbers; any other norm is called
@@ -194,31 +170,20 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         size, rate = (jnp.asarray(self.norm(of_state(a / scale))) for a in both)
         return starting_step(size, rate, order)
 
-    def _shortest_resolvable_step(self, t: ArrayLike, smallest_time: ArrayLike) -> Array:
-        """Return the length of the shortest step that the resolution of the time allows, s.
-
-        It is 8 units of round-off of the time `t`, s. If |t| is smaller than `smallest_time`, s, it
-        is 8 units of round-off of `smallest_time`.
-        """
+    def _shortest(self, t: ArrayLike, smallest_time: ArrayLike) -> Array:
+        """Return 8 units of round-off, s, of the time `t` or, if greater, of `smallest_time`."""
         return 8 * jnp.finfo(jnp.result_type(t)).eps * jnp.maximum(jnp.abs(t), smallest_time)
 
-    def adapt_step_size(
-        self,
-        t0: RealLike,
-        t1: RealLike,
-        y0: PyTree,
-        y1_candidate: PyTree,
-        args: PyTree,
-        y_error: PyTree,
-        error_order: RealLike | None,
-        controller_state: PyTree,
-    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
-        inner, least = controller_state
-        keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
-        )
-        unit = self._shortest_resolvable_step(left, least)
+    # As in diffrax, the arguments come by position; they are those of `StandardController`.
+    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, t0: RealLike, t1: RealLike, *given: Any
+    ) -> Any:
+        *rest, (inner, least) = given
+        adapted = self.controller.adapt_step_size(t0, t1, *rest, inner)
+        keep, left, right, jumped, inner, result = adapted
+        unit = self._shortest(left, least)
         stuck = ~keep & ~(right - left > unit)
+        y_error = rest[3]
         # A run that is stuck after a step to NaN or infinity ends with `NONFINITE`. If this step
         # was already the shortest possible one, a still shorter step might be finite: the result
         # then is `dt_min_reached`, which says that no step is short enough.
@@ -229,19 +194,12 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
 
 
 class Stopping(dfx.AbstractAdaptiveStepSizeController):
-    """Wrap an adaptive step controller so that steps end at the `stops`, where the field jumps.
+    """Wrap an adaptive step controller so that steps end at `stops` (J,), where the field jumps.
 
-    A step that reaches a stop ends at the last floating-point number before the stop. The next step
-    begins at the stop. It is at least as long as the previous step would have been without the
-    stop. (`diffrax.ClipStepSizeController` chooses the next step by the length of the step that was
-    cut short at the stop, so that each stop costs several short steps.) A step that would end just
-    before a stop ends at the stop.
-
-    **Arguments:** `controller` is any adaptive controller of diffrax, or `ConstantStepSize`;
-    `stops` (J,) are times in increasing order.
-
-    >>> Stopping(dfx.PIDController(rtol=1e-6, atol=1e-9), jnp.array([0.5])).rtol
-    1e-06
+    Such a step ends at the last floating-point number before the stop; the next one begins at the
+    stop, and is at least as long as the step before would have been.
+    (`diffrax.ClipStepSizeController` goes on from the length that was cut short.) A step that would
+    end just before a stop ends at the stop.
     """
 
     controller: Any
@@ -255,69 +213,47 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         still = lax.stop_gradient(stops)
         self.following = jnp.searchsorted(still, still, side="right").astype(jnp.int32)
 
-    rtol = _make_property_of_controller("rtol")
-    atol = _make_property_of_controller("atol")
-    norm = _make_property_of_controller("norm")
+    rtol = _inner("rtol")
+    atol = _inner("atol")
+    norm = _inner("norm")
 
     def wrap(self, direction: PyTree) -> "Stopping":
         way = jnp.asarray(direction).astype(self.stops.dtype)
         stops = jnp.where(way < 0, -self.stops[::-1], self.stops)
         return Stopping(self.controller.wrap(direction), stops)
 
-    def init(
-        self,
-        terms: PyTree[dfx.AbstractTerm],
-        t0: RealLike,
-        t1: RealLike,
-        y0: PyTree,
-        dt0: RealLike | None,
-        args: PyTree,
-        func: Callable[..., PyTree],
-        error_order: RealLike | None,
+    def init(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, *given: Any
     ) -> tuple[Any, Any]:
-        first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        first, inner = self.controller.init(terms, t0, *given)
         index = jnp.sum(self.stops <= t0, dtype=jnp.int32)
         return self._end_of_step(t0, first - t0, index), (inner, first - t0, index)
 
     def _end_of_step(self, t: RealLike, length: Any, stop_index: Array) -> Array:
         """Return the end of a step from t, s, which is the next stop if that is not far beyond."""
-        end = self._stop_and_last_time_before(stop_index)[1]
+        end = self._stop_and_end(stop_index)[1]
         near = end - _SLIVER * jnp.finfo(end.dtype).eps * jnp.abs(lax.stop_gradient(end))
         return jnp.where(t + length > jnp.where(jnp.isinf(end), end, near), end, t + length)
 
-    def _stop_and_last_time_before(self, stop_index: Array) -> tuple[Array, Array]:
-        """Return the time of a stop, s, and the last floating-point time before it, s.
-
-        A stop is a time at which steps end because the field jumps; `stop_index` is its index. The
-        step before the stop ends at the last floating-point number before the stop. If the index is
-        beyond the last stop, both times are infinite.
-        """
+    def _stop_and_end(self, stop_index: Array) -> tuple[Array, Array]:
+        """Return the time of a stop, s, and the last floating-point time before it, or inf."""
         none = jnp.full_like(self.stops[:1], jnp.inf)
-        stop = row_of_each_body(jnp.concatenate([self.stops, none]), stop_index)
+        stop = rows_at(jnp.concatenate([self.stops, none]), stop_index)
         still = lax.stop_gradient(stop)
-        gap = jnp.where(jnp.isinf(still), 0, previous_float(still) - still)
-        return stop, stop + gap
+        return stop, stop + jnp.where(jnp.isinf(still), 0, previous_float(still) - still)
 
-    def adapt_step_size(
-        self,
-        t0: RealLike,
-        t1: RealLike,
-        y0: PyTree,
-        y1_candidate: PyTree,
-        args: PyTree,
-        y_error: PyTree,
-        error_order: RealLike | None,
-        controller_state: PyTree,
-    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
-        inner, kept, index = controller_state
-        keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
-        )
-        stop, end = self._stop_and_last_time_before(index)
+    # As in diffrax, the arguments come by position; they are those of `StandardController`.
+    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, t0: RealLike, t1: RealLike, *given: Any
+    ) -> Any:
+        *rest, (inner, kept, index) = given
+        adapted = self.controller.adapt_step_size(t0, t1, *rest, inner)
+        keep, left, right, jumped, inner, result = adapted
+        stop, end = self._stop_and_end(index)
         reached = keep & (t1 >= end)
         length = lax.stop_gradient(right - left)
         length = jnp.where(reached, jnp.maximum(length, kept), length)
         left = jnp.where(reached, stop, left)
-        index = jnp.where(reached, row_of_each_body(self.following, index), index)
+        index = jnp.where(reached, rows_at(self.following, index), index)
         right = self._end_of_step(left, length, index)
         return keep, left, right, jumped | reached, (inner, length, index), result

@@ -30,10 +30,10 @@ from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import quaternion_product, squared_norm
 from rigidjax.rotation.linalg3 import components
 from rigidjax.solve import splitting
-from rigidjax.solve.components import Atoms, join_scalars, split_into_scalars
+from rigidjax.solve.components import Atoms, join_scalars, split_scalars
 from rigidjax.solve.equal_steps import StepWithLoopedStages, change_in_step
 from rigidjax.solve.explicit import AbstractExplicit, RungeKutta4
-from rigidjax.solve.magnus import Magnus4, momentum_change_and_turn, require_independent_of_attitude
+from rigidjax.solve.magnus import Magnus4, change_and_turn, refuse_attitude
 from rigidjax.solve.splitting import AbstractSplitting
 
 # Runs of at least this many steps use `Carrying`, with which a run without derivatives takes a
@@ -42,19 +42,18 @@ _MANY = 10_000
 
 
 class Stepper(NamedTuple):
-    """Hold the functions that take fixed steps of one body.
+    """Hold the functions that take fixed steps of one body, from `t` to `end`, of length `h`, s.
 
-    They work on numbers y, which stand for the state of the body. The numbers may differ from the
-    state: for example, they may hold the momentum in the place of the body rate. A step goes from
-    the time `t` to the time `end`, s, and has the length `h`, s. `inputs` are the values of the
-    torque's inputs during the step, or `None`.
+    They work on numbers y, which stand for the state but may differ from it: they may hold the
+    momentum in the place of the body rate. `inputs` are the values of the torque's inputs during
+    the step, or `None`.
     """
 
-    initial_numbers: Any  # the numbers y at the start, which stand for the state there
+    start: Any  # the numbers y at the start, which stand for the state there
     # change(t, end, h, y, inputs): the change of the numbers y in a step from t to end, of length
     # h.
     change: Callable[[Any, Any, Any, Any, Any], Any]
-    state_of_numbers: Callable[[Any], Any]  # the state that the numbers y stand for
+    state: Callable[[Any], Any]  # the state that the numbers y stand for
     delays: tuple[tuple[str, Array], ...] = ()  # name and delay, s, of each delayed input
 
     def step(self, t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:
@@ -64,19 +63,17 @@ class Stepper(NamedTuple):
 class Carrying(NamedTuple):
     """Take the fixed steps of the stepper `of`, and carry the rounding errors of the sums along.
 
-    Each step adds a change to the numbers y. It also computes the rounding error of this sum, which
-    the next step adds to its own change. The round-off of n steps then grows as √n, not as n. The
-    rounding error is carried along with the numbers y, and has no derivative. It is exact if
-    |change| ≤ |y|. Source: Kahan 1965, doi:10.1145/363707.363723; Dekker 1971,
-    doi:10.1007/BF01397083.
+    Each step adds the rounding error of the sum before it to its own change, so that the round-off
+    of n steps grows as √n, not as n. The error has no derivative; it is exact if |change| ≤ |y|.
+    Source: Kahan 1965, doi:10.1145/363707.363723; Dekker 1971, doi:10.1007/BF01397083.
     """
 
     of: Stepper
 
     @property
-    def initial_numbers(self) -> tuple[Any, Any]:
-        """Return the numbers of the state at the start, and their rounding errors, which are 0."""
-        return self.of.initial_numbers, jax.tree.map(jnp.zeros_like, self.of.initial_numbers)
+    def start(self) -> tuple[Any, Any]:
+        """Return the numbers at the start, and their rounding errors, which are 0."""
+        return self.of.start, jax.tree.map(jnp.zeros_like, self.of.start)
 
     @property
     def delays(self) -> tuple[tuple[str, Array], ...]:
@@ -89,64 +86,47 @@ class Carrying(NamedTuple):
         lost = jax.tree.map(lambda d, a, b: d - (b - a), change, y, after)
         return after, lax.stop_gradient(lost)
 
-    def state_of_numbers(self, numbers_and_errors: tuple[Any, Any]) -> Any:
-        """Return the state that its numbers stand for; their rounding errors are left out.
-
-        `numbers_and_errors` is a pair of the numbers and of their rounding errors.
-        """
-        return self.of.state_of_numbers(numbers_and_errors[0])
+    def state(self, numbers_and_errors: tuple[Any, Any]) -> Any:
+        """Return the state that the numbers stand for; their rounding errors are left out."""
+        return self.of.state(numbers_and_errors[0])
 
 
 AnyStepper = Stepper | Carrying
 
 
 def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) -> AnyStepper:
-    """Return the object that takes fixed steps of a vector field by a method.
+    """Return the object that takes fixed steps of a vector field `f(t, y, args)` by a method.
 
-    **Arguments:**
-
-    - `solver`: a method of `rigidjax.solvers`; `None` stands for the cheapest one.
-    - `field`: the vector field `f(t, y, args)` of one body.
-    - `y0`: the state at the start.
-    - `count`: the number of steps. If it is at least 10 000 or is traced, the result is a
-      `Carrying`, which also carries the rounding errors of the sums along; else it is a `Stepper`.
+    `None` stands for the cheapest method. At 10 000 steps and more, and if `count` is traced, the
+    result is a `Carrying`.
     """
-    stepper = _stepper_without_delays(solver, field, y0)._replace(delays=tuple(delays_of(field)))
+    stepper = _stepper(solver, field, y0)._replace(delays=tuple(delays_of(field)))
     return Carrying(stepper) if not isinstance(count, int) or count >= _MANY else stepper
 
 
-def cheapest_method_of_order_4(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
+def cheapest_method(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
     """Return the method of order 4 that takes the least work for a vector field.
 
-    It is `Magnus4` for the attitude of a body whose torque does not read the attitude, else
-    `RungeKutta4`.
+    It is `Magnus4` for an attitude whose torque does not read the attitude, else `RungeKutta4`.
     """
-    attitude = isinstance(field, AttitudeEquations)
-    blind = attitude and not may_read_attitude(field.euler.torque)
+    blind = isinstance(field, AttitudeEquations) and not may_read_attitude(field.euler.torque)
     return Magnus4() if blind else RungeKutta4()
 
 
-def _stepper_without_delays(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
-    """Return the object that takes fixed steps of a vector field by a method, as a `Stepper`.
-
-    Its field `delays` is empty: the caller fills in the delays of the torque's inputs. Raise
-    `TypeError` if the method cannot take fixed steps of this vector field.
-
-    - `solver`: a method of `rigidjax.solvers`; `None` stands for the one whose steps cost least.
-    - `field`: the vector field `f(t, y, args)`.
-    - `y0`: the state at the start.
-    """
-    turning = _inertia_and_torque(field, y0)
-    solver = cheapest_method_of_order_4(field) if solver is None else solver
+def _stepper(solver: Any, field: Any, y0: Any) -> Stepper:
+    """Return a `Stepper` without delays; raise `TypeError` if the method cannot take such steps."""
+    # A body that also moves in space, or whose torque has states of its own, is not `turning`.
+    euler, turning = field.euler if isinstance(field, AttitudeEquations) else field, None
+    if isinstance(euler, EulerEquations) and isinstance(y0, Spin | Attitude):
+        dtype = y0.omega.dtype
+        inertia = jax.tree.map(lambda a: a.astype(dtype), euler.inertia)
+        turning = _Turning(inertia, _entries(euler.inverse.astype(dtype)), euler.torque)
+    solver = cheapest_method(field) if solver is None else solver
     if isinstance(solver, Magnus4) and isinstance(y0, Attitude) and turning is not None:
-        require_independent_of_attitude(turning.torque)
-        return (
-            _stepper_of_free_body(turning.inertia, y0)
-            if turning.torque is None
-            else _stepper_of_magnus(turning, y0)
-        )
+        refuse_attitude(turning.torque)
+        return _free(turning.inertia, y0) if turning.torque is None else _magnus(turning, y0)
     if isinstance(solver, AbstractSplitting):
-        return _stepper_of_splitting(solver, field, y0)
+        return _splitting(solver, field, y0)
     if not isinstance(solver, AbstractExplicit | StepWithLoopedStages):
         raise TypeError(
             f"no fixed steps of {type(solver).__name__} on {type(y0).__name__}; wanted "
@@ -155,64 +135,40 @@ def _stepper_without_delays(solver: Any, field: Callable[..., Any], y0: Any) -> 
             "stepsize_controller=diffrax.ConstantStepSize() under jax.vmap"
         )
     if turning is not None:
-        return _stepper_of_explicit_method(solver, turning, y0)
+        return _explicit(solver, turning, y0)
 
     def slope_under(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
-        return lambda t, y: split_into_scalars(bind(field, inputs)(t, join_scalars(y, y0), None))
+        return lambda t, y: split_scalars(bind(field, inputs)(t, join_scalars(y, y0), None))
 
-    start = split_into_scalars(y0)
-    return _stepper_of_slope_function(solver, slope_under, start, lambda y: join_scalars(y, y0), y0)
+    start = split_scalars(y0)
+    return _of_slope(solver, slope_under, start, lambda y: join_scalars(y, y0), y0)
 
 
-class _InertiaAndTorque(NamedTuple):
-    """Hold the inertia and the torque of a body that only turns, and does not move in space.
-
-    The inertia has the same dtype as the body rate in the state.
-    """
+class _Turning(NamedTuple):
+    """Hold inertia and torque of a body that only turns, in the dtype of the body rate."""
 
     inertia: Inertia
     weights: SymmetricEntries  # the six different entries of the inverse of the inertia, 1/(kg m²)
     torque: Any  # the torque law, or `None` for a free body
 
 
-def _inertia_and_torque(field: Any, y0: Any) -> _InertiaAndTorque | None:
-    """Return the inertia and the torque of a body that only turns, or `None` for other motions.
+def _free(body: Inertia, state0: Attitude) -> Stepper:
+    """Return the steps of a free body by Magnus' method of order 4.
 
-    `field` is the vector field of the body, dy/dt as a function of time and state, and `y0` is the
-    state at the start. The result is `None`, for example, if the body also moves in space, or if
-    the torque has states of its own.
+    The numbers are the quaternion of the turn since the start, and the momentum Π, both along the
+    principal axes. Derivatives hold these axes fixed: the off-diagonal entries of the inertia along
+    them are zero, but have tangents.
     """
-    euler = field.euler if isinstance(field, AttitudeEquations) else field
-    if not isinstance(euler, EulerEquations) or not isinstance(y0, Spin | Attitude):
-        return None
-    dtype = y0.omega.dtype
-    inertia = jax.tree.map(lambda a: a.astype(dtype), euler.inertia)
-    return _InertiaAndTorque(
-        inertia, _entries_of_symmetric_matrix(euler.inverse.astype(dtype)), euler.torque
-    )
-
-
-def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
-    """Return the object that takes fixed steps of a free body by Magnus' method of order 4.
-
-    `body` is the inertia, and `state0` the state at the start. The object carries seven numbers
-    from step to step: the quaternion of the turn since the start, and the angular momentum Π. The
-    vector of the quaternion and Π have components along the principal axes of the body. Derivatives
-    hold these axes fixed: when the inertia changes, the off-diagonal entries of the inertia along
-    the axes, which are zero, have tangents that are not zero.
-    """
-    frame = splitting.principal_frame_of_tensor(body.tensor)
+    frame = splitting.principal_frame(body.tensor)
     weights, axes = frame.weights, frame.axes
     a, b, c, *_ = lax.stop_gradient(weights)
     gaps = (c - b, a - c, b - a)
-    momentum = splitting.momentum_along_axes(frame, state0.omega)
+    momentum = splitting.momentum_along(frame, state0.omega)
     one, none = jnp.ones_like(a), jnp.zeros_like(a)
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
-        slope = lambda _, p: _free_momentum_derivative(weights, gaps, p)  # noqa: E731
-        dp, turn = momentum_change_and_turn(
-            slope, partial(splitting.body_rate_along_axes, weights), t, end, h, y[4:]
-        )
+        slope = lambda _, p: _free_slope(weights, gaps, p)  # noqa: E731
+        dp, turn = change_and_turn(slope, partial(splitting.rate_along, weights), t, end, h, y[4:])
         return (*quaternion_product(y[:4], turn), *dp)
 
     def state(y: Atoms) -> Attitude:
@@ -220,52 +176,42 @@ def _stepper_of_free_body(body: Inertia, state0: Attitude) -> Stepper:
         # axes; `combine_columns` gives the vector in body axes.
         turn = jnp.stack([y[0], *combine_columns(axes, y[1:4])])
         q = quaternion.normalise(quaternion.multiply(state0.q, turn))
-        return Attitude(q, splitting.body_rate_in_body_axes(frame, y[4:]))
+        return Attitude(q, splitting.rate_in_body(frame, y[4:]))
 
     return Stepper((one, none, none, none, *momentum), change, state)
 
 
 @jax.custom_jvp
-def _free_momentum_derivative(
-    inverse: SymmetricEntries, inverse_differences: Triple, momentum: Triple
-) -> Triple:
-    """Return the time derivative of the momentum of a free body, dΠ/dt = Π × Ω, N m.
+def _free_slope(inverse: SymmetricEntries, inverse_differences: Triple, momentum: Triple) -> Triple:
+    """Return the time derivative of the momentum of a free body along its principal axes, Π × Ω.
 
-    `momentum` is the angular momentum Π, three numbers along the principal axes, N m s; Ω is the
-    body rate. `inverse` has the six entries (11, 22, 33, 12, 13, 23) of the inverse of the inertia
-    along these axes, 1/(kg m²). `inverse_differences` (c − b, a − c, b − a) are the
-    differences of its first three entries a, b and c.
+    `inverse_differences` (c − b, a − c, b − a) are those of the diagonal a, b, c of I⁻¹.
     """
     d, p = inverse_differences, momentum
     return d[0] * (p[1] * p[2]), d[1] * (p[2] * p[0]), d[2] * (p[0] * p[1])
 
 
-@_free_momentum_derivative.defjvp
-def _free_momentum_derivative_jvp(primals, tangents):
+@_free_slope.defjvp
+def _free_slope_jvp(primals, tangents):
     (weights, gaps, p), (dw, _, dp) = primals, tangents
-    rate, turning = splitting.body_rate_along_axes_jvp((weights, p), (dw, dp))
-    return _free_momentum_derivative(weights, gaps, p), add(cross(dp, rate), cross(p, turning))
+    rate, turning = splitting.rate_along_jvp((weights, p), (dw, dp))
+    return _free_slope(weights, gaps, p), add(cross(dp, rate), cross(p, turning))
 
 
-def _entries_of_symmetric_matrix(a: Array) -> SymmetricEntries:
-    """Return the six different entries of a symmetric matrix, in the order 11, 22, 33, 12, 13, 23.
-
-    `a` (3, 3) is the matrix. Each of the last three is the mean of two equal entries.
-    """
+def _entries(a: Array) -> SymmetricEntries:
+    """Return the entries 11, 22, 33, 12, 13, 23 of a symmetric matrix (3, 3)."""
     # Both halves of the matrix are used, so that the derivative is symmetric as the matrix is.
     off = [0.5 * (a[i, j] + a[j, i]) for i, j in ((0, 1), (0, 2), (1, 2))]
     return a[0, 0], a[1, 1], a[2, 2], *off
 
 
-def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
-    """Return the object that takes fixed steps by Magnus' method, under a torque.
+def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
+    """Return steps by Magnus' method under a torque that reads the time and the body rate.
 
-    The torque may read the time and the body rate, not the attitude. `turning` holds the inertia
-    and the torque of the body, and `state0` is the state at the start. From step to step the object
-    carries the quaternion of the attitude, and the angular momentum in body axes.
+    The numbers are the quaternion and the angular momentum in body axes.
     """
     body, weights, torque = turning
-    start, rate = split_into_scalars(state0), partial(matvec, weights)
+    start, rate = split_scalars(state0), partial(matvec, weights)
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         law = bind(torque, inputs)
@@ -275,31 +221,26 @@ def _stepper_of_magnus(turning: _InertiaAndTorque, state0: Attitude) -> Stepper:
             # The torque does not read the attitude. It therefore gets a `Spin`, a state without an
             # attitude.
             value = evaluate_torque(law, t, Spin(jnp.stack(omega)), body)
-            return add(cross(p, omega), split_into_scalars(value))
+            return add(cross(p, omega), split_scalars(value))
 
-        dp, turn = momentum_change_and_turn(slope, rate, t, end, h, y[4:])
+        dp, turn = change_and_turn(slope, rate, t, end, h, y[4:])
         return (*quaternion_product(y[:4], turn), *dp)
 
     def state(y: Atoms) -> Attitude:
         return Attitude(quaternion.normalise(jnp.stack(y[:4])), jnp.stack(rate(y[4:])))
 
-    return Stepper(
-        (*start[:4], *matvec(_entries_of_symmetric_matrix(body.tensor), start[4:])), change, state
-    )
+    return Stepper((*start[:4], *matvec(_entries(body.tensor), start[4:])), change, state)
 
 
-def _stepper_of_explicit_method(
-    solver: AbstractExplicit | StepWithLoopedStages, turning: _InertiaAndTorque, state0: Any
+def _explicit(
+    solver: AbstractExplicit | StepWithLoopedStages, turning: _Turning, state0: Any
 ) -> Stepper:
-    """Return the object that takes fixed steps of an explicit method for a body that only turns.
+    """Return steps of an explicit method for a body that only turns, a `Spin` or an `Attitude`.
 
-    `solver` is the Runge–Kutta method, `turning` holds the inertia and the torque of the body, and
-    `state0` is the state at the start, a `Spin` or an `Attitude`. The numbers that the object
-    carries from step to step are the quaternion, if the state has one, and the angular momentum in
-    body axes.
+    The numbers are the quaternion, if any, and the angular momentum in body axes.
     """
     body, weights, torque = turning
-    start = split_into_scalars(state0)
+    start = split_scalars(state0)
     many = len(start) - 3
 
     def slope_for_inputs(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
@@ -313,7 +254,7 @@ def _stepper_of_explicit_method(
             pushed = cross(p, omega)
             if law is not None:
                 value = evaluate_torque(law, t, join_scalars((*q, *omega), state0), body)
-                pushed = add(pushed, split_into_scalars(value))
+                pushed = add(pushed, split_scalars(value))
             return (*half_product(q, omega), *pushed) if many else pushed
 
         return slope
@@ -321,95 +262,63 @@ def _stepper_of_explicit_method(
     def state(y: Atoms) -> Any:
         return join_scalars((*y[:many], *matvec(weights, y[many:])), state0)
 
-    momentum = matvec(_entries_of_symmetric_matrix(body.tensor), start[many:])
-    return _stepper_of_slope_function(
-        solver, slope_for_inputs, (*start[:many], *momentum), state, state0
-    )
+    momentum = matvec(_entries(body.tensor), start[many:])
+    return _of_slope(solver, slope_for_inputs, (*start[:many], *momentum), state, state0)
 
 
-def _stepper_of_slope_function(
+def _of_slope(
     solver: AbstractExplicit | StepWithLoopedStages,
     slope_for_inputs: Callable[[Any], Callable[[Any, Atoms], Atoms]],
-    initial_numbers: Atoms,
-    state_of_numbers: Callable[[Atoms], Any],
+    start: Atoms,
+    state: Callable[[Atoms], Any],
     example_state: Any,
 ) -> Stepper:
-    """Return the object that takes fixed steps of an explicit method, for a slope dy/dt.
+    """Return steps of an explicit method for a slope `slope_for_inputs(inputs)(t, y)`.
 
-    **Arguments:**
-
-    - `solver`: the Runge–Kutta method.
-    - `slope_for_inputs`: a function such that `slope_for_inputs(inputs)(t, y)` is dy/dt. Here
-      `inputs` are the values of the torque's inputs during the step.
-    - `initial_numbers`: the numbers y at the start, a tuple of scalars that stand for the state.
-    - `state_of_numbers`: a function that returns the state for the numbers y.
-    - `example_state`: a state whose arrays have as many numbers as y, in the same order. It shows
-      which of the numbers y are a quaternion, which is scaled to length 1.
+    `example_state` has as many numbers as y, in the same order, and shows which are a quaternion.
     """
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
-        return _change_to_unit_length(
-            y, change_in_step(solver, slope_for_inputs(inputs), t, h, y, end), example_state
+        change = change_in_step(solver, slope_for_inputs(inputs), t, h, y, end)
+        if not isinstance(motion_of(example_state), HasAttitude):
+            return change
+        # Without the barrier XLA would compute the whole change again for each part of the
+        # quaternion.
+        change = barrier(change)
+        after, moved = (
+            components(motion_of(join_scalars(part, example_state)).q)
+            for part in (jax.tree.map(jnp.add, y, change), change)
+        )
+        # q is the quaternion after the step. The difference |q|² − 1, the excess, has few correct
+        # digits. Its rounding error is harmless, because it only changes the length of q and does
+        # not turn the body.
+        excess = jnp.minimum(squared_norm(after) - 1.0, 1.0)
+        # 1 − 1/√(1 + e), with the excess e, is computed by a series, because on a GPU a root and a
+        # quotient take a third of the time of a step. The error e⁴/4 of the series is below
+        # round-off for steps that turn the body by less than half a radian; after a longer step the
+        # following steps bring the length back to 1.
+        less = barrier(excess * (0.5 - excess * (0.375 - 0.3125 * excess)))
+        q = jnp.stack([d - less * a for d, a in zip(moved, after, strict=True)])
+        return split_scalars(
+            eqx.tree_at(lambda s: motion_of(s).q, join_scalars(change, example_state), q)
         )
 
-    return Stepper(initial_numbers, change, state_of_numbers)
+    return Stepper(start, change, state)
 
 
-def _change_to_unit_length(y: Atoms, change: Atoms, example_state: Any) -> Atoms:
-    """Return the change of a state in a step, after which the quaternion has the length 1.
+def _splitting(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
+    """Return steps of a splitting: free motions and kicks in turn.
 
-    - `y`: the numbers of the state before the step, a tuple of scalars.
-    - `change`: the changes of these numbers in the step. The changes of the quaternion are
-      corrected; the other changes are returned as they are.
-    - `example_state`: a state whose arrays have as many numbers as `y`, in the same order. It shows
-      which numbers are the quaternion. If it has none, nothing is corrected.
-    """
-    if not isinstance(motion_of(example_state), HasAttitude):
-        return change
-    # Without the barrier XLA would compute the whole change again for each part of the quaternion.
-    change = barrier(change)
-    after, moved = (
-        motion_of(join_scalars(part, example_state)).q
-        for part in (jax.tree.map(jnp.add, y, change), change)
-    )
-    after, moved = components(after), components(moved)
-    # q is the quaternion after the step. The difference |q|² − 1, the excess, has few correct
-    # digits. Its rounding error is harmless, because it only changes the length of q and does not
-    # turn the body.
-    excess = jnp.minimum(squared_norm(after) - 1.0, 1.0)
-    # 1 − 1/√(1 + e), with the excess e, is computed by a series, because on a GPU a root and a
-    # quotient take a third of the time of a step. The error e⁴/4 of the series is below round-off
-    # for steps that turn the body by less than half a radian; after a longer step the following
-    # steps bring the length back to 1.
-    less = barrier(excess * (0.5 - excess * (0.375 - 0.3125 * excess)))
-    q = jnp.stack([d - less * a for d, a in zip(moved, after, strict=True)])
-    return split_into_scalars(
-        eqx.tree_at(lambda s: motion_of(s).q, join_scalars(change, example_state), q)
-    )
-
-
-def _stepper_of_splitting(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
-    """Return the object that takes fixed steps of a splitting: free motions and kicks in turn.
-
-    A kick adds a weight times the torque times the length of the step to the momentum, at a fixed
-    attitude. From step to step the object carries the quaternion of the attitude, and the angular
-    momentum along the principal axes of the body.
-
-    - `solver`: the splitting method.
-    - `field`: the equations of motion of a body under a torque that reads the time and the
-      attitude.
-    - `state0`: the state at the start.
+    The numbers are the quaternion, and the angular momentum along the principal axes.
     """
     # The momentum Π is carried from step to step, along the principal axes. No step converts Π to Ω
     # = I⁻¹Π and back, so that |Π| drifts only by the round-off of the free motion.
-    frame = splitting.principal_frame_of_field(field, state0)
+    frame = splitting.frame_of_field(field, state0)
 
     def change(t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:
-        return splitting.change_in_splitting_step(
-            solver.composition, bind(field, inputs), frame, t, h, y
-        )
+        return splitting.splitting_change(solver.composition, bind(field, inputs), frame, t, h, y)
 
     def state(y: Any) -> Attitude:
-        return Attitude(quaternion.normalise(y[0]), splitting.body_rate_in_body_axes(frame, y[1]))
+        return Attitude(quaternion.normalise(y[0]), splitting.rate_in_body(frame, y[1]))
 
-    return Stepper((state0.q, splitting.momentum_along_axes(frame, state0.omega)), change, state)
+    return Stepper((state0.q, splitting.momentum_along(frame, state0.omega)), change, state)

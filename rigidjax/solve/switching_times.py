@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from rigidjax.rotation.barrier import barrier
 from rigidjax.solve.batching import Arrays
-from rigidjax.solve.linear_map import known_with_derivatives_of
+from rigidjax.solve.linear_map import with_derivatives
 from rigidjax.solve.switching import BENT, MOST, STRAIGHT, Switches
 
 _HALVINGS = {"float64": 62, "float32": 36}
@@ -75,9 +75,7 @@ def find_changes(found: Switches, consts: Arrays, t0: Array, t1: Array) -> Chang
     t = _times_with_derivatives(found, consts, t, jnp.asarray(element), sizes != 0)
     t = jnp.where(sizes != 0, t, t1)
     # A change that is not stored has no derivative: then none is known.
-    t = known_with_derivatives_of(
-        lax.stop_gradient(t), jnp.where(over, jnp.nan, 1.0).astype(t.dtype) * t
-    )
+    t = with_derivatives(lax.stop_gradient(t), jnp.where(over, jnp.nan, 1.0).astype(t.dtype) * t)
     return Changes(t, sizes, which.astype(t.dtype), first, over)
 
 

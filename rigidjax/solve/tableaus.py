@@ -43,13 +43,8 @@ class Tableau(NamedTuple):
     dense: tuple[Row, ...] = ()
 
 
-def _parse_tableau_rows(text: str) -> tuple[Row, ...]:
-    """Return the rows of a Butcher tableau from a text of `stage:weight` pairs.
-
-    A row holds the weights of the slopes at the stages of a Runge–Kutta method in one sum, such as
-    the sum for the state at a later stage. A semicolon separates two rows. Each row is a dict
-    `{stage: weight}`, where stages are counted from 0.
-    """
+def _parse_rows(text: str) -> tuple[Row, ...]:
+    """Return the rows of a Butcher tableau from `stage:weight` pairs; a semicolon ends a row."""
     rows = [row.split() for row in text.split(";")]
     return tuple({int(i): float(w) for i, w in (part.split(":") for part in row)} for row in rows)
 
@@ -60,13 +55,11 @@ def parse_numbers(text: str) -> tuple[float, ...]:
 
 
 def round_weights(tableau: Tableau, dtype: Any) -> Tableau:
-    """Return the `tableau` with the weights of its stages and of its solution rounded to `dtype`,
-    such that the sum of each row hardly changes.
+    """Return the tableau with weights rounded to `dtype` such that the row sums hardly change.
 
-    The sum of a row is the time of its stage as a fraction of the step. If each weight is rounded
-    to the nearest number of float32, the weights of Dormand and Prince's method of order 8 sum to 1
-    + 4e-7: every run is too fast by this fraction, however short its steps are. Weights of float64
-    are returned unchanged.
+    The sum of a row is the time of its stage. If each weight is rounded to the nearest float32,
+    those of DOP853 sum to 1 + 4e-7: every run is too fast by this fraction, however short its steps
+    are. Weights of float64 are returned unchanged.
     """
     if np.dtype(dtype) == np.float64:
         return tableau
@@ -74,20 +67,18 @@ def round_weights(tableau: Tableau, dtype: Any) -> Tableau:
 
     def rounded(row: Row) -> Row:
         times = tuple(nodes[stage] for stage in row)
-        return dict(zip(row, _rounded_weights(tuple(row.values()), times, dtype), strict=True))
+        return dict(zip(row, _rounded(tuple(row.values()), times, dtype), strict=True))
 
     a, extra_a = (tuple(map(rounded, rows)) for rows in (tableau.a, tableau.extra_a))
     return tableau._replace(a=a, b=rounded(tableau.b), extra_a=extra_a)
 
 
 @functools.cache
-def _rounded_weights(
-    weights: tuple[float, ...], times: tuple[float, ...], dtype: Any
-) -> tuple[float, ...]:
-    """Return the weights of one row of a tableau, each rounded up or down to a number of `dtype`.
+def _rounded(weights: tuple[float, ...], times: tuple[float, ...], dtype: Any) -> tuple[float, ...]:
+    """Return the weights of one row, each rounded up or down to a number of `dtype`.
 
-    Of all such choices, the result changes least the sum of the weights wᵢ and the sum of wᵢcᵢ,
-    where the `times` cᵢ are those of the stages, as fractions of the step.
+    Of all such choices, the result changes least the sum of the weights wᵢ and that of wᵢcᵢ, where
+    the `times` cᵢ are those of the stages, as fractions of the step.
     """
     exact = np.array(weights)
     near = exact.astype(dtype)
@@ -108,10 +99,7 @@ def _rounded_weights(
 
 
 def _sparse_row(row: np.ndarray) -> Row:
-    """Return a row of a Butcher tableau without its zeros, as a dict `{stage: weight}`.
-
-    `row` (s,) has the weights of all s stages.
-    """
+    """Return a row (s,) without its zeros."""
     return {i: float(w) for i, w in enumerate(row) if w != 0}
 
 
@@ -139,7 +127,7 @@ TSITOURAS5 = Tableau(
     # The dense output of Tsitouras' paper is a polynomial of degree 4 in θ, the fraction of the
     # step that has passed. These are the weights of the slopes at the stages in its coefficient of
     # θ⁴. The other coefficients follow from the states and slopes at both ends of the step.
-    dense=_parse_tableau_rows("""
+    dense=_parse_rows("""
     0:-1.0530884977290216 1:0.1017 2:2.490627285651252793 3:-16.54810288924490272
       4:47.37952196281928122 5:-34.87065786149660974 6:2.5
     """),
@@ -150,7 +138,7 @@ TSITOURAS5 = Tableau(
 # doi:10.1016/0771-050X(81)90010-3.
 # It has twelve stages, order 8, error estimates of orders 5 and 3, and dense output of order 7. It
 # has fewer stages and smaller constants than the 8(7) pair of 1981 that `diffrax.Dopri8` uses.
-(_B,) = _parse_tableau_rows("""
+(_B,) = _parse_rows("""
     0:0.054293734116568765 5:4.450312892752409 6:1.8915178993145003 7:-5.801203960010585
       8:0.3111643669578199 9:-0.1521609496625161 10:0.20136540080403034 11:0.04471061572777259
 """)
@@ -163,7 +151,7 @@ DORMAND_PRINCE8 = Tableau(
     0.05260015195876773 0.0789002279381516 0.1183503419072274 0.2816496580927726 0.3333333333333333
     0.25 0.3076923076923077 0.6512820512820513 0.6 0.8571428571428571 1.0
     """),
-    a=_parse_tableau_rows("""
+    a=_parse_rows("""
     0:0.05260015195876773;
     0:0.0197250569845379 1:0.0591751709536137;
     0:0.02958758547680685 2:0.08876275643042054;
@@ -184,7 +172,7 @@ DORMAND_PRINCE8 = Tableau(
     """),
     b=_B,
     errors=(
-        *_parse_tableau_rows("""
+        *_parse_rows("""
         0:0.01312004499419488 5:-1.2251564463762044 6:-0.4957589496572502 7:1.6643771824549864
           8:-0.35032884874997366 9:0.3341791187130175 10:0.08192320648511571
           11:-0.022355307863886294
@@ -192,7 +180,7 @@ DORMAND_PRINCE8 = Tableau(
         {i: _B.get(i, 0.0) - _THIRD.get(i, 0.0) for i in (0, 5, 6, 7, 8, 9, 10, 11)},
     ),
     extra_c=(0.1, 0.2, 0.7777777777777778),
-    extra_a=_parse_tableau_rows("""
+    extra_a=_parse_rows("""
     0:0.056167502283047954 6:0.25350021021662483 7:-0.2462390374708025 8:-0.12419142326381637
       9:0.15329179827876568 10:0.00820105229563469 11:0.007567897660545699 12:-0.008298;
     0:0.03183464816350214 5:0.028300909672366776 6:0.053541988307438566 7:-0.05492374857139099
@@ -201,7 +189,7 @@ DORMAND_PRINCE8 = Tableau(
     0:-0.42889630158379194 5:-4.697621415361164 6:7.683421196062599 7:4.06898981839711
       8:0.3567271874552811 12:-0.0013990241651590145 13:2.9475147891527724 14:-9.15095847217987
     """),
-    dense=_parse_tableau_rows("""
+    dense=_parse_rows("""
     0:-8.428938276109013 5:0.5667149535193777 6:-3.0689499459498917 7:2.38466765651207
       8:2.117034582445028 9:-0.871391583777973 10:2.2404374302607883 11:0.6315787787694688
       12:-0.08899033645133331 13:18.148505520854727 14:-9.194632392478356 15:-4.436036387594894;

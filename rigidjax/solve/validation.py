@@ -1,7 +1,7 @@
 """Check the arguments of `simulate` before anything is integrated."""
 
 import warnings
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,19 +22,18 @@ from rigidjax.motion.torques.composite import parts_of
 from rigidjax.rotation.validation import rotation_tolerance
 
 
-def checked_body_state_and_times(
-    body: Any, state0: Any, ts: Any, torque: Any, throw: bool
-) -> tuple[Any, Any, Array]:
-    """Return the body, the state at the start and the times of a run, after a check of all three.
+class Checked(NamedTuple):
+    """Hold the checked arguments of a run."""
 
-    **Arguments:**
+    body: Any
+    state0: Any
+    ts: Array  # (T,), s, in the dtype of the state
 
-    - `body`, `state0`, `ts`, `torque`: the arguments of `simulate` with these names.
-    - `throw`: whether invalid numbers raise an error. With `False` invalid traced numbers become
-      NaN instead; known invalid numbers raise an error in any case.
 
-    **Returns** three things: the body; the state at the start; and the times (T,), s, in the same
-    dtype as the state.
+def checked_run(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> Checked:
+    """Return body, start and times of a run in one dtype, after a check of all three.
+
+    Unless `throw`, invalid traced numbers become NaN; known ones raise an error in any case.
     """
     ts = checked_times(ts, throw)
     state0 = checked_start(state0, throw)
@@ -46,18 +45,15 @@ def checked_body_state_and_times(
     ts, state0 = jax.tree.map(
         lambda leaf: leaf if leaf.dtype == dtype else leaf.astype(dtype), (ts, state0)
     )
-    require_compatible_types(body, state0, torque)
-    warn_of_unknown_inertia_scale(body, torque)
+    require_compatible(body, state0, torque)
+    warn_of_scale(body, torque)
     if body is not None:
         body = real_or_nan(body, throw)
-    return body, state0, ts
+    return Checked(body, state0, ts)
 
 
-def require_compatible_types(body: Any, state0: Any, torque: Any) -> None:
-    """Raise `TypeError` unless the body, the type of the state and the torque fit together.
-
-    The arguments are those of `simulate` with the same names.
-    """
+def require_compatible(body: Any, state0: Any, torque: Any) -> None:
+    """Raise `TypeError` unless body, type of the state and torque of a run fit together."""
     if isinstance(state0, Point) and body is not None:
         raise TypeError(
             "body: wanted None, because a Point is no body and has no inertia; got "
@@ -72,56 +68,38 @@ def require_compatible_types(body: Any, state0: Any, torque: Any) -> None:
         scene_of_force(torque)
     if torque is not None and not isinstance(torque, AbstractScene | MovingFrame):
         require_state_type(torque, state0)
-        _refuse_inertial_law_in_moving_frame(torque)
+        laws = _laws_within(torque)
+        # In a moving frame the state has the rate relative to it; these laws need the absolute one.
+        for law in laws if any(isinstance(law, BodyInFrame) for law in laws) else ():
+            if hasattr(law, "internal_momentum") or isinstance(law, ChangingInertia):
+                raise TypeError(
+                    f"{type(law).__name__} needs the body rate in an inertial frame, got one in a "
+                    "moving frame (BodyInFrame, libration); solve in an inertial frame. For a body "
+                    "in orbit give the torque GravityGradient(mu, position), where position is a "
+                    "function of time"
+                )
     if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
         raise TypeError(
             f"Rigid moves as well as turns: wanted MassProperties, got {type(body).__name__}"
-            + _advice_to_make_body_of_numbers(body, moves=True)
+            + _advice(body, moves=True)
         )
     if not isinstance(state0, Rigid | Point) and not isinstance(body, Inertia):
         raise TypeError(
             f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
-            + (
-                "; pass body.inertia"
-                if isinstance(body, MassProperties)
-                else _advice_to_make_body_of_numbers(body)
-            )
+            + ("; pass body.inertia" if isinstance(body, MassProperties) else _advice(body))
         )
     if body is not None:
         _checks.require_unbatched_instance(body, type(body), "body")
 
 
-def _refuse_inertial_law_in_moving_frame(torque: Any) -> None:
-    """Raise `TypeError` if a torque needs the absolute body rate but also has a `BodyInFrame`.
-
-    The absolute body rate is the rate relative to an inertial frame. The law `BodyInFrame` is for a
-    body in a moving frame, such as that of an orbit, where the state has the body rate relative to
-    this frame. A torque may therefore not contain both a `BodyInFrame` and a law that needs the
-    absolute body rate. Such a law is a `ChangingInertia`, or a law with an internal momentum.
-
-    - `torque`: the torque law, which may consist of several laws.
-    """
-
-    def within(law: Any) -> list[Any]:
-        inner = [p.torque for p in parts_of(law) if isinstance(p, BodyInFrame | ChangingInertia)]
-        return [*parts_of(law), *(part for one in inner for part in within(one))]
-
-    laws = within(torque)
-    for law in laws if any(isinstance(law, BodyInFrame) for law in laws) else ():
-        if hasattr(law, "internal_momentum") or isinstance(law, ChangingInertia):
-            raise TypeError(
-                f"{type(law).__name__} needs the body rate in an inertial frame, got one in a "
-                "moving frame (BodyInFrame, libration); solve in an inertial frame. For a body in "
-                "orbit give the torque GravityGradient(mu, position), where position is a function "
-                "of time"
-            )
+def _laws_within(law: Any) -> list[Any]:
+    """Return the parts of a law, and those of the torques inside them."""
+    inner = [p.torque for p in parts_of(law) if isinstance(p, BodyInFrame | ChangingInertia)]
+    return [*parts_of(law), *(part for one in inner for part in _laws_within(one))]
 
 
 def common_dtype(tree: Any, name: str) -> Any:
-    """Return the dtype that all arrays of a tree have; raise `TypeError` if they have several.
-
-    The message of the error begins with `name`.
-    """
+    """Return the one dtype of all arrays of a tree; raise `TypeError` if they have several."""
     kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(tree)}
     if len(kinds) != 1:
         found = ", ".join(sorted(map(str, kinds)))
@@ -129,11 +107,10 @@ def common_dtype(tree: Any, name: str) -> Any:
     return kinds.pop()
 
 
-def warn_of_unknown_inertia_scale(body: Any, torque: Any) -> None:
+def warn_of_scale(body: Any, torque: Any) -> None:
     """Warn if a torque in N m acts on a body whose inertia is known only up to a factor.
 
-    The gravity gradient without harmonics needs no warning, because it is proportional to the
-    inertia. `torque` is the torque law, or `None` for a free body.
+    The gravity gradient without harmonics needs none: it is proportional to the inertia.
     """
     relative = isinstance(body, Inertia) and body.scale is not None
     alike = isinstance(torque, GravityGradient) and not torque.harmonics
@@ -145,13 +122,8 @@ def warn_of_unknown_inertia_scale(body: Any, torque: Any) -> None:
         )
 
 
-def _advice_to_make_body_of_numbers(numbers: Any, moves: bool = False) -> str:
-    """Return the end of an error message, for a user who gave bare numbers in the place of a body.
-
-    The text says how to make a body from the `numbers`. The body is a `MassProperties` if `moves`
-    is true (it also moves in space), else an `Inertia`. If `numbers` is not an array, a list or a
-    tuple, the text is empty.
-    """
+def _advice(numbers: Any, moves: bool = False) -> str:
+    """Return how to make a body of bare `numbers` (a `MassProperties` if it `moves`), or ""."""
     if not isinstance(numbers, (list, tuple, np.ndarray, jax.Array)):
         return ""
     if moves:
@@ -161,23 +133,17 @@ def _advice_to_make_body_of_numbers(numbers: Any, moves: bool = False) -> str:
 
 
 def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
-    """Return a body after a check that a real body can have its mass and inertia.
-
-    The numbers of an impossible body become NaN. If `throw` is true, or if the numbers are not
-    traced, an impossible body raises an error instead.
-    """
+    """Return a body, with NaN for numbers that no real body can have, or raise an error."""
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
     return require_physical_body(body, tensor, body.mass if matter else None, throw)
 
 
 def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
-    """Return the relative and the absolute tolerance of a run, after a check.
+    """Return the tolerances of a run; `None` gets what suits the dtype.
 
-    A tolerance of `None` gets the value that suits the `dtype` of the run. Traced tolerances are
-    not checked. Raise `ValueError` if `rtol` is not positive, if `atol` is negative, or if one of
-    them is not finite. If `rtol` is smaller than the dtype can reach, warn, and return the smallest
-    `rtol` that the dtype can reach.
+    Raise `ValueError` unless rtol > 0 and atol ≥ 0 are finite; warn, and return the smallest `rtol`
+    that the dtype can reach, if it is below. Traced tolerances are not checked.
     """
     double = dtype == jnp.float64
     usual = (1e-9, 1e-12) if double else (2e-5, 1e-7)
@@ -206,10 +172,9 @@ def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
 
 
 def checked_times(ts: Any, throw: bool) -> Array:
-    """Return the saved times of a run as an array (T,), s, after a check.
+    """Return the saved times (T,), s, after a check that two or more of them run in one direction.
 
-    The times must increase, or decrease, throughout, and there must be two at least. Other times
-    raise an error; if they are traced and `throw` is false, they become NaN instead.
+    Unless `throw`, bad traced times become NaN.
     """
     if isinstance(ts, (Spin, Attitude, Rigid, Point)):
         raise TypeError(f"ts: wanted times, got {type(ts).__name__}; the state comes before them")
@@ -228,7 +193,7 @@ def checked_times(ts: Any, throw: bool) -> Array:
     ahead = xp.where(back, numbers[:-1] > numbers[1:], numbers[1:] > numbers[:-1])
     if xp is not np:
         words = "ts: wanted increasing times, or decreasing ones throughout"
-        return _error_or_nan_if_bad(found, ~ahead.all(), words, throw)
+        return _error_or_nan(found, ~ahead.all(), words, throw)
     where = ""
     if not ahead.all():
         i = int(np.argmin(ahead)) + 1
@@ -239,15 +204,14 @@ def checked_times(ts: Any, throw: bool) -> Array:
                 + _checks.advice_for_large_times(found.dtype)
             )
     kind = "decreasing" if back else "increasing"
-    return _error_or_nan_if_bad(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
+    return _error_or_nan(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
 
 
 def checked_first_step(dt0: Any, times: Array) -> Array:
-    """Return the length of the first step that the user gave as `dt0`, s, after a check.
+    """Return the length of the first step, s, in the precision of the `times`.
 
-    `times` (T,), s, are the saved times, whose precision the length gets. If the value of `dt0` is
-    known, raise `ValueError` if it is zero, not finite, too short for the precision, or negative in
-    a run forwards in time.
+    Raise `ValueError` if it is known to be zero, not finite, too short, or negative in a run
+    forwards.
     """
     step = _checks.array_of_shape(dt0, (), "dt0").astype(times.dtype)
     known = _checks.is_known(times)
@@ -271,11 +235,9 @@ def checked_first_step(dt0: Any, times: Array) -> Array:
 
 
 def checked_start(state0: Any, throw: bool) -> Any:
-    """Return the state at the start of a run after a check.
+    """Return the state at the start: of one body, finite, with a quaternion of length 1.
 
-    The state must be that of one body, with finite numbers; a quaternion must have the length 1. An
-    invalid state raises an error. With `throw=False` a traced quaternion whose length is not 1
-    becomes NaN instead, and traced numbers that are not finite are left as they are.
+    Unless `throw`, a traced quaternion of another length becomes NaN.
     """
     wanted = "Spin, Attitude or Rigid, or Point without a body"
     _checks.require_unbatched_instance(
@@ -292,7 +254,7 @@ def checked_start(state0: Any, throw: bool) -> Any:
     if isinstance(state0, HasAttitude):
         xp = _checks.array_module(state0.q)
         off = xp.abs(xp.sqrt(xp.sum(xp.square(state0.q))) - 1)
-        q = _error_or_nan_if_bad(
+        q = _error_or_nan(
             state0.q,
             off > rotation_tolerance(state0.q.dtype),
             "q: wanted a unit quaternion (w, x, y, z), got one whose length is not 1; normalise it "
@@ -303,17 +265,10 @@ def checked_start(state0: Any, throw: bool) -> Any:
     return state0
 
 
-def _error_or_nan_if_bad(value: Array, bad: Any, message: str, throw: bool) -> Array:
-    """Return an array after a check: if it is bad, raise an error, or return NaN in its place.
+def _error_or_nan(value: Array, bad: Any, message: str, throw: bool) -> Array:
+    """Return `value`; if `bad`, raise an error, or return NaN for traced numbers unless `throw`.
 
-    **Arguments:**
-
-    - `value`: the array that was checked.
-    - `bad`: whether the array is bad, a truth value, which may be traced.
-    - `message`: the message of the error.
-    - `throw`: whether a bad array raises an error even if `bad` is traced. With `False` and a
-      traced `bad`, NaN is returned, because one bad body in a batch must not end the runs of the
-      other bodies. If `bad` is not traced, a bad array raises an error in any case.
+    One bad body in a batch must not end the runs of the others.
     """
     if throw or _checks.is_known(bad):
         return _checks.error_if(value, bad, message)

@@ -65,14 +65,14 @@ def test_steps_in_pieces(monkeypatch, count, most):
             jax.jacfwd(jax.grad(last, (0, 2)))(*at),
         )
 
-    here, there = jax.jit(lambda: (all_of(plain), all_of(pieces.take_equal_steps_on_gpu)))()
+    here, there = jax.jit(lambda: (all_of(plain), all_of(pieces.march_on_gpu)))()
     for a, b in zip(jax.tree.leaves(here), jax.tree.leaves(there), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-13, atol=1e-14)
 
 
 def test_reverse_over_reverse_is_refused():
     def last(size):
-        return steps_of(size, START, jnp.asarray(0.1), 3, pieces.take_equal_steps_on_gpu)[1]
+        return steps_of(size, START, jnp.asarray(0.1), 3, pieces.march_on_gpu)[1]
 
     with pytest.raises(TypeError, match="forward over reverse"):
         jax.grad(jax.grad(last))(jnp.asarray(0.8))
@@ -84,15 +84,15 @@ def test_a_gpu_takes_steps_in_pieces(monkeypatch):
     """
     taken = []
 
-    def take_equal_steps_on_gpu(*args):
+    def march_on_gpu(*args):
         taken.append(args[2])
-        return pieces.take_equal_steps_on_gpu(*args)
+        return pieces.march_on_gpu(*args)
 
     bodies, states = batch(2)
     law = rj.torques.Damping([0.1, 0.2, 0.3])
     here = rj.batch.rollout(bodies, states, 0.1, 5, law)
     monkeypatch.setattr(fixed_loop, "platform", lambda: "gpu")
-    monkeypatch.setattr(fixed_loop, "take_equal_steps_on_gpu", take_equal_steps_on_gpu)
+    monkeypatch.setattr(fixed_loop, "march_on_gpu", march_on_gpu)
     monkeypatch.setattr(pieces, "_MOST", 1)
     # Another number of steps a piece of results, so that no trace of the first call is taken.
     there = rj.batch.rollout(bodies, states, 0.1, 5, law, save_every=5)

@@ -328,7 +328,7 @@ def costs(kind, n, seed, dtype, table):
     plain = jax.jit(lambda p, y, rtol: last(run(kind, p, y, rtol=rtol, atol=1e-3 * rtol)))
 
     @jax.jit
-    def store_error_and_warn(p, start, rtol):
+    def with_error(p, start, rtol):
         sol = run(kind, p, start, rtol=rtol, atol=1e-3 * rtol)
         return last(sol), sol.error.total
 
@@ -352,8 +352,7 @@ def costs(kind, n, seed, dtype, table):
     for i in range(n):
         mine, begin = {name: a[i] for name, a in p.items()}, start[i]
         ratios.append(
-            timed(store_error_and_warn, mine, begin, rtol[i])[0]
-            / timed(plain, mine, begin, rtol[i])[0]
+            timed(with_error, mine, begin, rtol[i])[0] / timed(plain, mine, begin, rtol[i])[0]
         )
         ends = np.stack([plain(mine, begin, tolerance) for tolerance in grid])
         true = np.max(apart(ends, truth[i : i + 1], low[i : i + 1]) / sized(truth)[i], 1)

@@ -3,13 +3,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rigidjax.solve.linear_map import known_with_derivatives_of
+from rigidjax.solve.linear_map import with_derivatives
 
 
 @pytest.mark.oldest
 def test_a_known_value_has_the_derivatives_of_the_other():
     def f(x):
-        return known_with_derivatives_of(jnp.asarray(7.0), jnp.sin(x))
+        return with_derivatives(jnp.asarray(7.0), jnp.sin(x))
 
     x = jnp.asarray(0.3)
     np.testing.assert_allclose(f(x), 7.0, rtol=0)

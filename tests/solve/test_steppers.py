@@ -11,7 +11,7 @@ import rigidjax as rj
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import may_read_attitude, may_read_rate
 from rigidjax.solve import components, explicit, fixed
-from rigidjax.solve.equal_steps import loop_stages_of_low_order
+from rigidjax.solve.equal_steps import loop_low_order
 from rigidjax.solve.steppers import stepper_of
 
 BODY = rj.Inertia([[1.6, 0.1, 0.0], [0.1, 2.0, 0.2], [0.0, 0.2, 3.0]])
@@ -129,7 +129,7 @@ def test_derivatives_of_equal_steps(law):
 )
 def test_stages_in_a_loop_take_the_steps_of_those_written_out(plain, law, dtype):
     """Values and derivatives by the rate, in both modes."""
-    rolled = loop_stages_of_low_order(plain)
+    rolled = loop_low_order(plain)
     assert rolled is not plain
     body, start, ts, law = jax.tree.map(
         lambda a: jnp.asarray(a, dtype), (BODY, START, np.array([0.3, 0.5, 0.9]), law)
@@ -159,7 +159,7 @@ def test_trees_come_back_as_they_were():
         "c": jnp.zeros((0, 3)),
         "d": jnp.ones(50),
     }
-    parts = components.split_into_scalars(tree)
+    parts = components.split_scalars(tree)
     assert len(parts) == 8
     back = components.join_scalars(parts, tree)
     assert jax.tree.all(jax.tree.map(lambda x, y: bool((x == y).all()), back, tree))

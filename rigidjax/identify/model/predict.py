@@ -27,11 +27,11 @@ from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.motion.torques.states import freeze_own_states
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
-from rigidjax.solve.components import split_into_scalars
-from rigidjax.solve.equal_steps import loop_stages_of_low_order, state_after_step
+from rigidjax.solve.components import split_scalars
+from rigidjax.solve.equal_steps import loop_low_order, state_after_step
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.fixed_loop import fill_first_rows, take_equal_step, torque_inputs_at_start
-from rigidjax.solve.steppers import cheapest_method_of_order_4, stepper_of
+from rigidjax.solve.fixed_loop import equal_step, fill_rows, inputs_at_start
+from rigidjax.solve.steppers import cheapest_method, stepper_of
 from rigidjax.solve.tableaus import KUTTA4
 
 # If the body turns by TURN_A_STEP rad in each step, a method of order 5 has an error of 1e-9 for
@@ -101,7 +101,7 @@ class FixedSteps(AbstractIntegrator):
     ) -> PyTree:
         y0 = with_own_states(body, state0, torque, ts[0])
         field = equations_of_motion(body, y0, torque)
-        return fixed(loop_stages_of_low_order(self.solver), field, ts, y0, self.substeps, self.last)
+        return fixed(loop_low_order(self.solver), field, ts, y0, self.substeps, self.last)
 
     def refine(self) -> AbstractIntegrator:
         if self.substeps > FINEST:
@@ -213,28 +213,26 @@ class HeldSteps(AbstractIntegrator):
         count, size = ts.shape[0] - 1, (ts[1] - ts[0]).astype(state0.omega.dtype)
         before = max((len(rows) - ts.shape[0] for rows in inputs.values()), default=0)
         start = with_own_states(
-            body, state0, bind(torque, torque_inputs_at_start(torque, size, inputs)), 0.0
+            body, state0, bind(torque, inputs_at_start(torque, size, inputs)), 0.0
         )
         field = equations_of_motion(body, start, torque)
-        stepper = stepper_of(
-            loop_stages_of_low_order(cheapest_method_of_order_4(field)), field, start
-        )
+        stepper = stepper_of(loop_low_order(cheapest_method(field)), field, start)
 
         def take_step(y: PyTree, i: Array) -> tuple[PyTree, PyTree]:
-            y = take_equal_step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
-            return y, stepper.state_of_numbers(y)
+            y = equal_step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
+            return y, stepper.state(y)
 
         def warm_up(y: PyTree, i: Array) -> tuple[PyTree, None]:
             # Before the first time of the record the torque's own states (such as the speed of a
             # motor) follow the inputs, while the body keeps its initial state.
             y, _ = take_step(y, i)
-            return split_into_scalars(Coupled(start.motion, stepper.state_of_numbers(y).own)), None
+            return split_scalars(Coupled(start.motion, stepper.state(y).own)), None
 
-        y0 = stepper.initial_numbers
+        y0 = stepper.start
         if before and isinstance(start, Coupled):
             y0, _ = lax.scan(warm_up, y0, jnp.arange(-before, 0, dtype=jnp.int32))
         still = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *jnp.shape(a))), start)
-        later = fill_first_rows(count if self.last is None else self.last, take_step, y0, still)
+        later = fill_rows(count if self.last is None else self.last, take_step, y0, still)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, later)
 
 
