@@ -20,8 +20,8 @@ import rigidjax as rj
 from rigidjax import _checks, _show
 from rigidjax.cli import spec
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.layouts import imu_columns_of
-from rigidjax.cli.logs.units import TIME_UNITS, unit_in_column_name
+from rigidjax.cli.logs.layouts import imu_columns
+from rigidjax.cli.logs.units import TIME_UNITS, unit_in_name
 from rigidjax.workprecision import command as workprecision
 
 # The demo takes only the options in this tuple. All other options describe how to read logs or what
@@ -363,7 +363,7 @@ def _read_logs(
     how: dict[str, Any] = dict(window=options.window, wheels=wheels, free=options.free)
     records, of_first = [], None
     for path in options.logs:
-        time, *rates = options.columns or imu_columns_of(path).columns
+        time, *rates = options.columns or imu_columns(path).columns
         time = options.time or time
         time_unit = spec.unit_of_time(path, time, options.time_unit)
         channels = [
@@ -392,7 +392,7 @@ def _print_units_from_column_names(
     words = [
         f"{what} in {unit}"
         for what, names, unit in [("time", (time_column,), time_unit), *units]
-        if unit_in_column_name(names[0], [unit or ""])
+        if unit_in_name(names[0], [unit or ""])
     ]
     if words:
         _print_line(f"{path}: {', '.join(words)}, as the names of its columns say")

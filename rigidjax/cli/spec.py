@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from rigidjax.cli.logs.errors import LogError, warn
-from rigidjax.cli.logs.layouts import known_unit_of_column
+from rigidjax.cli.logs.layouts import known_unit
 from rigidjax.cli.logs.table import read_table
-from rigidjax.cli.logs.times import mask_of_increasing, rows_to_use, warn_of_gap_or_wrong_unit
-from rigidjax.cli.logs.units import TIME_UNITS, UNITS, unit_of_columns
+from rigidjax.cli.logs.times import increasing, increasing_rows, warn_of_steps
+from rigidjax.cli.logs.units import TIME_UNITS, UNITS, common_unit
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.data.reference_states import require_turning
 from rigidjax.identify.model import charts
@@ -204,7 +204,7 @@ def read_log(
     # The times are counted from the first time stamp: times since 1970, in seconds or nanoseconds,
     # are so large that float64 has few digits left for the steps between them.
     t = (table[time] - _first_finite_time(table[time])) * UNITS[unit]
-    kept = rows_to_use(path, t, time, window)
+    kept = increasing_rows(path, t, time, window)
     # A slice is used if all rows are kept, since indexing with a slice makes no copy of a large
     # log.
     kept = slice(None) if kept.size == t.size else kept
@@ -218,7 +218,7 @@ def read_log(
             rate = _median_body_rate(path, one, factor, values[kept][mask[kept]])
         sensor, values = _sensor_and_readings(one, values, factor, "bias" in free)
         readings.append((sensor, values[kept], mask[kept]))
-    warn_of_gap_or_wrong_unit(path, t[kept], unit, rate)
+    warn_of_steps(path, t[kept], unit, rate)
     inputs = _wheel_speed_series(path, t, table, wheels)
     # The memory of a large log is freed before the recording copies its columns.
     del table
@@ -244,8 +244,8 @@ def unit_of_channel(path: str | Path, channel: Channel) -> str:
     - `channel`: the sensor: its kind, columns and stated unit.
     """
     allowed = _units_of_kind(channel.kind)
-    usual = known_unit_of_column(path, channel.columns[0]) or allowed[0]
-    return unit_of_columns(channel.columns, channel.unit, usual, allowed, str(path))
+    usual = known_unit(path, channel.columns[0]) or allowed[0]
+    return common_unit(channel.columns, channel.unit, usual, allowed, str(path))
 
 
 def unit_of_time(path: str | Path, column: str, stated_unit: str | None) -> str:
@@ -256,8 +256,8 @@ def unit_of_time(path: str | Path, column: str, stated_unit: str | None) -> str:
     - `column`: the name of the time column.
     - `stated_unit`: the unit that the user states, or `None`.
     """
-    usual = known_unit_of_column(path, column) or "s"
-    return unit_of_columns([column], stated_unit, usual, TIME_UNITS, str(path))
+    usual = known_unit(path, column) or "s"
+    return common_unit([column], stated_unit, usual, TIME_UNITS, str(path))
 
 
 def _median_body_rate(
@@ -367,9 +367,9 @@ def _wheel_speed_series(
     speeds = {}
     # The speeds of the wheels are kept also at times outside of the window, since a delayed speed
     # is from a time before that of the reading.
-    kept = mask_of_increasing(t) if wheels else slice(None)
+    kept = increasing(t) if wheels else slice(None)
     for name, one in zip(names_of_wheel_speeds(wheels), wheels, strict=True):
-        unit = unit_of_columns([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
+        unit = common_unit([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
         try:
             samples = table[one.column][kept] * UNITS[unit]
             speeds[name] = Series(*_fill_missing_rows(t[kept], samples))
