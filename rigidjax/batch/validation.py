@@ -293,7 +293,7 @@ def _check_unit_quaternions(q: Array) -> list[Check]:
             "normalise with rigidjax.quaternion.normalise, and mind that the scalar is first"
         )
 
-    return [(_checks.index_of_first_bad_row(_is_not_unit, q), refuse)]
+    return [(_checks.first_bad_row(_is_not_unit, q), refuse)]
 
 
 def _is_not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:

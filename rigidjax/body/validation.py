@@ -169,7 +169,7 @@ def index_of_first_impossible_inertia(
 
     - `tensors`: (n, 3, 3) inertia tensors, kg m², that are not traced.
     """
-    return _checks.index_of_first_bad_row(_are_impossible_inertias, tensors)
+    return _checks.first_bad_row(_are_impossible_inertias, tensors)
 
 
 def _are_impossible_inertias(xp: ModuleType, tensors: Array | np.ndarray) -> Array | np.ndarray:

@@ -400,7 +400,7 @@ def _run_logs(options: argparse.Namespace) -> int:
     print()
     print(rj.identify.report.table(rj.identify.report.rows(fit, rate_unit)))
     for sensor, rms in zip(model.records.sensors, fit.rms, strict=True):
-        scale, unit = _show.scale_and_unit_to_show(sensor.unit, rate_unit)
+        scale, unit = _show.shown_unit(sensor.unit, rate_unit)
         print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
     print()
     print(rj.identify.report.verdict(fit))

@@ -38,7 +38,7 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
     out: list[Row] = []
     for quantity in fit.quantities:
         low, high = bounds[quantity.name]
-        scale, unit = _show.scale_and_unit_to_show(quantity.unit, rate_unit)
+        scale, unit = _show.shown_unit(quantity.unit, rate_unit)
         name = quantity.name
         if name.startswith("Ω"):
             axis, *where = name.split(" ", 1)
@@ -285,9 +285,7 @@ def write_html(
     '<!doctype html>'
     """
     require_one_fit(fit)
-    units = [
-        _show.scale_and_unit_to_show(unit, rate_unit) for *_, unit in _rms_errors_of_components(fit)
-    ]
+    units = [_show.shown_unit(unit, rate_unit) for *_, unit in _rms_errors_of_components(fit)]
     sizes = _table_rows_as_html(
         (name, " ".join(f"{scale * x:.3g}" for x in axes), unit)
         for (name, axes, _), (scale, unit) in zip(

@@ -356,7 +356,7 @@ def _message_of_too_short_step(time_dtype: Any) -> str:
     return (
         "simulate: no step is short enough: the minimum step size, some units of round-off of the "
         f"time, was reached. Does the torque jump or grow without bound? In {np.dtype(time_dtype)} "
-        f"the times near 1e9 s are {gap:.2g} s apart: {_checks.advice_for_large_times(time_dtype)}"
+        f"the times near 1e9 s are {gap:.2g} s apart: {_checks.advice_on_times(time_dtype)}"
     )
 
 

@@ -336,9 +336,7 @@ def _solve_run(
                 setup, event, state0, times
             )
     except RuntimeError as error:
-        raise explain_max_steps_error(
-            setup, state0, times, _checks.error_without_equinox_text(error)
-        ) from None
+        raise explain_max_steps_error(setup, state0, times, _checks.plain_error(error)) from None
     warn_of_missed_switches(setup, state0, times, stats)
     if setup.throw and "ended" in stats:
         ys = raise_if_scene_ended_run(setup.torque, ys, stats, times)

@@ -299,7 +299,7 @@ def _require_distinct_times(t: np.ndarray, dtype: np.dtype) -> None:
     index = int(np.argmax(off))
     words = (
         f"t: {dtype} changes the step of {steps[index]:.3g} s after {t[index]} s to "
-        f"{held[index]:.3g} s; {_checks.advice_for_large_times(dtype)}"
+        f"{held[index]:.3g} s; {_checks.advice_on_times(dtype)}"
     )
     if off[index] >= 1:
         raise ValueError(words)
