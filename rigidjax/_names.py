@@ -23,8 +23,8 @@ _NOT_MODELLED = ("joint", "contact", "hinge", "constraint", "collide", "render",
 
 
 def define_dir_and_getattr(module_name: str) -> None:
-    """Let `dir` list the names in a module's `__all__`, and the look-up of another name raise
-    `AttributeError` with the nearest public names.
+    """Define `__dir__` and `__getattr__` of a module: `dir` lists its `__all__`, and the look-up of
+    another name raises `AttributeError` with the nearest public names.
     """
     here = sys.modules[module_name]
     vars(here).update(

@@ -27,7 +27,7 @@ from rigidjax.plot.style import (
     pyplot,
     rotation_matrices,
     set_equal_scales,
-    sphere_points,
+    viewpoint,
 )
 
 # CORNERS (8, 3) are the corners of the cube from −1 to 1. FACES has, for each face, the indices of
@@ -163,7 +163,7 @@ def tumble(
     edges: dict[str, Any] = {"linewidths": 0.3}
     if surface is None:
         edges = {"edgecolor": "0.2", "linewidths": 0.8}
-    towards = sphere_points(np.radians(ax.azim), np.radians(90 - ax.elev))
+    towards = viewpoint(ax)
     drawn = Poly3DCollection([], alpha=0.85 if surface is None else 1.0, **edges)
     ax.add_collection3d(drawn)
     (trail,) = ax.plot([], [], [], color="0.3", lw=0.9)

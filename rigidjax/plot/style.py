@@ -153,14 +153,19 @@ def sphere_points(longitude: np.ndarray, colatitude: np.ndarray) -> np.ndarray:
     return np.stack(np.broadcast_arrays(np.cos(longitude) * ring, np.sin(longitude) * ring, height))
 
 
+def viewpoint(ax: Any) -> np.ndarray:
+    """Return the unit vector from the middle of 3-D axes towards the viewer."""
+    up, around = np.radians([ax.elev, ax.azim])
+    return np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+
+
 def draw_on_sphere(
     ax: Any, path: np.ndarray, *, hidden_style: dict[str, Any] | None = None, **style: Any
 ) -> None:
     """Draw a line (T, 3) on the unit sphere; what the sphere hides has the `hidden_style`, by
     default faint.
     """
-    eye = sphere_points(np.radians(ax.azim), np.radians(90 - ax.elev))
-    front, label = path @ eye > 0, style.pop("label", None)
+    front, label = path @ viewpoint(ax) > 0, style.pop("label", None)
     for seen, more in ((front, {"label": label}), (~front, hidden_style or {"alpha": 0.25})):
         # The visible and the hidden part of the line overlap by one point, so that no gap opens
         # between the two.
