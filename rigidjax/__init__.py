@@ -25,7 +25,7 @@ from rigidjax import (
     motion as motion,
     solve as solve,
 )
-from rigidjax._names import define_dir_and_getattr, raise_attribute_error
+from rigidjax._names import define_dir_and_getattr, raise_unknown
 from rigidjax.body import (
     Inertia as Inertia,
     MassProperties as MassProperties,
@@ -88,8 +88,4 @@ define_dir_and_getattr(__name__)
 
 def __getattr__(name: str) -> ModuleType:
     later = name in _LATER
-    return (
-        importlib.import_module(f"rigidjax.{name}")
-        if later
-        else raise_attribute_error(__name__, name)
-    )
+    return importlib.import_module(f"rigidjax.{name}") if later else raise_unknown(__name__, name)

@@ -23,22 +23,19 @@ _NOT_MODELLED = ("joint", "contact", "hinge", "constraint", "collide", "render",
 
 
 def define_dir_and_getattr(module_name: str) -> None:
-    """Define `__dir__` and `__getattr__` of a module: `dir` then lists the names in its `__all__`,
-    and a look-up of a name that the module lacks raises `AttributeError` with the nearest public
-    names.
-
-    - `module_name`: the full name of the module, which its code gives as `__name__`
+    """Define `__dir__` and `__getattr__` of a module: `dir` lists its `__all__`, and the look-up of
+    another name raises `AttributeError` with the nearest public names.
     """
     here = sys.modules[module_name]
     vars(here).update(
         __dir__=lambda: sorted(here.__all__),
-        __getattr__=functools.partial(raise_attribute_error, module_name),
+        __getattr__=functools.partial(raise_unknown, module_name),
     )
 
 
-def raise_attribute_error(module_name: str, name: str) -> NoReturn:
-    """Raise `AttributeError` for a `name` that a module lacks; the message contains the one or two
-    public names of the library that are nearest to it.
+def raise_unknown(module_name: str, name: str) -> NoReturn:
+    """Raise `AttributeError` for a name that a module lacks, with the public names of the library
+    that are nearest to it.
     """
     here, hint = sys.modules[module_name], ""
     if module_name == "rigidjax" and any(word in name.lower() for word in _NOT_MODELLED):
@@ -50,7 +47,7 @@ def raise_attribute_error(module_name: str, name: str) -> NoReturn:
     # tools ask for such names; and for a module that is not loaded yet, since the import system
     # asks for it.
     elif name[0] != "_" and not (hasattr(here, "__path__") and find_spec(f"{module_name}.{name}")):
-        paths = _public_paths_by_name()
+        paths = _paths()
         # `fit` and `Fit` are two names: the name is looked up first as it was written, and then in
         # lower case.
         same = next((one for one in (name, name.lower()) if one in paths), None)
@@ -77,9 +74,9 @@ def suggest_arguments(function: Function) -> Function:
 
 
 @functools.cache
-def _public_paths_by_name() -> dict[str, str]:
-    """Return a dictionary from each public name of the library to its shortest path: from `Sum` to
-    `rj.torques.Sum`, for example. Each name is a key as it is written, and also in lower case.
+def _paths() -> dict[str, str]:
+    """Return the shortest path of each public name: from `Sum` (and `sum`) to `rj.torques.Sum`, for
+    example.
     """
     modules, paths = [("rj", sys.modules["rigidjax"])], {}
     for path, module in modules:

@@ -21,8 +21,8 @@ Quat = Float[Array, "4"]
 
 @runtime_checkable
 class Rotation(Protocol):
-    """Describe an object like the `Rotation` of SciPy: an active rotation, whose method `as_quat`
-    returns a quaternion with the scalar part last.
+    """Describe an object like the `Rotation` of SciPy, an active rotation: `as_quat` returns a
+    quaternion with the scalar last.
     """
 
     def as_quat(self) -> Any: ...

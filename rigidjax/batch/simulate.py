@@ -240,9 +240,7 @@ def _results(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
 
     def status(row: PyTree, ys: PyTree) -> dfx.RESULTS:
         result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-        return result_of_body(
-            result, one_body(batch.shared, row, batch.constants)[0]
-        )
+        return result_of_body(result, one_body(batch.shared, row, batch.constants)[0])
 
     return jax.vmap(status)(batch.per_body, ys)
 

@@ -260,7 +260,7 @@ def _check_unit_quaternions(q: Array) -> list[Check]:
             "normalise with rigidjax.quaternion.normalise, and mind that the scalar is first"
         )
 
-    return [Check(_checks.index_of_first_bad_row(is_not_unit, q), refuse)]
+    return [Check(_checks.first_bad_row(is_not_unit, q), refuse)]
 
 
 def checked_steps(step_size: ScalarLike, num_steps: int, dtype: np.dtype) -> tuple[Array, int]:

@@ -93,7 +93,7 @@ class Inertia(eqx.Module):
         Array(3., dtype=float64)
         """
         moments = validation.require_physical_moments(
-            jnp.stack(_checks.scalar_arrays_of_one_dtype(i1=i1, i2=i2, i3=i3))
+            jnp.stack(_checks.scalars(i1=i1, i2=i2, i3=i3))
         )
         return Inertia(jnp.diag(moments))
 

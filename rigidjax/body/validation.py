@@ -158,7 +158,7 @@ def first_impossible_inertia(
         flat, broken, skew = _faults(xp, tensors, allow_zero_moment=False)
         return (flat | broken | skew) & ~xp.isnan(xp.asarray(tensors)).any(axis=(-1, -2))
 
-    return _checks.index_of_first_bad_row(impossible, tensors)
+    return _checks.first_bad_row(impossible, tensors)
 
 
 _MASS = "mass: wanted a positive mass (kg), got zero, a negative one or NaN"

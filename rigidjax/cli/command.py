@@ -20,8 +20,8 @@ import rigidjax as rj
 from rigidjax import _checks, _show
 from rigidjax.cli import spec
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.layouts import imu_columns_of
-from rigidjax.cli.logs.units import TIME_UNITS, unit_in_column_name
+from rigidjax.cli.logs.layouts import imu_columns
+from rigidjax.cli.logs.units import TIME_UNITS, unit_in_name
 from rigidjax.workprecision import command as workprecision
 
 # The demo takes only the options in this tuple. All other options describe how to read logs or what
@@ -33,16 +33,14 @@ _OUTPUTS = ("checkpoint", "figure", "report", "json", "csv", "keep")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line and return its exit code.
+    """Run the command line and return its exit code: 0 for success, 1 for a fit that cannot be
+    trusted, 2 for bad input or a file that could not be written, 130 for an interrupt.
 
-    The code is 0 for success, 1 for a fit that cannot be trusted, 2 for bad input or a file that
-    could not be written, and 130 for an interrupt.
-
-    **Arguments:** `arguments` the words of the command line, or `None` for those that this process
-    was started with. With `None` the process belongs to this command alone, so that settings of JAX
-    may be changed: compiled programs are then kept for the next run, unless `--no-cache` is given.
+    The words `arguments` are those that this process was started with if they are `None`. The
+    process then belongs to this command alone, so that settings of JAX may be changed: compiled
+    programs are kept for the next run, unless `--no-cache` is given.
     """
-    parser = _make_parser()
+    parser = _parser()
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help()
@@ -52,26 +50,23 @@ def main(arguments: list[str] | None = None) -> int:
     jax.config.update("jax_enable_x64", True)
     if options.command == "identify" and options.demo == bool(options.logs):
         parser.error("identify: give either log FILES or --demo")
-    _check_output_files(options, parser)
+    _check_outputs(options, parser)
     if arguments is None:
         # Characters of a file name that the terminal cannot show are escaped, since they would
         # raise an error that ends the run.
         for stream in (sys.stdout, sys.stderr):
             stream.reconfigure(errors="backslashreplace")  # pyright: ignore
-        sys.unraisablehook = _raise_interrupt_again
+        sys.unraisablehook = _raise_again
     try:
-        return _dispatch_command(options, parser, owns_process=arguments is None)
+        return _dispatch(options, parser, owns_process=arguments is None)
     except KeyboardInterrupt:
         _print_error("interrupted (Ctrl-C); nothing more is written")
         return 130
 
 
-def _raise_interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
-    """Raise a Ctrl-C (`KeyboardInterrupt`) again if Python dropped it. Python does so if the
-    interrupt comes while the garbage collector calls a function of JAX.
-
-    `dropped` holds the exception that Python could not raise; this function is set as
-    `sys.unraisablehook`. An exception other than Ctrl-C is reported as usual.
+def _raise_again(dropped: "sys.UnraisableHookArgs") -> None:
+    """Raise a Ctrl-C again that Python dropped, as it does if the interrupt comes while the garbage
+    collector calls a function of JAX; report any other exception as usual.
     """
     if dropped.exc_type is KeyboardInterrupt:
         # Another thread raises the interrupt a moment later: an interrupt that is raised within
@@ -81,16 +76,10 @@ def _raise_interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(dropped)
 
 
-def _dispatch_command(
+def _dispatch(
     options: argparse.Namespace, parser: argparse.ArgumentParser, owns_process: bool
 ) -> int:
-    """Run the command that the options name, and return its exit code.
-
-    - `options`: the options of the command line.
-    - `parser`: the parser of the command line, which reports wrong options.
-    - `owns_process`: whether the process belongs to this command, so that settings of JAX may be
-      changed.
-    """
+    """Run the command that the options name, and return its exit code."""
     if owns_process:
         rj.set_xla_flags()
     if options.command == "workprecision":
@@ -105,22 +94,20 @@ def _dispatch_command(
     if owns_process and options.no_cache:
         jax.config.update("jax_enable_compilation_cache", False)
     elif owns_process:
-        _keep_compiled_programs()
+        _keep_programs()
     return _run_demo(options) if options.demo else _run_logs(options)
 
 
-def _check_output_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Check before the fit that each output file that the `options` name can be written, and end
-    the program with a message of the `parser` if this is not so.
-
-    If the file name of the figure has no ending, the ending `.png` is added to it in `options`.
+def _check_outputs(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """Refuse, before the fit, output files that cannot be written; add the ending `.png` to a
+    figure without one.
     """
     figure = options.figure
     if figure is not None and figure.name and not figure.suffix.strip("."):
         # Matplotlib adds the ending `.png` to a name without an ending. The ending is added here,
         # so that messages name the right file.
         options.figure = figure.with_name(figure.name.rstrip(".") + ".png")
-    if figure is not None and not _prepare_matplotlib_if_installed():
+    if figure is not None and not _has_matplotlib():
         parser.error("--figure: matplotlib is missing; in the clone: pip install '.[view]'")
     if figure is not None and figure.suffix.strip("."):
         from matplotlib.backend_bases import FigureCanvasBase
@@ -141,12 +128,11 @@ def _check_output_files(options: argparse.Namespace, parser: argparse.ArgumentPa
             parser.error(f"--{name}: {path}: {why}")
 
 
-def _keep_compiled_programs() -> None:
+def _keep_programs() -> None:
     """Set JAX to store compiled programs in the user's cache folder, so that the next start takes
     only seconds.
 
-    The command `workprecision` does not call this function, since it measures how long programs
-    take to compile.
+    The command `workprecision` does not, since it measures how long programs take to compile.
     """
     if jax.__version_info__ < (0, 12):
         # Messages of XLA are hidden: for each stored program that XLA loads, it reports two of its
@@ -176,8 +162,8 @@ def _keep_compiled_programs() -> None:
 
 
 def _cache_folder() -> Path:
-    """Return the folder for the stored programs of rigidjax: inside the user's cache folder, where
-    Linux (XDG), macOS or Windows has it.
+    """Return the folder of rigidjax inside the user's cache folder, where Linux (XDG), macOS or
+    Windows has it.
     """
     xdg_folder = os.environ.get("XDG_CACHE_HOME")
     if xdg_folder:
@@ -188,15 +174,13 @@ def _cache_folder() -> Path:
     return Path.home() / inside / "rigidjax"
 
 
-class _EscapingParser(argparse.ArgumentParser):
-    """Read the command line, with error messages in which control characters, which the name of a
-    file may contain, are escaped.
+class _Parser(argparse.ArgumentParser):
+    """Read the command line; control characters, which the name of a file may contain, are escaped
+    in messages.
     """
 
     def error(self, message: str) -> NoReturn:
-        """Print the message with its control characters escaped, and end the program with exit code
-        2.
-        """
+        """Print the message escaped, and end the program with exit code 2."""
         super().error(_checks.escape_controls(message))
 
 
@@ -269,9 +253,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def _make_parser() -> argparse.ArgumentParser:
+def _parser() -> argparse.ArgumentParser:
     """Return the parser of the command line, with all commands and their options."""
-    parser = _EscapingParser(
+    parser = _Parser(
         prog="python -m rigidjax",
         description="Differentiable rigid-body mechanics for JAX: identify inertia from data.",
         epilog="Try: python -m rigidjax identify --demo",
@@ -296,14 +280,14 @@ def _make_parser() -> argparse.ArgumentParser:
 
 
 def _run_demo(options: argparse.Namespace) -> int:
-    """Run the demo with the `options` of the command line, and return the exit code. The demo fits
-    the motion of the tumbling asteroid Toutatis to radar observations.
+    """Fit the motion of the tumbling asteroid Toutatis to radar observations, and return the exit
+    code.
     """
     from rigidjax.datasets import toutatis
 
     print("4179 Toutatis, 17 radar observations, 2 to 18 December 1992")
     print(f"data: {toutatis.CITATION}\n")
-    fit = _fit_or_print_error(toutatis.model(), options, 16)
+    fit = _fit(toutatis.model(), options, 16)
     if fit is None:
         return 2
     more = toutatis.rows(fit)
@@ -317,18 +301,9 @@ def _run_demo(options: argparse.Namespace) -> int:
     return _write_outputs(fit, options, title, [toutatis.CITATION], [title], units, more)
 
 
-def _channels_of_options(
-    options: argparse.Namespace, rate_columns: Sequence[str]
-) -> list[spec.Channel]:
-    """Return the sensors of a log, as the command line describes them, each as a `Channel` (kind,
-    columns, unit, noise and limit).
-
-    The sensors are those of the option `--sensor`. Without this option the log has one gyro, which
-    the options `--unit`, `--noise` and `--limit` describe.
-
-    - `options`: the options of the command line.
-    - `rate_columns`: the names of the three columns of the body rates, for the one gyro without
-      `--sensor`.
+def _channels(options: argparse.Namespace, rate_columns: Sequence[str]) -> list[spec.Channel]:
+    """Return the sensors of a log: those of `--sensor`, else one gyro, which `--unit`, `--noise`
+    and `--limit` describe.
     """
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
@@ -338,7 +313,7 @@ def _channels_of_options(
                 "--sensor gyro=wx,wy,wz:deg/s:0.1"
             )
         return [spec.parse_channel(text) for text in options.sensor]
-    noise = None if options.noise is None else spec.broadcast_noise(options.noise, "--noise")
+    noise = None if options.noise is None else spec.noise_of_axes(options.noise, "--noise")
     if options.limit is not None and not options.limit > 0:
         raise LogError(f"--limit: wanted a positive number, got {options.limit}")
     return [spec.Channel("gyro", tuple(rate_columns), options.unit, noise, options.limit)]
@@ -347,10 +322,8 @@ def _channels_of_options(
 def _read_logs(
     options: argparse.Namespace,
 ) -> tuple[list[spec.Channel], list[rj.identify.Recording], rj.identify.Model]:
-    """Read the logs that the `options` of the command line name, and return three things.
-
-    They are the sensors of the first log; the recordings of all logs (times, readings and sensors);
-    and the model (body, torque and free numbers) that the options describe.
+    """Return the sensors of the first log, the recordings of all logs, and the model that the
+    options describe; raise `LogError` as `read_log`.
     """
     if options.columns and options.time:
         raise LogError("--time: not together with --columns, whose first name is the time column")
@@ -363,14 +336,19 @@ def _read_logs(
     how: dict[str, Any] = dict(window=options.window, wheels=wheels, free=options.free)
     records, of_first = [], None
     for path in options.logs:
-        time, *rates = options.columns or imu_columns_of(path).columns
+        time, *rates = options.columns or imu_columns(path).columns
         time = options.time or time
         time_unit = spec.unit_of_time(path, time, options.time_unit)
         channels = [
             dataclasses.replace(one, unit=spec.unit_of_channel(path, one))
-            for one in _channels_of_options(options, rates)
+            for one in _channels(options, rates)
         ]
-        _print_units_from_column_names(path, time, time_unit, channels)
+        named = [("time", [time], time_unit), *((c.kind, c.columns, c.unit) for c in channels)]
+        words = [
+            f"{what} in {unit}" for what, names, unit in named if unit_in_name(names[0], [unit])
+        ]
+        if words:
+            _print_line(f"{path}: {', '.join(words)}, as the names of its columns say")
         how |= dict(time=time, time_unit=time_unit, flight=options.flight)
         records.append(spec.read_log(path, channels, **how))
         of_first = of_first or channels
@@ -378,32 +356,9 @@ def _read_logs(
     return of_first or [], records, spec.model_of(records, options.model, **how)
 
 
-def _print_units_from_column_names(
-    path: str, time_column: str, time_unit: str, channels: Sequence[spec.Channel]
-) -> None:
-    """Print which units were read from the names of the columns of a log, if any were.
-
-    - `path`: the path of the log.
-    - `time_column`: the name of the time column.
-    - `time_unit`: the unit of the times.
-    - `channels`: the sensors of the log, with their columns and units.
-    """
-    units = [(one.kind, one.columns, one.unit) for one in channels]
-    words = [
-        f"{what} in {unit}"
-        for what, names, unit in [("time", (time_column,), time_unit), *units]
-        if unit_in_column_name(names[0], [unit or ""])
-    ]
-    if words:
-        _print_line(f"{path}: {', '.join(words)}, as the names of its columns say")
-
-
 @contextlib.contextmanager
-def _print_or_raise_log_warnings(strict: bool) -> Iterator[None]:
-    """Print each warning about a log (`LogWarning`) that arises within a `with` block, in one line.
-
-    If `strict` is true, the first such warning is raised as an error and not printed.
-    """
+def _log_warnings(strict: bool) -> Iterator[None]:
+    """Print each `LogWarning` of a `with` block in one line, or raise the first if `strict`."""
     with warnings.catch_warnings():
         warnings.simplefilter("error" if strict else "always", LogWarning)
         usual = warnings.showwarning
@@ -421,11 +376,11 @@ def _print_or_raise_log_warnings(strict: bool) -> Iterator[None]:
 
 
 def _run_logs(options: argparse.Namespace) -> int:
-    """Fit the model that the `options` of the command line describe to the logs that they name,
-    print and write the report, and return the exit code.
+    """Fit the model to the logs that the options name, print and write the report, and return the
+    exit code.
     """
     try:
-        with _print_or_raise_log_warnings(options.strict):
+        with _log_warnings(options.strict):
             channels, records, model = _read_logs(options)
     except ValueError as error:
         return _print_error(error)
@@ -437,7 +392,7 @@ def _run_logs(options: argparse.Namespace) -> int:
         count, span = record.t.shape[0] + record.dropped, record.t[-1] - record.t[0]
         _print_line(f"{path}: {count} samples over {span:.4g} s{words}")
     print()
-    fit = _fit_or_print_error(model, options, 8)
+    fit = _fit(model, options, 8)
     if fit is None:
         return 2
     of_gyros = (c.unit for c in channels if c.kind == "gyro" and c.unit != "rpm")
@@ -445,7 +400,7 @@ def _run_logs(options: argparse.Namespace) -> int:
     print()
     print(rj.identify.report.table(rj.identify.report.rows(fit, rate_unit)))
     for sensor, rms in zip(model.records.sensors, fit.rms, strict=True):
-        scale, unit = _show.scale_and_unit_to_show(sensor.unit, rate_unit)
+        scale, unit = _show.shown_unit(sensor.unit, rate_unit)
         print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
     print()
     print(rj.identify.report.verdict(fit))
@@ -454,14 +409,11 @@ def _run_logs(options: argparse.Namespace) -> int:
     return _write_outputs(fit, options, title, names, names, {"rate_unit": rate_unit})
 
 
-def _fit_or_print_error(
+def _fit(
     model: rj.identify.Model, options: argparse.Namespace, starts: int
 ) -> rj.identify.Fit | None:
-    """Return the fit of the `model`, or `None` after an error whose message is printed.
-
-    - `options`: the options of the command line, which may name the number of starts and a
-      checkpoint file.
-    - `starts`: the number of starting points if the options do not name it.
+    """Return the fit, or `None` after an error whose message is printed; `starts` is used if the
+    options name none.
     """
     try:
         return rj.identify.fit(
@@ -484,40 +436,29 @@ def _write_outputs(
     units: dict[str, str],
     more_rows: Sequence[tuple[str, float, float, float, str]] = (),
 ) -> int:
-    """Write those outputs of a fit (figure, report, numbers) that the options ask for, and return
-    the exit code.
+    """Write the figure, report and numbers that the options ask for, and return the exit code: 0
+    after a good fit, 1 after another, 2 after a failed output, 130 after Ctrl-C.
 
-    If an output fails, a message is printed, and all other outputs are still written. The exit code
-    is 0 after a good fit, 1 after a fit that is not good, 2 after a failed output, and 130 after
-    Ctrl-C.
-
-    - `fit`: the result of the fit.
-    - `options`: the options of the command line.
-    - `title`: the title of the report.
-    - `files_read`: the names of the files that were read, for the report.
-    - `names`: the names of the recordings that were fitted, for the titles of the figures.
-    - `units`: the unit of rates under the key `rate_unit`, and the unit of times under the key
-      `time_unit`, which is missing if the unit is s.
-    - `more_rows`: rows of further quantities for report and numbers: name, value, low and high end
-      of the interval, and unit.
+    If an output fails, a message is printed, and all others are still written. Files read stand in
+    the report, and the recordings' names above figures. The dict `units` has `rate_unit` and, if it
+    is not s, `time_unit`; the further rows have the name, value, low and high end of the interval,
+    and unit of a quantity.
     """
     report, figure = rj.identify.report, options.figure
-    if options.demo and figure is None and _prepare_matplotlib_if_installed():
+    if options.demo and figure is None and _has_matplotlib():
         figure = Path("toutatis.png")
 
     def write_page() -> None:
-        figures = (
-            _draw_report_figures_skipping_failed(fit, names, units)
-            if figure is not None or _prepare_matplotlib_if_installed()
-            else []
+        drawn = figure is not None or _has_matplotlib()
+        report.write_html(
+            fit,
+            options.report,
+            title=title,
+            figures=_figures(fit, names, units) if drawn else [],
+            files=files_read,
+            more=more_rows,
+            rate_unit=units["rate_unit"],
         )
-        page: dict[str, Any] = {
-            "title": title,
-            "figures": figures,
-            "files": files_read,
-            "more": more_rows,
-        }
-        report.write_html(fit, options.report, rate_unit=units["rate_unit"], **page)
 
     def write_picture() -> None:
         rj.plot.fit(fit, index=0, title=names[0], **units).savefig(figure, dpi=130)
@@ -527,7 +468,7 @@ def _write_outputs(
         ("figure", figure, write_picture), ("numbers", options.json, numbers),
         ("report", options.report, write_page),
     )  # fmt: skip
-    all_written = True
+    code = 0 if fit.ok else 1
     for what, path, make in wanted:
         try:
             if path is not None:
@@ -536,23 +477,16 @@ def _write_outputs(
         except Exception as error:
             # Any error of one output, such as a full disk, is printed and not raised, so that the
             # other outputs of the fit are still written: a fit of an hour must not be lost.
-            _print_error(f"no {what}: {path}: {type(error).__name__}: {error}")
-            all_written = False
+            code = _print_error(f"no {what}: {path}: {type(error).__name__}: {error}")
     if "interrupted" in fit.status:
         _print_error("interrupted (Ctrl-C): not all starts were made, see the status")
         return 130
-    return 2 if not all_written else 0 if fit.ok else 1
+    return code
 
 
-def _draw_report_figures_skipping_failed(
-    fit: rj.identify.Fit, names: list[str], units: dict[str, str]
-) -> list[Any]:
-    """Return the figures of a report, without the figures whose drawing raises an error.
-
-    - `fit`: the result of the fit.
-    - `names`: the names of the recordings; only the first twelve recordings have a figure each.
-    - `units`: the unit of rates under the key `rate_unit`, and the unit of times under the key
-      `time_unit`, which is missing if the unit is s.
+def _figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str]) -> list[Any]:
+    """Return the figures of a report, of the first twelve recordings; one whose drawing fails is
+    left out with a message.
     """
     figures, plot = [], functools.partial(rj.plot.fit, fit, **units)
     logs = [functools.partial(plot, index=i, title=name) for i, name in enumerate(names[:12])]
@@ -567,9 +501,9 @@ def _draw_report_figures_skipping_failed(
     return figures
 
 
-def _prepare_matplotlib_if_installed() -> bool:
-    """Return whether matplotlib is installed; if it is, set it to draw without windows, else print
-    a line that says that it is missing.
+def _has_matplotlib() -> bool:
+    """Return whether matplotlib is installed, and let it draw without windows; print a line if it
+    is missing.
     """
     try:
         import matplotlib
@@ -581,7 +515,7 @@ def _prepare_matplotlib_if_installed() -> bool:
 
 
 def _print_line(line: str) -> None:
-    """Print the text `line`, with its control characters escaped."""
+    """Print a line with its control characters escaped."""
     try:
         print(_checks.escape_controls(line), flush=True)
     except OSError:
@@ -591,6 +525,6 @@ def _print_line(line: str) -> None:
 
 
 def _print_error(message: object) -> int:
-    """Print the error `message` in one line, and return the exit code 2."""
+    """Print an error in one line, and return the exit code 2."""
     print(f"error: {_checks.escape_controls(message)}", file=sys.stderr)
     return 2

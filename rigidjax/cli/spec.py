@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from rigidjax.cli.logs.errors import LogError, warn
-from rigidjax.cli.logs.layouts import known_unit_of_column
+from rigidjax.cli.logs.layouts import known_unit
 from rigidjax.cli.logs.table import read_table
-from rigidjax.cli.logs.times import mask_of_increasing, rows_to_use, warn_of_gap_or_wrong_unit
-from rigidjax.cli.logs.units import TIME_UNITS, UNITS, unit_of_columns
+from rigidjax.cli.logs.times import increasing, increasing_rows, warn_of_steps
+from rigidjax.cli.logs.units import TIME_UNITS, UNITS, common_unit
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.data.reference_states import require_turning
 from rigidjax.identify.model import charts
@@ -28,8 +28,8 @@ from rigidjax.motion.torques import Damping, Flywheel, Input, Series, Sum, Wheel
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation import euler
 
-# Each word of the option `--model` names a function that returns a chart of the body (a map from
-# free numbers to a possible body), given the typical size of a moment of inertia, kg m².
+# Each word of the option `--model` names a function that returns a chart of the body, given the
+# typical size of a moment of inertia, kg m².
 MODELS: dict[str, Callable[[float], charts.AbstractBodyChart]] = {
     "ratios": lambda _: charts.Ratios(),
     "principal-ratios": lambda _: charts.PrincipalRatios(),
@@ -52,17 +52,8 @@ _WHEEL_UNITS = ("rad/s", "rpm")
 
 
 class Channel(eqx.Module):
-    """Hold the description of one sensor of a log.
-
-    **Fields:**
-
-    - `kind`: the kind of the sensor.
-    - `columns`: the names of its columns in the log.
-    - `unit`: the unit of the readings; `None` means the unit in the names of the columns or, if
-      they contain no unit, the usual unit of such a log.
-    - `noise`: the standard deviation of the readings of each axis, in the unit of the readings;
-      `None` if it is not known.
-    - `limit`: the full scale of the sensor, in the unit of the readings; `None` if it is not known.
+    """Hold the description of one sensor of a log; noise and limit (full scale) are in the unit of
+    the readings, and `None` if not known.
     """
 
     kind: str
@@ -73,31 +64,28 @@ class Channel(eqx.Module):
 
 
 class WheelColumn(eqx.Module):
-    """Hold the description of a wheel whose speed was logged.
-
-    **Fields:** `column` the name of the column of the speed; `unit` the unit of the speed, or
-    `None` for the unit in the name of the column or, if it contains no unit, rad/s; `inertia` the
-    moment of inertia about the axis of the wheel, kg m²; `axis` (3,) a unit vector along this axis,
-    body frame.
-    """
+    """Hold the description of a wheel whose speed was logged."""
 
     column: str
     unit: str | None
+    # About the axis of the wheel, kg m².
     inertia: float
+    # A unit vector, body frame.
     axis: tuple[float, float, float]
 
 
 def parse_channel(text: str) -> Channel:
-    """Return the sensor that is written as `KIND=COLUMNS[:UNIT[:NOISE]]`.
+    """Return the sensor that is written as `KIND=COLUMNS[:UNIT[:NOISE]]`, such as
+    `gyro=wx,wy,wz:deg/s:0.1`.
 
-    An example is `gyro=wx,wy,wz:deg/s:0.1`. KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y,
-    z) or `euler-ZXZ` (any sequence; body → world); NOISE is one number or three, one for each axis,
-    as in `0.1,0.1,0.2`. **Raises** `LogError`, a readable error, for any other text.
+    KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y, z) or `euler-ZXZ` (any sequence; body →
+    world); NOISE is one number, or one for each axis, as in `0.1,0.1,0.2`. **Raises** `LogError`
+    for any other text.
     """
     kind, _, rest = text.partition("=")
     names, *more = rest.split(":")
     columns = tuple(name.strip() for name in names.split(","))
-    allowed = _units_of_kind(kind)
+    allowed = _units(kind)
     if not allowed:
         raise LogError(
             f"sensor {text!r}: wanted gyro, accelerometer, quaternion or euler-SEQUENCE, as in "
@@ -115,22 +103,20 @@ def parse_channel(text: str) -> Channel:
         noise = tuple(float(part) for part in more[1].split(","))
     except ValueError:
         raise LogError(f"sensor {text!r}: wanted a number for the noise, got {more[1]!r}") from None
-    return Channel(kind, columns, unit, broadcast_noise(noise, f"sensor {text!r}"))
+    return Channel(kind, columns, unit, noise_of_axes(noise, f"sensor {text!r}"))
 
 
-def _units_of_kind(kind: str) -> tuple[str, ...]:
-    """Return the allowed units of a kind of sensor, such as `gyro` or `euler-ZXZ`, the default unit
-    first; return an empty tuple for an unknown kind.
+def _units(kind: str) -> tuple[str, ...]:
+    """Return the allowed units of a kind of sensor, the default unit first; none for an unknown
+    kind.
     """
     key = "euler" if kind.startswith("euler-") else kind
     return () if kind == "euler" else SENSOR_UNITS.get(key, ())
 
 
-def broadcast_noise(noise: Sequence[float], message_start: str) -> tuple[float, ...]:
-    """Return the noise of three axes, from one positive number for all axes, or three.
-
-    **Raises** `LogError` for another count of numbers, or a number that is not positive; the
-    message begins with the text `message_start`.
+def noise_of_axes(noise: Sequence[float], message_start: str) -> tuple[float, ...]:
+    """Return the noise of three axes from one positive number or three; raise `LogError` for
+    others.
     """
     if len(noise) not in (1, 3):
         raise LogError(f"{message_start}: wanted one noise or three, got {len(noise)}")
@@ -140,11 +126,11 @@ def broadcast_noise(noise: Sequence[float], message_start: str) -> tuple[float, 
 
 
 def parse_wheel(text: str) -> WheelColumn:
-    """Return the wheel that is written as `COLUMN:INERTIA[:AXIS[:UNIT]]`.
+    """Return the wheel that is written as `COLUMN:INERTIA[:AXIS[:UNIT]]`, such as
+    `flywheel:5.2e-7:z:rad/s`.
 
-    An example is `flywheel:5.2e-7:z:rad/s`. INERTIA is the moment of inertia about the wheel's
-    axis, kg m²; AXIS is the body axis `x`, `y` or `z` along which this axis lies. **Raises**
-    `LogError` for any other text.
+    INERTIA is about the wheel's axis, kg m²; AXIS is the body axis `x`, `y` or `z` along it.
+    **Raises** `LogError` for any other text.
     """
     name, *more = text.split(":")
     axis = more[1] if len(more) > 1 else "z"
@@ -170,25 +156,13 @@ def read_log(
     free: Sequence[str] = (),
     flight: int | None = None,
 ) -> Recording:
-    """Return the recording in a file, with the sensors that `channels` describe.
+    """Return the recording in a log, with the sensors that `channels` describe; its times count
+    from the first time stamp of the log.
 
-    The times of the recording count from the first time stamp of the log. A sensor has no reading
-    in a row in which one of its cells is empty.
-
-    **Arguments:**
-
-    - `path`: the path of the file.
-    - `channels`: the sensors.
-    - `time`: the name of the time column.
-    - `time_unit`: the unit of the time column; `None` means the unit in the name of the column or,
-      if it contains no unit, the usual unit of such a log (s for text).
-    - `window`: (from, to), s from the first time stamp, or `None` for all rows.
-    - `wheels`: the wheels; their speeds become inputs of the recording, with the name `wheel`, or
-      `wheel 1`, `wheel 2`, … if there are several.
-    - `free`: some of the words `bias`, `drag`, `delay`. If it contains `bias`, the sensors get a
-      bias, which a fit can estimate; the other words have no effect here.
-    - `flight`: the number of the flight in a Blackbox log, from 1; `None` if the log has only one
-      flight.
+    A sensor has no reading in a row in which one of its cells is empty. The window (from, to) is in
+    s from the first time stamp. The speeds of the wheels become inputs, `wheel`, or `wheel 1`,
+    `wheel 2`, … Of the words in `free`, `bias` gives each sensor a bias; the others have no effect
+    here.
 
     It **warns** as `read_table` does, of rows that are left out because their times do not
     increase, of a long gap, of times that are plainly in another unit or no times, of rates that no
@@ -203,8 +177,9 @@ def read_log(
     table = read_table(path, names, flight=flight)
     # The times are counted from the first time stamp: times since 1970, in seconds or nanoseconds,
     # are so large that float64 has few digits left for the steps between them.
-    t = (table[time] - _first_finite_time(table[time])) * UNITS[unit]
-    kept = rows_to_use(path, t, time, window)
+    finite = np.flatnonzero(np.isfinite(table[time]))
+    t = (table[time] - (table[time][finite[0]] if finite.size else 0.0)) * UNITS[unit]
+    kept = increasing_rows(path, t, time, window)
     # A slice is used if all rows are kept, since indexing with a slice makes no copy of a large
     # log.
     kept = slice(None) if kept.size == t.size else kept
@@ -215,11 +190,11 @@ def read_log(
         values *= factor
         mask = np.isfinite(values).all(axis=1)
         if one.kind == "gyro":
-            rate = _median_body_rate(path, one, factor, values[kept][mask[kept]])
-        sensor, values = _sensor_and_readings(one, values, factor, "bias" in free)
+            rate = _median_rate(path, one, factor, values[kept][mask[kept]])
+        sensor, values = _sensor(one, values, factor, "bias" in free)
         readings.append((sensor, values[kept], mask[kept]))
-    warn_of_gap_or_wrong_unit(path, t[kept], unit, rate)
-    inputs = _wheel_speed_series(path, t, table, wheels)
+    warn_of_steps(path, t[kept], unit, rate)
+    inputs = _wheel_speeds(path, t, table, wheels)
     # The memory of a large log is freed before the recording copies its columns.
     del table
     try:
@@ -228,48 +203,26 @@ def read_log(
         raise LogError(f"{path}: {error}") from None
 
 
-def _first_finite_time(t: np.ndarray) -> float:
-    """Return the first of the times `t` (n,) that is a finite number, not missing (NaN); return
-    zero if there is none.
-    """
-    finite = np.isfinite(t)
-    return float(t[np.argmax(finite)]) if finite.any() else 0.0
-
-
 def unit_of_channel(path: str | Path, channel: Channel) -> str:
-    """Return the unit of the readings of a sensor: the unit that `channel` states, else the unit in
-    the names of its columns, else the usual unit of such columns in such a log.
-
-    - `path`: the path of the log; its ending tells the format of the log.
-    - `channel`: the sensor: its kind, columns and stated unit.
+    """Return the stated unit of a sensor, else that in the names of its columns, else the usual one
+    of such a log; raise `LogError` as `common_unit`.
     """
-    allowed = _units_of_kind(channel.kind)
-    usual = known_unit_of_column(path, channel.columns[0]) or allowed[0]
-    return unit_of_columns(channel.columns, channel.unit, usual, allowed, str(path))
+    allowed = _units(channel.kind)
+    usual = known_unit(path, channel.columns[0]) or allowed[0]
+    return common_unit(channel.columns, channel.unit, usual, allowed, str(path))
 
 
 def unit_of_time(path: str | Path, column: str, stated_unit: str | None) -> str:
-    """Return the unit of the times in a log: the unit that the user states, else the unit in the
-    name of the time column, else the usual unit of the times in such a log.
-
-    - `path`: the path of the log; its ending tells the format of the log.
-    - `column`: the name of the time column.
-    - `stated_unit`: the unit that the user states, or `None`.
+    """Return the stated unit of the times, else that in the name of their column, else the usual
+    one of such a log; raise `LogError` as `common_unit`.
     """
-    usual = known_unit_of_column(path, column) or "s"
-    return unit_of_columns([column], stated_unit, usual, TIME_UNITS, str(path))
+    usual = known_unit(path, column) or "s"
+    return common_unit([column], stated_unit, usual, TIME_UNITS, str(path))
 
 
-def _median_body_rate(
-    path: str | Path, channel: Channel, factor: float, rates: np.ndarray
-) -> float:
-    """Return the median magnitude of the body rates, rad/s, or zero after a warning that no gyro
-    reads such rates. Raise `LogError` if there are no rates, or if all rates are zero.
-
-    - `path`: the path of the log, for the message.
-    - `channel`: the gyro, with the names of its columns, for the message.
-    - `factor`: the factor from the unit of the gyro to rad/s.
-    - `rates`: (n, 3) the rates, rad/s.
+def _median_rate(path: str | Path, channel: Channel, factor: float, rates: np.ndarray) -> float:
+    """Return the median magnitude of the rates, rad/s, or zero after a warning that no gyro reads
+    such rates; raise `LogError` if there are none, or if all are zero.
     """
     names = ", ".join(channel.columns)
     if not rates.size:
@@ -290,16 +243,11 @@ def _median_body_rate(
     return 0.0
 
 
-def _sensor_and_readings(
+def _sensor(
     channel: Channel, values: np.ndarray, factor: float, has_bias: bool
 ) -> tuple[AbstractSensor, np.ndarray]:
-    """Return two things: the sensor that a `Channel` of a log describes; and its readings at T
-    times, (T, 3), or quaternions (T, 4) if it is a sensor of attitudes.
-
-    - `channel`: the kind, the columns, the noise and the limit of the sensor.
-    - `values`: (T, 3) the values of its columns, in SI units, or (T, 4) for quaternions.
-    - `factor`: the factor from the unit of the channel to SI.
-    - `has_bias`: whether the sensor gets a bias, initially zero, which a fit can estimate.
+    """Return the sensor that a channel describes, and its readings: the SI values of its columns,
+    or quaternions.
     """
     zero = [0.0, 0.0, 0.0] if has_bias else None
     noise = None if channel.noise is None else factor * np.array(channel.noise)
@@ -319,23 +267,17 @@ def _sensor_and_readings(
         raise LogError(f"sensor {channel.kind}: {error}") from None
 
 
-def names_of_wheel_speeds(wheels: Sequence[WheelColumn]) -> list[str]:
-    """Return the names of the inputs of a recording, which are signals that torques read by name,
-    that hold the speeds of the wheels: `wheel` for one wheel, `wheel 1`, `wheel 2`, … for several.
-    """
+def wheel_names(wheels: Sequence[WheelColumn]) -> list[str]:
+    """Return the names of the inputs with the wheels' speeds."""
     return [f"wheel {i + 1}" if len(wheels) > 1 else "wheel" for i in range(len(wheels))]
 
 
-def _fill_missing_rows(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fill the gaps of a series whose times are evenly spaced but for missing rows: return two
-    arrays, the times without gaps, and the values, of which the missing ones are interpolated.
+def _fill_gaps(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and values in which the gaps of an evenly spaced series are filled by
+    interpolation.
 
-    Both arrays are returned unchanged if a time differs from an even spacing by more than a
-    thousandth of a step, if there are fewer than two times, or if the filled series would be more
-    than about ten times as long as the series.
-
-    - `t`: (T,) increasing times, s.
-    - `values`: (T,) the values at these times.
+    A series is returned unchanged if a time differs from an even spacing by more than a thousandth
+    of a step, or if it would become more than about ten times as long.
     """
     step = np.median(np.diff(t)) if t.size > 1 else np.nan
     place = (t - t[:1]) / step
@@ -351,49 +293,24 @@ def _fill_missing_rows(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, n
     return t[0] + step * places, np.interp(places, np.round(place), values)
 
 
-def _wheel_speed_series(
+def _wheel_speeds(
     path: str | Path, t: np.ndarray, table: dict[str, np.ndarray], wheels: Sequence[WheelColumn]
 ) -> dict[str, Series]:
-    """Return the logged speed of each wheel, rad/s, as a function of time (a `Series`), in a dict.
-
-    The keys are the names under which the torques of the wheels read their speeds: `wheel`, or
-    `wheel 1`, `wheel 2`, … if there are several wheels.
-
-    - `path`: the path of the log, for messages.
-    - `t`: (T,) the times, s.
-    - `table`: the columns of the log, by name.
-    - `wheels`: the wheels, with the column and the unit of their speeds.
+    """Return the logged speed of each wheel, rad/s, as a function of time, s, by the names of the
+    inputs; raise `LogError` for one that is none.
     """
     speeds = {}
     # The speeds of the wheels are kept also at times outside of the window, since a delayed speed
     # is from a time before that of the reading.
-    kept = mask_of_increasing(t) if wheels else slice(None)
-    for name, one in zip(names_of_wheel_speeds(wheels), wheels, strict=True):
-        unit = unit_of_columns([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
+    kept = increasing(t) if wheels else slice(None)
+    for name, one in zip(wheel_names(wheels), wheels, strict=True):
+        unit = common_unit([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
         try:
             samples = table[one.column][kept] * UNITS[unit]
-            speeds[name] = Series(*_fill_missing_rows(t[kept], samples))
+            speeds[name] = Series(*_fill_gaps(t[kept], samples))
         except ValueError as error:
             raise LogError(f"{path}: column {one.column!r}: {error}") from None
     return speeds
-
-
-def _torque_of_options(wheels: Sequence[WheelColumn], free: Sequence[str]) -> Torque | None:
-    """Return the torque on the body: the torque of the wheels and, if `free` contains "drag", a
-    linear drag, whose coefficients are initially zero. Without wheels and drag return `None`.
-
-    - `wheels`: the wheels whose speeds were logged.
-    - `free`: some of `bias`, `drag`, `delay`, the numbers that a fit may move; for `delay` each
-      wheel gets a delay, initially zero; `bias` has no effect here.
-    """
-    delay = 0.0 if "delay" in free else None
-    parts: list[Torque] = [
-        Flywheel(Wheel(one.inertia, one.axis, Input(name), delay=delay))
-        for name, one in zip(names_of_wheel_speeds(wheels), wheels, strict=True)
-    ]
-    if "drag" in free:
-        parts.append(Damping([0.0, 0.0, 0.0]))
-    return Sum(*parts) if parts else None
 
 
 def model_of(
@@ -405,53 +322,43 @@ def model_of(
     free: Sequence[str] = (),
     loss: str = "soft-l1",
 ) -> Model:
-    """Return the model of recordings that were read by `read_log`.
+    """Return the model of recordings that were read by `read_log`: all share one drag, and each has
+    its own bias and delay.
 
-    All recordings share one drag; each has its own bias and delay.
-
-    **Arguments:**
-
-    - `recordings`: the recordings of one body.
-    - `body_chart`: a key of `MODELS`, which is the word of the option `--model`. It names the chart
-      of the body, a map from free numbers to a possible body.
-    - `typical_moment`: the typical size of a moment of inertia, kg m².
-    - `wheels`: the wheels whose speeds were logged.
-    - `free`: some of the words `bias`, `drag`, `delay`, for the numbers that a fit may move.
-    - `loss`: a key of `LOSSES`, which is the word of the option `--loss`.
-
-    **Raises** `LogError` for another word as `body_chart` or `loss`.
+    The word `body_chart` is a key of `MODELS`, `loss` one of `LOSSES`; the typical moment of
+    inertia is in kg m². **Raises** `LogError` for another word.
     """
     if body_chart not in MODELS:
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {body_chart!r}")
     if loss not in LOSSES:
         raise LogError(f"loss: wanted one of {', '.join(LOSSES)}, got {loss!r}")
-    moving = _free_numbers_of_options(
-        recordings[0].sensors, names_of_wheel_speeds(wheels), typical_moment, free
-    )
+    names = wheel_names(wheels)
+    delay = 0.0 if "delay" in free else None
+    parts: list[Torque] = [
+        Flywheel(Wheel(one.inertia, one.axis, Input(name), delay=delay))
+        for name, one in zip(names, wheels, strict=True)
+    ]
+    if "drag" in free:
+        parts.append(Damping([0.0, 0.0, 0.0]))
     return Model(
         list(recordings),
         MODELS[body_chart](typical_moment),
-        torque=_torque_of_options(wheels, free),
-        free=moving,
+        torque=Sum(*parts) if parts else None,
+        free=_parameters(recordings[0].sensors, names, typical_moment, free),
         loss=LOSSES[loss],
     )
 
 
-def _free_numbers_of_options(
+def _parameters(
     sensors: Sequence[AbstractSensor],
     wheels: Sequence[str],
     typical_moment: float,
     free: Sequence[str],
 ) -> list[Free]:
-    """Return the numbers that a fit may move in addition to the body and its motion, as a list of
-    `Free`: biases of sensors, places of accelerometers, the drag, and the delays of wheels.
+    """Return the parameters beside the body and its motion: biases, places of accelerometers, the
+    drag, and the delays of wheels.
 
-    - `sensors`: the sensors of one recording; a bias is free if the sensor has one.
-    - `wheels`: the names of the wheels, for the names of their delays.
-    - `typical_moment`: the typical size of a moment of inertia, kg m², from which the scale of the
-      drag follows.
-    - `free`: some of the words `bias`, `drag`, `delay`. The drag and the delays are free if this
-      list contains their words; for biases the sensors decide, as said above.
+    A bias is free if the sensor has one; the drag and the delays are free by their words in `free`.
     """
 
     def of_sensor(index: int, name: str) -> Callable[[Scene], Any]:

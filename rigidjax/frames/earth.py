@@ -102,7 +102,7 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
     >>> earth(0.5).acceleration(0.0, Point([0.0, 0, 0], [0.0, 0, 0])).tolist()
     [0.0, 0.0, -9.80665]
     """
-    lat, g, w = _checks.scalar_arrays_of_one_dtype(latitude=latitude, gravity=gravity, rate=rate)
+    lat, g, w = _checks.scalars(latitude=latitude, gravity=gravity, rate=rate)
     words = "latitude: wanted radians between −π/2 and π/2; were these degrees?"
     lat = _checks.error_if(lat, ~(jnp.abs(lat) <= 0.5000001 * jnp.pi), words)
     g = _checks.require_positive(g, "gravity", "a positive number, m/s²; it points down")
@@ -166,7 +166,7 @@ class Foucault(AbstractScene):
         [4.0, 0.0, 3.0]
         """
         named = dict(east=east, north=north, east_speed=east_speed, north_speed=north_speed)
-        length, e, n, ve, vn = _checks.scalar_arrays_of_one_dtype(length=self.length, **named)
+        length, e, n, ve, vn = _checks.scalars(length=self.length, **named)
         below = length**2 - e * e - n * n
         words = "foucault: wanted a start below the pivot, got one beyond the length of the string"
         below = _checks.error_if(below, ~(below > 0), words)

@@ -101,7 +101,7 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
     >>> hoop(1.0, 5.0).acceleration(0.0, Point([0.0, 0, -1], [0.0, 0, 0])).tolist()
     [0.0, 0.0, 0.0]
     """
-    r, w, g = _checks.scalar_arrays_of_one_dtype(radius=radius, rate=rate, gravity=gravity)
+    r, w, g = _checks.scalars(radius=radius, rate=rate, gravity=gravity)
     r = _checks.require_positive(r, "radius", "a positive number, m")
     return Hoop(r, _checks.require_finite(w, "rate"), _checks.require_finite(g, "gravity"))
 

@@ -38,7 +38,7 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
     out: list[Row] = []
     for quantity in fit.quantities:
         low, high = bounds[quantity.name]
-        scale, unit = _show.scale_and_unit_to_show(quantity.unit, rate_unit)
+        scale, unit = _show.shown_unit(quantity.unit, rate_unit)
         name = quantity.name
         if name.startswith("Ω"):
             axis, *where = name.split(" ", 1)
@@ -287,7 +287,7 @@ def write_html(
     require_one_fit(fit)
     sizes = []
     for name, axes, unit in _component_rms(fit):
-        scale, shown = _show.scale_and_unit_to_show(unit, rate_unit)
+        scale, shown = _show.shown_unit(unit, rate_unit)
         sizes.append((name, " ".join(f"{scale * x:.3g}" for x in axes), shown))
     starts = _html_rows(
         (

@@ -1,6 +1,6 @@
 """Compute the conserved quantities of a body under torques, and their drift in a simulation."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,14 +39,14 @@ def energy(
     >>> energy(rj.Inertia.from_principal(1.0, 1.0, 1.0), start, top)
     Array(10.31, dtype=float64)
     """
-    motion, parts, t = _checked_motion_torques_and_time(body, state, torque, t)
+    motion, parts, t = _checked(body, state, torque, t)
     for part in parts:
         if not hasattr(part, "energy"):
             words = f"energy: wanted torques with a potential, got {type(part).__name__}, which has"
             raise TypeError(
                 f"{words} no method energy(t, state, body); or take kinetic_energy alone"
             )
-    return _total_energy(in_precision(body, motion.omega.dtype), motion, parts, t)
+    return _energy(in_precision(body, motion.omega.dtype), motion, parts, t)
 
 
 def conserved(
@@ -84,14 +84,14 @@ def conserved(
     >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))
     ['energy', 'momentum_squared']
     """
-    motion, parts, t = _checked_motion_torques_and_time(body, state, torque, t)
+    motion, parts, t = _checked(body, state, torque, t)
     dtype = motion.omega.dtype
     body = in_precision(body, dtype)
     quantities: dict[str, Float[Array, "..."]] = {}
     if all(hasattr(part, "energy") and getattr(part, "steady", False) for part in parts):
-        quantities["energy"] = _total_energy(body, motion, parts, t)
+        quantities["energy"] = _energy(body, motion, parts, t)
     external = [part for part in parts if not hasattr(part, "internal_momentum")]
-    momentum = _total_angular_momentum(body, motion, parts, t)
+    momentum = _momentum(body, motion, parts, t)
     if not external:
         quantities["momentum_squared"] = dot(momentum, momentum)
     if isinstance(motion, HasAttitude):
@@ -106,14 +106,14 @@ def conserved(
                 length > 0, length, 1
             )
     if isinstance(motion, HasPose) and isinstance(body, MassProperties):
-        parts_and_laws = [
-            (part, part.law if isinstance(part, FrozenLaw) else part) for part in parts
-        ]
         # The linear momentum is conserved only if no part of the torque is a force. A part is known
         # to return a torque alone if it is an `AbstractTorque` that does not read the position
         # (`feels` is not `HasPose`); any other part may return a force as well.
-        is_torque_only = lambda law: isinstance(law, AbstractTorque) and law.feels is not HasPose  # noqa: E731
-        forces = [part for part, law in parts_and_laws if not is_torque_only(law)]
+        forces = []
+        for part in parts:
+            law = part.law if isinstance(part, FrozenLaw) else part
+            if not isinstance(law, AbstractTorque) or law.feels is HasPose:
+                forces.append(part)
         if not forces:
             quantities["linear_momentum"] = body.mass * motion.v
         if all(isinstance(part, CentralGravity) for part in [*external, *forces]):
@@ -157,14 +157,20 @@ def drift(
             raise ValueError(f"{words}, got shape {leaf.shape}")
     quantities = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
     kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(motion)
-    momenta = jax.vmap(lambda t, y: _angular_momentum_magnitude(body, y, torque, t))(ts, ys)
+
+    def momentum_length(t: ScalarLike, y: PyTree) -> Scalar:
+        motion, parts, t = _checked(body, y, torque, t)
+        own = in_precision(body, motion.omega.dtype)
+        return length_or_zero(_momentum(own, motion, parts, t))
+
+    momenta = jax.vmap(momentum_length)(ts, ys)
     drifts = {}
     for name, values in quantities.items():
-        distances = _magnitude_at_each_time(values - jax.lax.slice_in_dim(values, 0, 1))
+        distances = _lengths(values - jax.lax.slice_in_dim(values, 0, 1))
         if name == "energy":
             scale = kinetic
         elif name in ("linear_momentum", "momentum_about_origin"):
-            scale = _magnitude_at_each_time(values)
+            scale = _lengths(values)
         else:
             scale = momenta**2 if name == "momentum_squared" else momenta
         scale = jnp.max(scale)
@@ -172,40 +178,28 @@ def drift(
     return drifts
 
 
-def _checked_motion_torques_and_time(
-    body: Body, state: PyTree, torque: Torque | None, t: ScalarLike
-) -> tuple[HasSpin, tuple[Any, ...], Scalar]:
-    """Check a state, a torque and a time, and return the three things from which conserved
-    quantities are computed: the state of motion (a `Spin`, `Attitude` or `Rigid`); a tuple of the
-    single torques and forces; and the time, as a scalar array, s.
+class _Checked(NamedTuple):
+    """Hold a state of motion, the single torques and forces (no `Sum`), and the time, s."""
 
-    A `Sum` of torques is taken apart into its members. A torque with states of its own (such as the
-    speed of a reaction wheel) is returned with the values of these states inserted, so that it can
-    be called as a torque without states.
+    motion: HasSpin
+    parts: tuple[Any, ...]
+    t: Scalar
 
-    - `body`: an `Inertia` or `MassProperties`
-    - `state`: a state of motion, or a `Coupled`: a state of motion together with the states of the
-      torques
-    - `torque`: a torque, a force, a `Sum` of several, or `None`
-    - `t`: s, the time of the state
+
+def _checked(body: Body, state: PyTree, torque: Torque | None, t: ScalarLike) -> _Checked:
+    """Check a state, a torque and a time. Of a torque with states of its own the values of these
+    states, which a `Coupled` holds, are inserted.
     """
     if isinstance(state, Coupled):
         state, torque = state.motion, freeze_own_states(torque, state.own)
     parts = parts_of(torque)
     for part in parts or (None,):
         require_compatible(part, state, body)
-    return state, parts, _checks.array_of_shape(t, (), "t")
+    return _Checked(state, parts, _checks.array_of_shape(t, (), "t"))
 
 
-def _total_energy(body: Body, state: HasSpin, torques: tuple[Any, ...], t: Scalar) -> Scalar:
-    """Return the total energy of a body, J: its kinetic energy plus the potential energy of each
-    torque.
-
-    - `body`: an `Inertia` or `MassProperties`
-    - `state`: the state of motion, a `Spin`, `Attitude` or `Rigid`
-    - `torques`: the torques and forces, each with a method `energy(t, state, body)`
-    - `t`: s, the time
-    """
+def _energy(body: Body, state: HasSpin, torques: tuple[Any, ...], t: Scalar) -> Scalar:
+    """Return the kinetic energy of a body plus the potential energy of each torque, J."""
     dtype, total = state.omega.dtype, kinetic_energy(body, state)
     for torque in torques:
         value = in_precision(torque, dtype).energy(t.astype(dtype), state, body)
@@ -213,18 +207,8 @@ def _total_energy(body: Body, state: HasSpin, torques: tuple[Any, ...], t: Scala
     return total
 
 
-def _total_angular_momentum(
-    body: Body, state: HasSpin, torques: tuple[Any, ...], t: ScalarLike
-) -> Vec3:
-    """Return the angular momentum (3,), kg m²/s, body frame, of the body and of the wheels inside
-    it.
-
-    - `body`: an `Inertia` or `MassProperties`
-    - `state`: the state of motion, a `Spin`, `Attitude` or `Rigid`
-    - `torques`: the torques and forces. If one of them has a method `internal_momentum(t)`, as
-      wheels have, the momentum that this method returns is added.
-    - `t`: s, the time
-    """
+def _momentum(body: Body, state: HasSpin, torques: tuple[Any, ...], t: ScalarLike) -> Vec3:
+    """Return the angular momentum, kg m²/s, body frame, of the body and of the wheels inside it."""
     momentum = angular_momentum(body, state)
     for torque in torques:
         if hasattr(torque, "internal_momentum"):
@@ -232,28 +216,6 @@ def _total_angular_momentum(
     return momentum
 
 
-def _angular_momentum_magnitude(
-    body: Body, state: PyTree, torque: Torque | None, t: ScalarLike
-) -> Scalar:
-    """Return the magnitude of the angular momentum of the body and of the wheels inside it, kg
-    m²/s.
-
-    - `body`: an `Inertia` or `MassProperties`
-    - `state`: the state of motion, or a `Coupled`: a state of motion together with the states of
-      the torques
-    - `torque`: a torque, a force, a `Sum` of several, or `None`
-    - `t`: s, the time
-    """
-    state, parts, t = _checked_motion_torques_and_time(body, state, torque, t)
-    return length_or_zero(
-        _total_angular_momentum(in_precision(body, state.omega.dtype), state, parts, t)
-    )
-
-
-def _magnitude_at_each_time(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:
-    """Return the magnitude of a quantity at each of n times, (n,): the length of a vector, or the
-    absolute value of a number.
-
-    - `values`: (n, 3), a vector for each of n times; or (n,), a number for each time
-    """
+def _lengths(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:
+    """Return the length of the vector, or the absolute value of the number, at each time."""
     return jnp.abs(values) if values.ndim == 1 else jnp.sqrt(jnp.sum(values**2, axis=-1))

@@ -9,7 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, _show, _types
-from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, ScalarLike, Vec3, Vectors
+from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, ScalarLike, Vec3, Vectors
 from rigidjax.body.inertia import Inertia, MassProperties, apply, inverse
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques.base import Torque, evaluate_torque, force_and_torque, require_torque
@@ -94,13 +94,13 @@ class Rigid(eqx.Module):
 
 
 class EulerEquations(eqx.Module):
-    """Evaluate Euler's equations `I dΩ/dt = IΩ × Ω + τ` as a vector field `f(t, y, args)`.
+    """Evaluate Euler's equations `I dΩ/dt = IΩ × Ω + τ` as a vector field `f(t, y, args)`; I, kg
+    m², is about the point that the body turns about, and τ, N m, in the body frame.
 
-    Ω is the body rate, rad/s, body frame. **Arguments:** `inertia` I, kg m², about the point that
-    the body turns about; `torque` a torque, whose value is τ, N m, body frame, or `None`. Source:
-    Landau and Lifshitz, Mechanics, eq 36.4; the equations are in Lie–Poisson form, `dΠ/dt = Π ×
-    ∇H(Π) + τ` with the momentum `Π = IΩ` and the energy `H = ½ Π·I⁻¹Π`. **Raises:** `ValueError`
-    for the inertia of a rod or a point, which has no inverse, unless JAX traces the inertia.
+    Source: Landau and Lifshitz, Mechanics, eq 36.4; the equations are in Lie–Poisson form, `dΠ/dt =
+    Π × ∇H(Π) + τ` with the momentum `Π = IΩ` and the energy `H = ½ Π·I⁻¹Π`. **Raises:**
+    `ValueError` for the inertia of a rod or a point, which has no inverse, unless JAX traces the
+    inertia.
     """
 
     inertia: Inertia
@@ -123,24 +123,15 @@ class EulerEquations(eqx.Module):
         return Spin(self.angular_acceleration(t, y))
 
     def angular_acceleration(self, t: ScalarLike, state: HasSpin) -> Vec3:
-        """Return dΩ/dt (3,), rad/s², body frame: the derivative of the body rate under the torque
-        in the field `torque` of these equations.
-
-        - `t`: s, the time
-        - `state`: any state with a body rate Ω and with each other part that the torque reads, such
-          as the attitude
-        """
+        """Return dΩ/dt, rad/s², body frame, under the torque of these equations."""
         torque = None
         if self.torque is not None:
             torque = evaluate_torque(self.torque, t, state, self.inertia)
-        return self.angular_acceleration_under(torque, state)
+        return self.acceleration_under(torque, state)
 
-    def angular_acceleration_under(self, torque: Vec3 | None, state: HasSpin) -> Vec3:
-        """Return dΩ/dt = I⁻¹ (IΩ × Ω + τ), (3,), rad/s², body frame: the derivative of the body
-        rate under the torque τ, which the caller gives.
-
-        - `torque`: τ (3,), N m, body frame, or `None` for no torque
-        - `state`: any state with a body rate Ω
+    def acceleration_under(self, torque: Vec3 | None, state: HasSpin) -> Vec3:
+        """Return dΩ/dt = I⁻¹ (IΩ × Ω + τ), rad/s², body frame, under a given torque τ, N m, body
+        frame.
         """
         dtype = state.omega.dtype
         momentum = apply(self.inertia.tensor.astype(dtype), state.omega)
@@ -151,12 +142,11 @@ class EulerEquations(eqx.Module):
 
 
 class AttitudeEquations(eqx.Module):
-    """Evaluate the equations of motion of a body that turns, Euler's equations `I dΩ/dt = IΩ × Ω +
-    τ` and `dq/dt = ½ q ⊗ (0, Ω)` (notes, eq 50), as a vector field `f(t, y, args)`.
+    """Evaluate the equations of motion of a body that turns, Euler's equations and `dq/dt = ½ q ⊗
+    (0, Ω)` (notes, eq 50), as a vector field `f(t, y, args)` of an `Attitude`.
 
-    The state y is an `Attitude`: the quaternion q, body → world, and the body rate Ω, rad/s.
-    **Arguments:** `inertia` I, kg m², about the point that the body turns about; `torque` a torque,
-    whose value is τ, N m, body frame, or `None`.
+    The inertia, kg m², is about the point that the body turns about; the torque is in N m, body
+    frame.
     """
 
     euler: EulerEquations
@@ -170,13 +160,10 @@ class AttitudeEquations(eqx.Module):
 
 class NewtonEuler(eqx.Module):
     """Evaluate the Newton–Euler equations of a body about its centre of mass as a vector field
-    `f(t, y, args)` (notes, eqs 1, 50, 56, 84).
+    `f(t, y, args)` of a `Rigid` (notes, eqs 1, 50, 56, 84).
 
-    The equations are `dx/dt = v`, `m dv/dt = F`, `dq/dt = ½ q ⊗ (0, Ω)` and `I dΩ/dt = IΩ × Ω + τ`.
-    The state y is a `Rigid`: the position x and velocity v of the centre of mass, world frame; the
-    quaternion q, body → world; and the body rate Ω. **Arguments:** `body` the mass m and the
-    inertia I about the centre of mass; `torque` a model that returns the torque τ, N m, body frame,
-    or a `Wrench` of τ and the force F, N, world frame; `None` for a free body.
+    They are `dx/dt = v`, `m dv/dt = F`, `dq/dt = ½ q ⊗ (0, Ω)` and `I dΩ/dt = IΩ × Ω + τ`; the
+    torque model returns τ, N m, body frame, or a `Wrench` of τ and F, N, world frame.
     """
 
     euler: EulerEquations
@@ -197,17 +184,13 @@ class NewtonEuler(eqx.Module):
             acceleration = jnp.zeros_like(y.v)
         else:
             acceleration = force / self.body.mass.astype(y.v.dtype)
-        spin = self.euler.angular_acceleration_under(torque, y)
+        spin = self.euler.acceleration_under(torque, y)
         return Rigid(y.v, acceleration, quaternion.rate(y.q, y.omega), spin)
 
 
 def project_to_group(state: State) -> State:
-    """Return the state with its quaternion, if the state has one, scaled to length 1; the other
-    numbers of the state do not change. **Raises:** `ValueError` if the quaternion is zero, unless
-    JAX traces the quaternion.
-
-    - `state`: a `Spin`, `Attitude`, `Rigid` or any other tree of arrays, or a `Coupled`: a state of
-      motion together with the states of the torques
+    """Return the state with its quaternion, if it has one, scaled to length 1; raise `ValueError`
+    for a known quaternion that is zero.
     """
     if isinstance(state, Coupled):
         return eqx.tree_at(lambda s: s.motion, state, project_to_group(state.motion))
@@ -218,19 +201,12 @@ def project_to_group(state: State) -> State:
             _checks.error_if(
                 q, length**2 == 0, f"state.q: wanted a length near 1, got {length:.3g}"
             )
-        return eqx.tree_at(lambda s: s.q, state, _normalise_reproducibly(state.q))
+        # The digits of q/√n, with the squared length n, must be the same in every compiled program.
+        # XLA replaces the quotient by the product of q and 1/√n in some programs, which changes the
+        # last digit. Reverse-mode differentiation computes the steps of a solver again in another
+        # program: another last digit there would change the lengths of the steps, and the gradient
+        # would belong to another discretisation (an error of 7e-6 at a tolerance of 1e-11). The
+        # barrier keeps the root and the quotient apart, which round equally in every program.
+        length = lax.optimization_barrier(jnp.sqrt(squared_norm(components(state.q))))
+        return eqx.tree_at(lambda s: s.q, state, state.q / length)
     return state
-
-
-def _normalise_reproducibly(q: Quat) -> Quat:
-    """Return the quaternion `q` (4,) divided by its length, rounded to the same digits in every
-    compiled program.
-
-    Let n be the squared length of q. XLA replaces the quotient q/√n by the product of q and 1/√n in
-    some programs, which changes the last digit. Reverse-mode differentiation computes the steps of
-    a solver again in another program. A different last digit there would change the lengths of the
-    steps, and the gradient would belong to another discretisation (an error of 7e-6 at a tolerance
-    of 1e-11). Here the root and the quotient are kept as two separate operations, which round
-    equally in every program.
-    """
-    return q / lax.optimization_barrier(jnp.sqrt(squared_norm(components(q))))

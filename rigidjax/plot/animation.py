@@ -21,12 +21,13 @@ from rigidjax.body.meshes import checked_faces
 from rigidjax.body.principal_axes import principal
 from rigidjax.plot.style import (
     COLOURS,
-    attitudes_on_host,
     escape_formulas,
+    host_attitudes,
+    host_times,
     pyplot,
     rotation_matrices,
     set_equal_scales,
-    times_on_host,
+    viewpoint,
 )
 
 # CORNERS (8, 3) are the corners of the cube from −1 to 1. FACES has, for each face, the indices of
@@ -70,7 +71,16 @@ class Film(eqx.Module):
             wanted = " or ".join(kinds)
             raise ValueError(f"save: wanted a name that ends in {wanted}, got {path.name}")
         if suffix == ".mp4":
-            _write_mp4(self.data, path)
+            program = shutil.which("ffmpeg")
+            if program is None:
+                raise FileNotFoundError(
+                    "save: a film in .mp4 needs the program ffmpeg; a .gif needs no other program"
+                )
+            # The video format needs an even width and height in px.
+            even = "scale=trunc(iw/2)*2:trunc(ih/2)*2"
+            options = ["-vf", even, "-pix_fmt", "yuv420p", "-movflags", "faststart"]
+            run = [program, "-y", "-loglevel", "error", "-f", "gif", "-i", "-", *options, str(path)]
+            subprocess.run(run, input=self.data, check=True)
         elif suffix == ".html" and self.kind == "gif":
             path.write_text(f"<!doctype html>\n{self._repr_html_()}\n", encoding="utf-8")
         else:
@@ -87,24 +97,6 @@ class Film(eqx.Module):
             f'<iframe srcdoc="{page}" width="100%" height="{self.height}" '
             'style="border:1px solid #ddd"></iframe>'
         )
-
-
-def _write_mp4(gif: bytes, path: Path) -> None:
-    """Write an animated picture as a film to the file `path`, whose name ends in `.mp4`.
-    **Raises:** `FileNotFoundError` if the program ffmpeg is missing.
-
-    - `gif`: the bytes of a GIF file
-    """
-    program = shutil.which("ffmpeg")
-    if program is None:
-        raise FileNotFoundError(
-            "save: a film in .mp4 needs the program ffmpeg; a .gif needs no other program"
-        )
-    # The video format needs an even width and height in px.
-    even = "scale=trunc(iw/2)*2:trunc(ih/2)*2"
-    options = ["-vf", even, "-pix_fmt", "yuv420p", "-movflags", "faststart"]
-    run = [program, "-y", "-loglevel", "error", "-f", "gif", "-i", "-", *options, str(path)]
-    subprocess.run(run, input=gif, check=True)
 
 
 def tumble(
@@ -146,9 +138,9 @@ def tumble(
     >>> tumble(body, sol.ts, sol.ys, fps=2).data[:6]
     b'GIF89a'
     """
-    seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
+    seconds, pictures = _length(ts, seconds, fps)
     body = validation.require_single_body(body, (Inertia, MassProperties), "body")
-    moments, q = evenly_spaced_times_and_attitudes(ts, states, pictures)
+    moments, q = resampled(ts, states, pictures)
     _warn_of_aliases(ts, states, moments, seconds)
     size = _checks.integer(size, "size", 64)
     solid = _solid(body, surface)
@@ -164,17 +156,14 @@ def tumble(
     ax: Any = figure.add_axes((0.0, 0.08, 0.86, 0.84), projection="3d")
     # The path goes through every given state: through the states of the few pictures alone it would
     # be a zigzag.
-    when, tips = (
-        np.asarray(ts, dtype=float),
-        rotation_matrices(attitudes_on_host(states)) @ solid.tip,
-    )
+    when = np.asarray(ts, dtype=float)
+    tips = rotation_matrices(host_attitudes(states)) @ solid.tip
     unit = ", m" if surface is not None or isinstance(body, MassProperties) else ""
     set_equal_scales(ax, solid.reach, (f"x{unit}", f"y{unit}", f"z{unit}"))
     edges: dict[str, Any] = {"linewidths": 0.3}
     if surface is None:
         edges = {"edgecolor": "0.2", "linewidths": 0.8}
-    up, around = np.radians([ax.elev, ax.azim])
-    towards = [np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)]
+    towards = viewpoint(ax)
     drawn = Poly3DCollection([], alpha=0.85 if surface is None else 1.0, **edges)
     ax.add_collection3d(drawn)
     (trail,) = ax.plot([], [], [], color="0.3", lw=0.9)
@@ -207,15 +196,9 @@ def tumble(
     return Film(out.getvalue(), "gif", size)
 
 
-def _duration_and_picture_count(
-    ts: NumbersLike, seconds: float | int | None, fps: float | int
-) -> tuple[float, int]:
-    """Return two numbers: the duration of a film, s; and the number of its pictures, at least 2.
-
-    - `ts`: (T,) the times of the motion, s.
-    - `seconds`: the wanted duration, s; with `None` it is the duration of the motion, but at most
-      20 s.
-    - `fps`: the number of pictures a second.
+def _length(ts: NumbersLike, seconds: float | int | None, fps: float | int) -> tuple[float, int]:
+    """Return the duration of a film, s, by default that of the motion, but at most 20 s; and the
+    number of its pictures, at least 2.
     """
     if seconds is None:
         when = _checks.host_array(ts, "ts")
@@ -242,8 +225,8 @@ def player(
     **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises** as
     `tumble`.
     """
-    seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
-    moments, q = evenly_spaced_times_and_attitudes(ts, states, pictures)
+    seconds, pictures = _length(ts, seconds, fps)
+    moments, q = resampled(ts, states, pictures)
     _warn_of_aliases(ts, states, moments, seconds)
     solid = _solid(validation.require_single_body(body, (Inertia, MassProperties), "body"), surface)
     viser = _checks.import_library("viser", "view", "plot.player")
@@ -257,7 +240,7 @@ def player(
     try:
         server = viser.ViserServer(host="127.0.0.1", verbose=False)
         try:
-            page = _html_of_tumbling_solid(server, solid, q, seconds)
+            page = _page(server, solid, q, seconds)
         finally:
             server.stop()
     finally:
@@ -265,9 +248,9 @@ def player(
     return Film(page.encode("utf-8"), "html", height)
 
 
-def _html_of_tumbling_solid(server: Any, solid: "_Solid", q: np.ndarray, seconds: float) -> str:
-    """Draw a tumbling body in a server of viser without browsers, and return the page that plays
-    its attitudes `q` (N, 4), body → world, evenly spaced over `seconds`.
+def _page(server: Any, solid: "_Solid", q: np.ndarray, seconds: float) -> str:
+    """Return a page that plays attitudes, evenly spaced over `seconds`, drawn in a server of viser
+    without browsers.
     """
     scene = server.scene
     scene.set_up_direction("+z")
@@ -298,16 +281,12 @@ def _html_of_tumbling_solid(server: Any, solid: "_Solid", q: np.ndarray, seconds
     return recording.as_html()
 
 
-def evenly_spaced_times_and_attitudes(
-    ts: NumbersLike, states: PyTree, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays: `count` evenly spaced times, s; and the attitudes (count, 4) at these
-    times, from the `states` of a body at the times `ts` (T,), s.
-
-    Between two consecutive states the attitude is interpolated along the shorter arc.
+def resampled(ts: NumbersLike, states: PyTree, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return evenly spaced times, s, and the attitudes at them, interpolated along the
+    shorter arc.
     """
-    q = attitudes_on_host(states)
-    t = times_on_host(ts, q.shape[0])
+    q = host_attitudes(states)
+    t = host_times(ts, q.shape[0])
     if t.size < 2:
         raise ValueError(f"ts: wanted at least two times, got {t.size}")
     # q and −q are the same attitude: signs are chosen so that consecutive quaternions are near each
@@ -331,7 +310,7 @@ class _Solid(NamedTuple):
 
 def _solid(body: Inertia | MassProperties, surface: Any) -> _Solid:
     """Return what is drawn for a body: its `surface`, or the uniform box that moves as it does."""
-    half, axes = box_half_lengths_and_axes(body)
+    half, axes = equal_box(body)
     if surface is None:
         polygons = ((CORNERS * half) @ axes.T)[np.array(FACES)]
     else:
@@ -351,7 +330,7 @@ def _solid(body: Inertia | MassProperties, surface: Any) -> _Solid:
 
 
 def _triangles(mesh: Any) -> np.ndarray:
-    """Return the corners (m, 3, 3) of the triangles of a mesh."""
+    """Return the corners of the triangles of a mesh."""
     if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
         mesh = (mesh.vertices, mesh.faces)
     if not isinstance(mesh, tuple) or len(mesh) != 2:
@@ -362,10 +341,10 @@ def _triangles(mesh: Any) -> np.ndarray:
 
 
 def _warn_of_aliases(ts: NumbersLike, states: PyTree, moments: np.ndarray, seconds: float) -> None:
-    """Warn if the body makes half a turn between two pictures, at `moments`, s, of a film of some
-    `seconds`, or a quarter between two of its `states`.
+    """Warn if the body makes half a turn between two pictures of a film, or a quarter between two
+    of its states.
     """
-    t, rates = times_on_host(ts, len(states.omega)), np.linalg.norm(states.omega, axis=-1)
+    t, rates = host_times(ts, len(states.omega)), np.linalg.norm(states.omega, axis=-1)
     turns = np.abs(np.diff(t)) * 0.5 * (rates[1:] + rates[:-1]) / (2 * np.pi)
     sign = np.sign(t[-1] - t[0])
     total = np.interp(sign * moments, sign * t, np.concatenate([[0.0], np.cumsum(turns)]))
@@ -382,13 +361,12 @@ def _warn_of_aliases(ts: NumbersLike, states: PyTree, moments: np.ndarray, secon
     warnings.warn(f"film: {words}", stacklevel=3)
 
 
-def box_half_lengths_and_axes(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays for the uniform box that moves as the body does: its half-lengths a (3,);
-    and its axes (3, 3).
+def equal_box(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
+    """Return the half-lengths and the axes (columns, in body axes) of the uniform box that moves as
+    the body does.
 
-    The box has the mass m and the principal second moments λ of the body, and hence λ = m a²/3. The
-    columns of the second array are the axes of the box, in body axes. The half-lengths are in
-    metres for `MassProperties`; for an `Inertia` they are scaled so that the longest is 1.
+    Of the mass m and the principal second moments λ = m a²/3 follow the half-lengths a, in metres;
+    for an `Inertia` they are scaled so that the longest is 1.
     """
     second, q = principal(body.second_moment)
     size = np.sqrt(np.maximum(np.asarray(second, dtype=float), 0.0))
@@ -402,6 +380,5 @@ def box_half_lengths_and_axes(body: Inertia | MassProperties) -> tuple[np.ndarra
     else:
         size = size / size.max()
     # A plate or a rod gets a little thickness, so that it is visible.
-    return np.maximum(size, 0.02 * size.max()), rotation_matrices(np.asarray(q, dtype=float)[None])[
-        0
-    ]
+    axes = rotation_matrices(np.asarray(q, dtype=float)[None])[0]
+    return np.maximum(size, 0.02 * size.max()), axes

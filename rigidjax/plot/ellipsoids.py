@@ -38,7 +38,7 @@ def inertia_ellipsoid(
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
     ['x, m', 'x, m', 'y, m']
     """
-    best, drawn = _body_and_random_samples(body, _checks.integer(samples, "samples", 0))
+    best, drawn = _samples(body, _checks.integer(samples, "samples", 0))
     solid = isinstance(best, MassProperties)
     size = 1.0 if solid else float(np.trace(np.asarray(best.second_moment)))
     if not size > 0:
@@ -46,17 +46,17 @@ def inertia_ellipsoid(
             "body: wanted a body with an extension, got one whose second moment of mass is zero "
             "(a point), which has no ellipsoid"
         )
-    shapes = {"body": np.asarray(_ellipsoid_matrix(best))[None] / size}
+    shapes = {"body": np.asarray(_matrix(best))[None] / size}
     if drawn is not None:
-        shapes["cloud"] = np.asarray(jax.vmap(_ellipsoid_matrix)(drawn)) / size
+        shapes["cloud"] = np.asarray(jax.vmap(_matrix)(drawn)) / size
     if truth is not None:
-        other = np.asarray(_ellipsoid_matrix(truth))
+        other = np.asarray(_matrix(truth))
         # An `Inertia` has no size: unless both bodies are `MassProperties`, only the shapes are
         # compared, and the matrix of `truth` is scaled to trace 1.
         own = solid and isinstance(truth, MassProperties)
         shapes["truth"] = other[None] / (1.0 if own else float(np.trace(other)))
     ax = axes_of_shape(ax, (3,), ncols=3, figsize=(10.5, 3.9))
-    _draw_ellipsoid_outlines(ax, shapes, "m" if solid else "relative size")
+    _draw(ax, shapes, "m" if solid else "relative size")
     if len(shapes) > 1:
         how = dict(loc="outside lower center", ncols=3, frameon=False)
         ax[0].figure.legend(*ax[0].get_legend_handles_labels(), **how)
@@ -64,13 +64,9 @@ def inertia_ellipsoid(
     return ax
 
 
-def _body_and_random_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
-    """Return two things: the body; and `samples` bodies drawn at random from the uncertainty of a
-    fit, as one body with a leading axis, or `None` if `body` is no fit.
-
-    - `body`: an `Inertia`, a `MassProperties`, or a `Fit` of one body; the samples follow the
-      Gaussian distribution with its covariance.
-    - `samples`: the number of sampled bodies.
+def _samples(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
+    """Return the body, and bodies drawn at random from the Gaussian uncertainty of a fit, as one
+    body with a leading axis; `None` for no fit.
     """
     if isinstance(body, Inertia | MassProperties):
         return validation.require_single_body(body, (Inertia, MassProperties), "body"), None
@@ -88,37 +84,26 @@ def _body_and_random_samples(body: Any, samples: int) -> tuple[Inertia | MassPro
     return body.body, jax.vmap(lambda step: body.model.bodies(x + step))(steps)
 
 
-def _draw_ellipsoid_outlines(ax: Any, matrices_by_name: dict[str, np.ndarray], unit: str) -> None:
-    """Draw the outlines of ellipsoids r·A⁻¹r = 1 on the planes xy, xz and yz, with a legend.
-
-    - `ax`: (3,) matplotlib axes, one for each plane.
-    - `matrices_by_name`: arrays (n, 3, 3) of the matrices A of n ellipsoids, by name: `body` (n =
-      1); and, each of them optional, `cloud` (n bodies sampled from the uncertainty) and `truth`
-      (the body to compare with, n = 1).
-    - `unit`: the unit of length, in the labels.
+def _draw(ax: Any, matrices: dict[str, np.ndarray], unit: str) -> None:
+    """Draw the outlines of ellipsoids r·A⁻¹r = 1 on the planes xy, xz and yz; the names of the
+    matrices are `body` and perhaps `cloud` (samples) and `truth`.
     """
     # The outline of r·A⁻¹r = 1 reaches √A_ii along axis i. All three panels have the same scale,
     # for comparison.
-    reaches = {
-        name: np.sqrt(np.einsum("nii->ni", shape)) for name, shape in matrices_by_name.items()
-    }
+    reaches = {name: np.sqrt(np.einsum("nii->ni", shape)) for name, shape in matrices.items()}
     reach = 1.1 * max(float(one.max()) for one in reaches.values())
     apart = np.abs(reaches.get("cloud", reaches["body"]) - reaches["body"]).max(initial=0.0)
     wide = apart > 0.01 * reach
     label = "within the uncertainty" if wide else "uncertainty: below a line's width"
     for one, (i, j) in zip(ax, _PLANES, strict=True):
-        if "cloud" in matrices_by_name:
-            for shape in matrices_by_name["cloud"]:
-                one.plot(*_ellipsoid_outline(shape, i, j), color=COLOURS[5], lw=0.5, alpha=0.25)
+        if "cloud" in matrices:
+            for shape in matrices["cloud"]:
+                one.plot(*_outline(shape, i, j), color=COLOURS[5], lw=0.5, alpha=0.25)
             one.plot([], [], color=COLOURS[5], lw=1, label=label)
-        one.plot(
-            *_ellipsoid_outline(matrices_by_name["body"][0], i, j),
-            color=COLOURS[0],
-            lw=2,
-            label="body",
-        )
-        if "truth" in matrices_by_name:
-            outline = _ellipsoid_outline(matrices_by_name["truth"][0], i, j)
+        outline = _outline(matrices["body"][0], i, j)
+        one.plot(*outline, color=COLOURS[0], lw=2, label="body")
+        if "truth" in matrices:
+            outline = _outline(matrices["truth"][0], i, j)
             one.plot(*outline, color=COLOURS[1], lw=1.6, ls="--", label="truth")
         one.set_aspect("equal")
         one.set(xlim=(-reach, reach), ylim=(-reach, reach))
@@ -126,27 +111,18 @@ def _draw_ellipsoid_outlines(ax: Any, matrices_by_name: dict[str, np.ndarray], u
         one.grid(alpha=0.3)
 
 
-def _ellipsoid_matrix(body: Inertia | MassProperties) -> Any:
-    """Return the matrix A (3, 3) of the ellipsoid r·A⁻¹r = 1 that is drawn for a body with the
-    second moment of mass 𝔖 = ∫ r rᵀ dm (3, 3).
-
-    For `MassProperties` A is 5𝔖 divided by the mass, in square metres; for an `Inertia` A is 𝔖, kg
-    m².
+def _matrix(body: Inertia | MassProperties) -> Any:
+    """Return the matrix A of the ellipsoid r·A⁻¹r = 1 of a body: 5𝔖/mass, m², or 𝔖, kg m², for an
+    `Inertia`.
     """
     if isinstance(body, MassProperties):
         return body.second_moment * (5.0 / body.mass)
     return body.second_moment
 
 
-def _ellipsoid_outline(matrix: np.ndarray, i: int, j: int) -> np.ndarray:
-    """Return 121 points (2, 121) on the outline of the ellipsoid r·A⁻¹r = 1, as it is seen along a
-    coordinate axis.
-
-    The outline is the ellipse of the 2 × 2 block of A with the rows and columns `i` and `j`.
-
-    - `matrix`: (3, 3) the matrix A.
-    - `i`, `j`: the indices, 0 to 2, of the two axes of the picture; the ellipsoid is seen along the
-      third axis.
+def _outline(matrix: np.ndarray, i: int, j: int) -> np.ndarray:
+    """Return points on the outline of the ellipsoid r·A⁻¹r = 1, seen along the axis that is not i
+    or j: the ellipse of this block of A.
     """
     values, vectors = np.linalg.eigh(matrix[np.ix_((i, j), (i, j))])
     angle = np.linspace(0, 2 * np.pi, 121)

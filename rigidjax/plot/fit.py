@@ -16,7 +16,7 @@ from rigidjax.plot.style import (
     TIMES,
     escape_formulas,
     pyplot,
-    recording_residuals_and_standard_deviations,
+    residuals_of,
     unit_factor,
 )
 from rigidjax.rotation import quaternion
@@ -48,16 +48,22 @@ def fit(
     plt = pyplot()
     seconds = unit_factor(time_unit, TIMES, "time_unit")
     rate = unit_factor(rate_unit, RATES, "rate_unit")
-    record, left, _ = recording_residuals_and_standard_deviations(fit_result, index)
+    record, left, _ = residuals_of(fit_result, index)
     count = len(record.readings)
     size, how = (max(6.2 * count, 7.5), 6), dict(squeeze=False, layout="constrained")
     figure, axes = plt.subplots(2, count, figsize=size, sharex=True, height_ratios=(2, 1), **how)
-    dense = _dense_times_and_states(fit_result, record, index)
+    dense, model, body, state0 = None, fit_result.model, fit_result.body, fit_result.state0
+    # For a free body and few readings the line between the readings is made smooth.
+    if model.torque is None and record.t.shape[0] <= 300:
+        if model.count > 1:
+            state0 = jax.tree.map(lambda leaf: leaf[index], state0)
+        if isinstance(body, dict):
+            body = body[model.body_names[index]]
+        times = np.linspace(record.t[0], record.t[-1], 800)
+        dense = times, simulate(body, state0, times).ys
     for column, (reading, errors) in enumerate(zip(record.readings, left, strict=True)):
         upper, lower = axes[:, column]
-        _draw_readings_and_residuals(
-            upper, lower, record.t, reading, errors, dense, (seconds, rate, rate_unit)
-        )
+        _draw_sensor(upper, lower, record.t, reading, errors, dense, (seconds, rate, rate_unit))
         lower.axhline(0, color="0.6", lw=0.8)
         lower.set_xlabel(f"time, {time_unit}")
         upper.margins(x=0.02, y=0.2)
@@ -68,32 +74,7 @@ def fit(
     return figure
 
 
-def _dense_times_and_states(
-    fit_result: Any, record: Any, index: int
-) -> tuple[np.ndarray, Any] | None:
-    """Return two things: 800 evenly spaced times, s; and the fitted states at these times, for a
-    smooth line between the readings.
-
-    The result is `None` for a body under a torque, and for a recording with more than 300 times:
-    the line then joins the predictions at the times of the readings.
-
-    - `fit_result`: a `Fit`, the result of a fit.
-    - `record`: one of the recordings of the fit; the evenly spaced times are between its first and
-      its last time.
-    - `index`: the index of this recording in the fit.
-    """
-    model, body, state0 = fit_result.model, fit_result.body, fit_result.state0
-    if model.torque is not None or record.t.shape[0] > 300:
-        return None
-    if model.count > 1:
-        state0 = jax.tree.map(lambda leaf: leaf[index], state0)
-    if isinstance(body, dict):
-        body = body[model.body_names[index]]
-    dense = np.linspace(record.t[0], record.t[-1], 800)
-    return dense, simulate(body, state0, dense).ys
-
-
-def _draw_readings_and_residuals(
+def _draw_sensor(
     upper_axes: Any,
     lower_axes: Any,
     ts: ArrayLike,
@@ -102,19 +83,12 @@ def _draw_readings_and_residuals(
     dense_states: tuple[np.ndarray, PyTree] | None,
     units: tuple[float, float, str],
 ) -> None:
-    """Draw the readings of one sensor and the fitted line in the upper axes, and the residuals in
-    the lower axes.
+    """Draw the readings of one sensor and the fitted line in the upper axes, and the residuals, in
+    the unit of the sensor, in the lower axes.
 
-    - `upper_axes`, `lower_axes`: matplotlib axes.
-    - `ts`: (T,) the times of the readings, s.
-    - `reading`: an object with the sensor, its readings and their mask, which is true at times with
-      a reading.
-    - `errors`: (T, k) the residuals (reading minus prediction) at T times in k components, in the
-      unit of the sensor.
-    - `dense_states`: evenly spaced times, s, and the fitted states there, for a smooth line; or
-      `None` for a line through the predictions at the times of the readings.
-    - `units`: the number of seconds in the unit of time, the factor from rad/s to the unit of
-      rates, and the name of this unit.
+    With dense times, s, and states the line is smooth; else it joins the predictions. The units are
+    the number of s in that of time, the factor from rad/s to that of rates, and the name of the
+    latter.
     """
     (seconds, rate, rate_unit), seen, sensor = units, reading.host_mask, reading.sensor
     t = np.asarray(ts) / seconds
@@ -122,16 +96,16 @@ def _draw_readings_and_residuals(
     names: tuple[str, ...] = ("x", "y", "z")[: values.shape[1]]
     scale, unit, line_t = 1.0, sensor.unit, t
     if sensor.reading_shape == (4,):
-        read, scale = np.asarray(_body_z_in_world(values)), 180 / np.pi
+        read, scale = np.asarray(_body_z(values)), 180 / np.pi
         # The predicted attitude is the attitude read, turned back by the residual, which is a
         # rotation vector in body axes.
-        line = np.asarray(_body_z_in_world(_attitudes_turned_back(values, errors)))
+        line = np.asarray(_body_z(_turned_back(values, errors)))
         names = tuple(f"{axis} of body z" for axis in "xyz")
         upper_axes.set_ylabel("body z axis in world axes")
         unit = "deg (body axes)"
         if dense_states is not None:
             line_t = dense_states[0] / seconds
-            line = np.asarray(_body_z_in_world(dense_states[1].q))
+            line = np.asarray(_body_z(dense_states[1].q))
     else:
         if sensor.unit == "rad/s":
             scale, unit, names = rate, rate_unit, ("Ωx", "Ωy", "Ωz")
@@ -160,15 +134,15 @@ def _draw_readings_and_residuals(
 
 @jax.jit
 @jax.vmap
-def _attitudes_turned_back(q: Quat, rotation_vector: Vec3) -> Quat:
-    """Return the attitudes (T, 4) that a turn by the T rotation vectors (T, 3), rad, in body axes,
-    takes to the attitudes `q` (T, 4), body → world.
+def _turned_back(q: Quat, rotation_vector: Vec3) -> Quat:
+    """Return the attitudes that a turn by rotation vectors, rad, body axes, takes to the attitudes
+    `q`.
     """
     return quaternion.multiply(q, quaternion.exp(-rotation_vector))
 
 
 @jax.jit
 @jax.vmap
-def _body_z_in_world(q: Quat) -> Vec3:
-    """Return the body z axis (T, 3) in world axes for the attitudes `q` (T, 4), body → world."""
+def _body_z(q: Quat) -> Vec3:
+    """Return the body z axis in world axes."""
     return quaternion.rotate(q, jnp.eye(3, dtype=q.dtype)[2])

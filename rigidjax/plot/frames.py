@@ -15,8 +15,8 @@ from rigidjax.plot.style import (
     COLOURS,
     axes_of_shape,
     escape_formulas,
-    time_series_on_host,
-    times_on_host,
+    host_rows,
+    host_times,
 )
 
 
@@ -54,9 +54,9 @@ def frames(
     if not known or len(plane) != 2 or plane[0] == plane[1]:
         raise ValueError(f"plane: wanted two of x, y, z such as 'xz', got {plane!r}")
     i, j = (AXES.index(name) for name in plane)
-    path = time_series_on_host(inside.x, 3, "inside.x")
+    path = host_rows(inside.x, 3, "inside.x")
     kind = _checks.numeric_array(inside.x, "inside.x").dtype
-    t = jnp.asarray(times_on_host(ts, path.shape[0], "the path has"), kind)
+    t = jnp.asarray(host_times(ts, path.shape[0], "the path has"), kind)
     outside = np.asarray(jax.vmap(moving.to_inertial)(inside, t).x)
     ax = axes_of_shape(ax, (2,), ncols=2, figsize=(9.6, 4.6))
     names = (("moving", path), ("inertial", outside))

@@ -1,6 +1,6 @@
 """Draw the phase portrait of a heavy symmetric top: the tilt and its time derivative."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion.torques import HeavyTop
 from rigidjax.plot import style
-from rigidjax.plot.style import COLOURS, escape_formulas, time_series_on_host
+from rigidjax.plot.style import COLOURS, escape_formulas, host_rows
 
 
 def phase_portrait(
@@ -51,9 +51,9 @@ def phase_portrait(
             getattr(_checks.require_instance(top, HeavyTop, "top"), name), size, f"top.{name}"
         )
     levels = _checks.integer(levels, "levels", 1)
-    across, along, axis, weight, up = _symmetric_top_constants(inertia, top)
-    m = style.rotation_matrices(style.attitudes_on_host(states))
-    omega = np.einsum("tij,tj->ti", m, time_series_on_host(states.omega, 3, "states.omega"))
+    across, along, axis, weight, up = _constants(inertia, top)
+    m = style.rotation_matrices(style.host_attitudes(states))
+    omega = np.einsum("tij,tj->ti", m, host_rows(states.omega, 3, "states.omega"))
     first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], states)
     about_up = float(np.asarray(spatial_angular_momentum(inertia, first)) @ up)
     about_axis = along * float(np.asarray(first.omega) @ axis)
@@ -95,19 +95,23 @@ def phase_portrait(
     return ax
 
 
-def _symmetric_top_constants(
-    inertia: Inertia, top: HeavyTop
-) -> tuple[float, float, np.ndarray, float, np.ndarray]:
-    """Return five constants of a heavy symmetric top: the moments of inertia I₁ across and I₃ about
-    the axis of symmetry, kg m²; the axis (3,), body frame, from the pivot to the centre of mass;
-    the product of the weight and the distance of the centre of mass from the pivot, N m; and the
-    upward unit vector (3,), world frame.
+class _Constants(NamedTuple):
+    """Hold the constants of a heavy symmetric top."""
 
-    **Raises:** `ValueError` for a body that is not symmetric about this axis, and for a weight of
-    zero or a centre of mass at the pivot.
+    # The moments of inertia across and about the axis of symmetry, kg m².
+    across: float
+    along: float
+    # From the pivot to the centre of mass, body frame.
+    axis: np.ndarray
+    # The weight times the distance of the centre of mass from the pivot, N m.
+    weight: float
+    # Upwards, world frame.
+    up: np.ndarray
 
-    - `inertia`: the inertia about the pivot.
-    - `top`: the torque of the weight, with mass, centre of mass and gravity.
+
+def _constants(inertia: Inertia, top: HeavyTop) -> _Constants:
+    """Return the constants of a heavy symmetric top; raise `ValueError` for a body that is not
+    symmetric about the axis to its centre of mass, and for a weight that does not act.
     """
     tensor = np.asarray(inertia.tensor, dtype=float)
     com, gravity = np.asarray(top.com, dtype=float), np.asarray(top.gravity, dtype=float)
@@ -127,4 +131,4 @@ def _symmetric_top_constants(
             "phase_portrait: wanted a body symmetric about the axis through its centre of mass "
             f"(two equal moments across {axis.round(3).tolist()}); other tops have no such portrait"
         )
-    return across, along, axis, weight, -gravity / pull
+    return _Constants(across, along, axis, weight, -gravity / pull)

@@ -11,7 +11,7 @@ from rigidjax._types import HasAttitude, HasSpin
 from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.plot import style
-from rigidjax.plot.style import COLOURS, escape_formulas, time_series_on_host
+from rigidjax.plot.style import COLOURS, escape_formulas, host_rows
 
 
 def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
@@ -26,12 +26,12 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     >>> body_axes(sol.ys).get_zlabel()
     'z'
     """
-    m = style.rotation_matrices(style.attitudes_on_host(states))
+    m = style.rotation_matrices(style.host_attitudes(states))
     ax = style.axes_3d_or_new(ax)
-    style.draw_translucent_sphere(ax, "0.8", 0.12)
+    style.draw_sphere(ax, "0.8", 0.12)
     for axis, colour in enumerate(COLOURS[:3]):
         path = m[:, :, axis]
-        style.draw_curve_on_sphere(ax, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
+        style.draw_on_sphere(ax, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
         ax.plot(*path[:1].T, color=colour, marker="o", ms=6, ls="")
         ax.plot(*path[-1:].T, color=colour, marker="^", ms=7, ls="")
     # The marks in the legend are grey, since every body axis has such marks.
@@ -78,7 +78,7 @@ def polhode(
     moments, q = inertia.require_invertible().principal()
     i = np.asarray(moments, dtype=float)
     turn = style.rotation_matrices(np.asarray(q, dtype=float)[None])[0]
-    omega = time_series_on_host(states.omega, 3, "states.omega")
+    omega = host_rows(states.omega, 3, "states.omega")
     pi = omega @ turn * i
     size = float(np.linalg.norm(pi[0]))
     if not size > 0:
@@ -93,19 +93,19 @@ def polhode(
     # The drawing order is set here, since matplotlib gives a whole surface a single depth and would
     # draw the sphere over the path.
     ax.computed_zorder = False
-    style.draw_translucent_sphere(ax, COLOURS[5], 0.15)
+    style.draw_sphere(ax, COLOURS[5], 0.15)
     semi_axes = np.sqrt(twice_energy * i)
     # The ellipsoid is drawn as meridians and parallels, so that the sphere inside it stays visible.
     how: dict[str, Any] = dict(color=COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
     ax.plot_wireframe(
-        *(semi_axes[:, None, None] * style.grid_on_unit_sphere()), rstride=4, cstride=6, **how
+        *(semi_axes[:, None, None] * style.sphere_grid()), rstride=4, cstride=6, **how
     )
     # If all moments are equal, the energy is constant on the sphere, and there are no lines to
     # draw.
     if i[2] - i[0] > 1e-9 * i[2]:
-        _draw_curves_of_equal_energy(ax, i, energies)
+        _draw_energies(ax, i, energies)
     how = dict(hidden_style={"ls": (0, (1, 1)), "lw": 1.8}, label="this motion", zorder=5)
-    style.draw_curve_on_sphere(ax, pi, color=COLOURS[1], lw=2.6, **how)
+    style.draw_on_sphere(ax, pi, color=COLOURS[1], lw=2.6, **how)
     ax.plot(*pi[:1].T, color=COLOURS[1], marker="o", ms=6, ls="", label="start", zorder=6)
     style.set_equal_scales(ax, max(1.0, float(semi_axes.max())), ("Π₁ / h", "Π₂ / h", "Π₃ / h"))
     handles, names = ax.get_legend_handles_labels()
@@ -119,20 +119,16 @@ def polhode(
     return ax
 
 
-def _draw_curves_of_equal_energy(ax: Any, moments: np.ndarray, curve_count: int) -> None:
-    """Draw curves of equal energy, and the separatrix (the curve through the middle axis), on the
-    unit sphere of the angular momentum.
-
-    - `ax`: 3-D axes of matplotlib.
-    - `moments`: (3,) the principal moments, ascending.
-    - `curve_count`: the number of curves besides the separatrix.
+def _draw_energies(ax: Any, moments: np.ndarray, curve_count: int) -> None:
+    """Draw curves of equal energy on the unit sphere of the angular momentum, and the separatrix
+    through the middle axis; moments ascend.
     """
     import contourpy
 
     def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
         # The pole of the longitude and colatitude is on the axis of the middle moment. No closed
         # curve goes round this axis, so that no curve is cut where the longitude jumps by 2π.
-        return style.points_on_unit_sphere(around, down)[[1, 2, 0]]
+        return style.sphere_points(around, down)[[1, 2, 0]]
 
     inverse = 1 / moments
     around, down = np.linspace(0, 2 * np.pi, 181), np.linspace(0, np.pi, 91)
@@ -145,7 +141,7 @@ def _draw_curves_of_equal_energy(ax: Any, moments: np.ndarray, curve_count: int)
         drawn.append((inverse[1], how))
     for value, how in drawn:
         for curve in lines.lines(value):
-            style.draw_curve_on_sphere(ax, on_sphere(*np.asarray(curve).T).T, **how)
+            style.draw_on_sphere(ax, on_sphere(*np.asarray(curve).T).T, **how)
             how.pop("label", None)
 
 
@@ -164,8 +160,8 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     >>> herpolhode(body, sol.ys).get_xlabel()
     'ω along e₁, rad/s'
     """
-    m = style.rotation_matrices(style.attitudes_on_host(states))
-    omega = np.einsum("tij,tj->ti", m, time_series_on_host(states.omega, 3, "states.omega"))
+    m = style.rotation_matrices(style.host_attitudes(states))
+    omega = np.einsum("tij,tj->ti", m, host_rows(states.omega, 3, "states.omega"))
     each = jax.vmap(lambda state: spatial_angular_momentum(inertia, state))
     momenta = np.asarray(each(jax.tree.map(jnp.asarray, states)), dtype=float)
     size = np.linalg.norm(momenta, axis=1)

@@ -9,7 +9,7 @@ from rigidjax.plot.style import (
     TIMES,
     axes_of_shape,
     escape_formulas,
-    recording_residuals_and_standard_deviations,
+    residuals_of,
     unit_factor,
 )
 
@@ -41,12 +41,12 @@ def residuals(
     'lag, samples'
     """
     seconds = unit_factor(time_unit, TIMES, "time_unit")
-    record, left, noises = recording_residuals_and_standard_deviations(fit_result, index)
+    record, left, noises = residuals_of(fit_result, index)
     count = len(record.readings)
     ax = axes_of_shape(ax, (count, 4), nrows=count, ncols=4, figsize=(10.5, 2.8 * count))
     t = np.asarray(record.t) / seconds
     for row, reading, errors, noise in zip(ax, record.readings, left, noises, strict=True):
-        _draw_sensor_residuals(row, t, errors / noise, np.asarray(reading.host_mask))
+        _draw(row, t, errors / noise, np.asarray(reading.host_mask))
         row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
         row[0].set_xlabel(f"time, {time_unit}")
         row[3].set_xlabel(f"frequency, {'Hz' if time_unit == 's' else f'1/{time_unit}'}")
@@ -54,38 +54,26 @@ def residuals(
     return ax
 
 
-def _draw_sensor_residuals(
-    four_panels: np.ndarray, t: np.ndarray, standardised_residuals: np.ndarray, mask: np.ndarray
+def _draw(
+    four_panels: np.ndarray, t: np.ndarray, standardised: np.ndarray, mask: np.ndarray
 ) -> None:
-    """Draw the residuals of one sensor in four panels: over time, as a histogram, as
-    autocorrelation, and as power spectrum.
-
-    - `four_panels`: (4,) matplotlib axes, one for each panel.
-    - `t`: (T,) the T times of the readings, in the unit of the picture.
-    - `standardised_residuals`: (T, k) the residuals divided by their standard deviation, for the k
-      axes of the sensor.
-    - `mask`: (T,) true at times with a reading; the residuals at other times are not drawn.
+    """Draw the residuals of one sensor, divided by their standard deviation, in four panels: over
+    time, as a histogram, as autocorrelation, and as power spectrum.
     """
     over_time, spread, memory, spectrum = four_panels
-    colours, names = (
-        COLOURS[: standardised_residuals.shape[1]],
-        "xyz"[: standardised_residuals.shape[1]],
-    )
-    everything = standardised_residuals[mask].ravel()
+    seen = standardised[mask]
+    colours, names = COLOURS[: seen.shape[1]], "xyz"[: seen.shape[1]]
+    everything = seen.ravel()
     # With a scale that includes an outlier all other residuals would lie on a line: residuals
     # beyond `reach` are drawn at the border of the panel.
     reach = float(np.clip(np.abs(everything).max(initial=0.0) * 1.1, 4.0, 8.0))
     beyond = int((np.abs(everything) > reach).sum())
-    shown = np.where(
-        np.abs(standardised_residuals[mask]) <= reach, standardised_residuals[mask], np.nan
-    )
+    shown = np.where(np.abs(seen) <= reach, seen, np.nan)
     how: dict[str, Any] = dict(ms=2.5 if mask.sum() > 100 else 5, alpha=0.7)
     for values, colour, name in zip(shown.T, colours, names, strict=True):
         over_time.plot(t[mask], values, ".", color=colour, label=name, **how)
     if beyond:
-        for axis, (values, colour) in enumerate(
-            zip(standardised_residuals[mask].T, colours, strict=True)
-        ):
+        for axis, (values, colour) in enumerate(zip(seen.T, colours, strict=True)):
             for side, mark in ((1, "^"), (-1, "v")):
                 where = t[mask][side * values > reach]
                 # The triangles that stand for outliers have a height of their own for each axis of
@@ -119,7 +107,7 @@ def _draw_sensor_residuals(
 
     number = int(mask.sum())
     lags = np.arange(1, max(2, min(40, number // 2)))
-    for values, colour in zip(standardised_residuals[mask].T, colours, strict=True):
+    for values, colour in zip(seen.T, colours, strict=True):
         memory.plot(lags, _autocorrelation(values, lags), ".-", color=colour, ms=4, lw=0.8)
         spectrum.plot(*power_spectrum(t[mask], values), color=colour, lw=1)
     band = 2 / np.sqrt(max(number, 1))
@@ -131,12 +119,8 @@ def _draw_sensor_residuals(
 
 
 def power_spectrum(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays: F frequencies (F,), in cycles per unit of `t`; and the power (F,) of
-    `values` at these frequencies.
-
-    **Arguments:** `t` (T,) times; `values` (T,) residuals divided by their standard deviation.
-    White noise of standard deviation 1 has the power 1 at all frequencies. If there are fewer than
-    eight times, the arrays are empty.
+    """Return frequencies, in cycles per unit of `t`, and the power there of residuals divided by
+    their standard deviation: 1 for white noise. With fewer than eight times the arrays are empty.
     """
     from scipy.signal import lombscargle, welch
 
@@ -156,11 +140,8 @@ def power_spectrum(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _autocorrelation(values: np.ndarray, lags: np.ndarray) -> np.ndarray:
-    """Return the correlation (L,) of a series with itself at each of L given lags, divided by the
-    correlation at lag 0; the result is zero for a constant series.
-
-    - `values`: (T,) the series; its mean is subtracted.
-    - `lags`: (L,) the lags, positive whole numbers of samples.
+    """Return the correlation of a series with itself at each lag, in samples, divided by that at
+    lag 0; zero for a constant series.
     """
     centred = values - values.mean()
     whole = float(centred @ centred)

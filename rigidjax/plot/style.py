@@ -1,6 +1,6 @@
 """Provide what all pictures share: colours, axes, the import of matplotlib, checks of arguments."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,31 +22,31 @@ RATES = {"rad/s": 1.0, "deg/s": 180 / np.pi, "rpm": 30 / np.pi, "deg/day": 86400
 
 
 def pyplot() -> Any:
-    """Return `matplotlib.pyplot`, which is imported at the call.
-
-    **Raises:** `ModuleNotFoundError` without matplotlib; the message names the extra `view`.
+    """Return `matplotlib.pyplot`, imported at the call; raise `ModuleNotFoundError`, which names
+    the extra `view`, without it.
     """
     return _checks.import_library("matplotlib.pyplot", "view", "plot")
 
 
 def unit_factor(unit: str, units: dict[str, float], name: str) -> float:
-    """Return `units[unit]`, the conversion factor of a unit; raise an error for an unknown unit.
-
-    **Arguments:** `unit` such as `day`; `units` is `TIMES` (the number of seconds in each unit of
-    time) or `RATES` (the factor that converts rad/s to each unit of angular rate); `name` the name
-    of the caller's argument, for the error.
+    """Return the factor of a unit of `TIMES` (s in each) or `RATES` (from rad/s to each); raise an
+    error for an unknown unit.
     """
     return units[_checks.require_option(unit, tuple(units), name)]
 
 
-def recording_residuals_and_standard_deviations(
-    fit_result: Any, index: object
-) -> tuple[Any, list[np.ndarray], list[np.ndarray]]:
-    """Return three things: a recording of a fit; its residuals, an array for each sensor; and the
-    standard deviations of the residuals, an array for each sensor.
+class Residuals(NamedTuple):
+    """Hold the residuals of one recording."""
 
-    **Raises:** `TypeError` if `fit_result` is no `Fit`; `ValueError` if it is a batch of fits, or
-    if it has no recording with this `index`.
+    recording: Any
+    # For each sensor the residuals and their standard deviations, in its unit.
+    errors: list[np.ndarray]
+    noises: list[np.ndarray]
+
+
+def residuals_of(fit_result: Any, index: object) -> Residuals:
+    """Return a recording of a fit with its residuals; raise `TypeError` for no `Fit`, `ValueError`
+    for a batch of fits or an index without a recording.
     """
     if np.shape(getattr(fit_result, "chi2", 0.0)) != ():
         raise ValueError(
@@ -62,27 +62,22 @@ def recording_residuals_and_standard_deviations(
         raise ValueError(f"index: wanted one of {count} recordings, from 0, got {index}")
     record, which = fit_result.model.recordings[index], ... if count == 1 else index
     errors = [np.asarray(e[which])[: record.t.shape[0]] for e in fit_result.residuals]
-    lates = [
-        0.0 if reading.jitter_error is None else reading.jitter_error for reading in record.readings
+    noises = [
+        np.hypot(noise[which], 0.0 if one.jitter_error is None else one.jitter_error)
+        for noise, one in zip(fit_result.noise, record.readings, strict=True)
     ]
-    noises = zip(fit_result.noise, lates, strict=True)
-    return record, errors, [np.hypot(noise[which], late) for noise, late in noises]
+    return Residuals(record, errors, noises)
 
 
 def axes_2d_or_new(ax: Any, **options: Any) -> Any:
-    """Return `ax`, or new two-dimensional axes if `ax` is `None`; `options` are arguments of
-    `pyplot.subplots`.
-    """
+    """Return `ax`, or new two-dimensional axes; `options` are those of `pyplot.subplots`."""
     if ax is not None:
         return ax
     return pyplot().subplots(layout="constrained", **{"figsize": (6.4, 4.4), **options})[1]
 
 
 def axes_3d_or_new(ax: Any) -> Any:
-    """Return `ax`, or new 3-D axes if `ax` is `None`.
-
-    **Raises:** `TypeError` for axes that are not 3-D.
-    """
+    """Return `ax`, or new 3-D axes; raise `TypeError` for flat ones."""
     if ax is None:
         figure = pyplot().figure(layout="constrained", figsize=(6.0, 5.6))
         return figure.add_subplot(projection="3d")
@@ -92,9 +87,8 @@ def axes_3d_or_new(ax: Any) -> Any:
 
 
 def axes_of_shape(ax: Any, shape: tuple[int, ...], **options: Any) -> Any:
-    """Return `ax` as an array of axes with this shape, or new axes if `ax` is `None`.
-
-    `options` are arguments of `pyplot.subplots`. **Raises:** `ValueError` for another shape.
+    """Return `ax` as an array of axes of this shape, or new axes; raise `ValueError` for another
+    shape.
     """
     if ax is None:
         ax = np.reshape(pyplot().subplots(layout="constrained", **options)[1], shape)
@@ -107,31 +101,24 @@ def axes_of_shape(ax: Any, shape: tuple[int, ...], **options: Any) -> Any:
 
 
 def draw_legend_below(ax: Any, *entries: Any, distance: float = 0.16) -> None:
-    """Draw the legend below the axes, at a distance of `distance` times the height of the axes.
-
-    Inside the axes the legend would cover the curves. `entries` are arguments of `ax.legend`.
+    """Draw the legend below the axes, at a `distance` in heights of the axes: inside it would cover
+    the curves.
     """
     place = dict(loc="upper center", bbox_to_anchor=(0.5, -distance))
     ax.legend(*entries, **place, ncols=3, fontsize=8, frameon=False)
 
 
-def times_on_host(ts: object, count: int, words_about_count: str = "the states have") -> np.ndarray:
-    """Return the times `ts` (T,) as NumPy float64.
-
-    **Raises:** `ValueError` unless T is `count`. The text `words_about_count`, such as "the states
-    have", says in the message what has `count` entries.
-    """
+def host_times(ts: object, count: int, words_about_count: str = "the states have") -> np.ndarray:
+    """Return the times as NumPy float64; raise `ValueError` unless there are `count` of them."""
     t = _checks.host_array(ts, "ts")
     if t.shape != (count,):
         raise ValueError(f"ts: wanted ({count},) as {words_about_count}, got {t.shape}")
     return t
 
 
-def time_series_on_host(values: object, column_count: int, name: str) -> np.ndarray:
-    """Return `values` of one body over time (T, `column_count`) as NumPy float64.
-
-    `name` is the name of the values in messages. **Raises:** `ValueError` for another shape, or if
-    no value is finite.
+def host_rows(values: object, column_count: int, name: str) -> np.ndarray:
+    """Return values of one body over time as NumPy float64; raise `ValueError` for another shape,
+    or if no value is finite.
     """
     out = _checks.host_array(values, name)
     if out.ndim != 2 or out.shape[1] != column_count:
@@ -142,16 +129,14 @@ def time_series_on_host(values: object, column_count: int, name: str) -> np.ndar
     return out
 
 
-def attitudes_on_host(states: Any) -> np.ndarray:
-    """Return the quaternions (T, 4), body → world, of `states`, the states of one body at T times,
-    as NumPy float64.
-
-    **Raises:** `TypeError` for states without an attitude.
+def host_attitudes(states: Any) -> np.ndarray:
+    """Return the attitudes of one body over time as NumPy float64; raise `TypeError` for states
+    without one.
     """
     if not hasattr(states, "q"):
         got = type(states).__name__
         raise TypeError(f"states: wanted states with an attitude (Attitude, Rigid), got {got}")
-    return time_series_on_host(states.q, 4, "states.q")
+    return host_rows(states.q, 4, "states.q")
 
 
 def rotation_matrices(q: np.ndarray) -> np.ndarray:
@@ -160,26 +145,27 @@ def rotation_matrices(q: np.ndarray) -> np.ndarray:
     return np.asarray(jax.vmap(quaternion.to_matrix)(unit), dtype=float)
 
 
-def points_on_unit_sphere(longitude: np.ndarray, colatitude: np.ndarray) -> np.ndarray:
-    """Return points (3, …) on the unit sphere from their `longitude` and their `colatitude` (the
-    angle from the z axis), rad.
+def sphere_points(longitude: np.ndarray, colatitude: np.ndarray) -> np.ndarray:
+    """Return points (3, …) on the unit sphere from their longitude and colatitude (the angle from
+    the z axis), rad.
     """
     ring, height = np.sin(colatitude), np.cos(colatitude)
     return np.stack(np.broadcast_arrays(np.cos(longitude) * ring, np.sin(longitude) * ring, height))
 
 
-def draw_curve_on_sphere(
+def viewpoint(ax: Any) -> np.ndarray:
+    """Return the unit vector from the middle of 3-D axes towards the viewer."""
+    up, around = np.radians([ax.elev, ax.azim])
+    return np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+
+
+def draw_on_sphere(
     ax: Any, path: np.ndarray, *, hidden_style: dict[str, Any] | None = None, **style: Any
 ) -> None:
-    """Draw a line `path` (T, 3) on the unit sphere; the part that the sphere hides has the
-    `hidden_style`.
-
-    `hidden_style` and `style` are arguments of `ax.plot`; if `hidden_style` is not given, the
-    hidden part is faint.
+    """Draw a line (T, 3) on the unit sphere; what the sphere hides has the `hidden_style`, by
+    default faint.
     """
-    up, around = np.radians(ax.elev), np.radians(ax.azim)
-    eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
-    front, label = path @ eye > 0, style.pop("label", None)
+    front, label = path @ viewpoint(ax) > 0, style.pop("label", None)
     for seen, more in ((front, {"label": label}), (~front, hidden_style or {"alpha": 0.25})):
         # The visible and the hidden part of the line overlap by one point, so that no gap opens
         # between the two.
@@ -189,22 +175,18 @@ def draw_curve_on_sphere(
         ax.plot(*line.T, **{**style, **more})
 
 
-def grid_on_unit_sphere() -> np.ndarray:
+def sphere_grid() -> np.ndarray:
     """Return a grid of points (3, 49, 25) on the unit sphere, by longitude and colatitude."""
-    return points_on_unit_sphere(np.linspace(0, 2 * np.pi, 49)[:, None], np.linspace(0, np.pi, 25))
+    return sphere_points(np.linspace(0, 2 * np.pi, 49)[:, None], np.linspace(0, np.pi, 25))
 
 
-def draw_translucent_sphere(ax: Any, colour: str, alpha: float) -> None:
-    """Draw the unit sphere as a translucent surface; `alpha` is its opacity, from 0 to 1."""
-    ax.plot_surface(
-        *grid_on_unit_sphere(), color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1
-    )
+def draw_sphere(ax: Any, colour: str, alpha: float) -> None:
+    """Draw the unit sphere as a translucent surface."""
+    ax.plot_surface(*sphere_grid(), color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1)
 
 
 def set_equal_scales(ax: Any, half_width: float, labels: tuple[str, str, str]) -> None:
-    """Set equal scales, from −`half_width` to `half_width`, on all three axes, with few ticks and
-    with `labels`.
-    """
+    """Set equal scales, from −`half_width` to `half_width`, with few ticks, on all three axes."""
     from matplotlib.ticker import MaxNLocator
 
     limits = (-half_width, half_width)

@@ -16,7 +16,7 @@ from rigidjax.plot.style import (
     RATES,
     TIMES,
     escape_formulas,
-    time_series_on_host,
+    host_rows,
 )
 from rigidjax.rotation import euler
 
@@ -53,13 +53,13 @@ def motion(
     _checks.require_instance(
         states, HasSpin, "states", requirement="a Spin, an Attitude or a Rigid"
     )
-    omega = time_series_on_host(states.omega, 3, "states.omega") * turned
-    t = style.times_on_host(ts, omega.shape[0]) / seconds
+    omega = host_rows(states.omega, 3, "states.omega") * turned
+    t = style.host_times(ts, omega.shape[0]) / seconds
     both = hasattr(states, "q")
     count = 2 if both else 1
     ax = style.axes_of_shape(ax, (count,), nrows=count, sharex=True, figsize=(7.2, 2.6 * count))
     if both:
-        _draw_attitude(ax[0], t, style.attitudes_on_host(states), attitude)
+        _draw_attitude(ax[0], t, style.host_attitudes(states), attitude)
     for values, name, colour, dashes in zip(omega.T, "xyz", COLOURS[:3], LINE_STYLES, strict=True):
         ax[-1].plot(t, values, color=colour, ls=dashes, label=f"Ω{name}", lw=1.4)
     ax[-1].set(xlabel=f"time, {time_unit}", ylabel=f"body rate Ω, {rate_unit}")
@@ -74,13 +74,8 @@ def motion(
 
 
 def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, form: str) -> None:
-    """Draw the attitude of a body against time on matplotlib axes.
-
-    - `ax`: the axes.
-    - `t`: (T,) the times, in the unit of the picture.
-    - `q`: (T, 4) the attitudes, body → world.
-    - `form`: `quaternion`, `axes` (the components of the body axes along world z) or `angles`
-      (3-1-3 Euler angles).
+    """Draw the attitudes, body → world, in one of the forms of `motion`; `t` is in the unit of the
+    picture.
     """
     _checks.require_option(form, ("quaternion", "axes", "angles"), "attitude")
     if form == "quaternion":
@@ -89,22 +84,15 @@ def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, form: str) -> None:
         names = [f"{n}' · z" for n in "xyz"]
         lines, label = style.rotation_matrices(q)[:, 2, :].T, "body axes along world z"
     else:
-        names, lines, label = ["φ", "θ", "ψ"], _euler_angles_in_degrees(q).T, "3-1-3 angles, deg"
+        names, label = ["φ", "θ", "ψ"], "3-1-3 angles, deg"
+        degrees = np.degrees(np.asarray(jax.vmap(euler.from_quaternion)(jnp.asarray(q))))
+        # Where an angle jumps from 180° to −180° the curve is interrupted: a line across the whole
+        # picture would look like a motion.
+        degrees[1:][np.abs(np.diff(degrees, axis=0)) > 180] = np.nan
+        lines = degrees.T
     colours, line_styles = COLOURS[:3], LINE_STYLES
     if len(names) == 4:
         colours, line_styles = (COLOURS[6], *colours), (":", *line_styles)
     for values, name, colour, dashes in zip(lines, names, colours, line_styles, strict=True):
         ax.plot(t, values, color=colour, ls=dashes, label=name, lw=1.4)
     ax.set_ylabel(label)
-
-
-def _euler_angles_in_degrees(q: np.ndarray) -> np.ndarray:
-    """Return the 3-1-3 Euler angles (T, 3), degrees, of the attitudes `q` (T, 4); an angle is NaN
-    where it jumps by more than 180°, so that its curve is interrupted.
-    """
-    degrees = np.degrees(np.asarray(jax.vmap(euler.from_quaternion)(jnp.asarray(q))))
-    # Where an angle jumps from 180° to −180° the curve is interrupted: a line across the whole
-    # picture would look like a motion.
-    jump = np.abs(np.diff(degrees, axis=0)) > 180
-    degrees[1:][jump] = np.nan
-    return degrees

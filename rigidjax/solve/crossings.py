@@ -45,7 +45,7 @@ from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, with_own_states
 from rigidjax.motion.equations import project_to_group
-from rigidjax.motion.torques.base import missing_state_part_message
+from rigidjax.motion.torques.base import missing_part
 from rigidjax.solve import crossing_loop, validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
 from rigidjax.solve.adaptive_loop import Method, result_of_body
@@ -252,7 +252,7 @@ def checked_state(
     try:
         eqx.filter_eval_shape(condition_value, event, body, t, state0)
     except AttributeError as wrong:
-        told = missing_state_part_message("condition", wrong)
+        told = missing_part("condition", wrong)
         if told is None:
             raise
         raise TypeError(told) from wrong

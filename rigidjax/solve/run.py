@@ -329,7 +329,7 @@ def require_complete(setup: ClosedFormRun | DiffraxRun, ys: Any, result: dfx.RES
     shortest = (
         "simulate: no step is short enough: the minimum step size, some units of round-off of the "
         f"time, was reached. Does the torque jump or grow without bound? In {np.dtype(dtype)} "
-        f"the times near 1e9 s are {gap:.2g} s apart: {_checks.advice_for_large_times(dtype)}"
+        f"the times near 1e9 s are {gap:.2g} s apart: {_checks.advice_on_times(dtype)}"
     )
     for why, words in (
         (dfx.RESULTS.max_steps_reached, _MANY_STEPS),

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.motion.torques.base import jump_times_of, require_unbatched_torque
+from rigidjax.motion.torques.base import jump_times_of, require_single
 from rigidjax.motion.torques.inputs import Delayed, Lagged
 from rigidjax.motion.torques.piecewise import Held, Linear, Pulses, Tabulated
 from rigidjax.motion.torques.states import has_own_states
@@ -61,7 +61,7 @@ class Sided(eqx.Module):
         return type(self.law).__name__
 
     def __call__(self, t: Any, *args: Any) -> Any:
-        require_unbatched_torque(self.law)
+        require_single(self.law)
         with jax.named_scope(DECLARED):
             return self.law(self.time_on_correct_side(t), *args)
 

@@ -334,9 +334,7 @@ def _solve_run(
                 setup, event, state0, times
             )
     except RuntimeError as error:
-        raise explain_max_steps(
-            setup, state0, times, _checks.error_without_equinox_text(error)
-        ) from None
+        raise explain_max_steps(setup, state0, times, _checks.plain_error(error)) from None
     warn_of_missed(setup, state0, times, stats)
     if setup.throw and "ended" in stats:
         ys = raise_if_ended(setup.torque, ys, stats, times)

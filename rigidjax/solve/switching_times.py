@@ -66,7 +66,10 @@ def find_changes(found: Switches, consts: Arrays, t0: Array, t1: Array) -> Chang
     others, which = t, jnp.zeros(0, jnp.int32)
     if bent.size:
         cells = _cells_with_one_change(found, still, begin, end, bent, others)
-        bisect = lambda *args: _bisect(found, still, *args, 0.5)  # noqa: E731
+
+        def bisect(low: Array, high: Array, element: Array, value: Array) -> Array:
+            return _bisect(found, still, low, high, element, value, 0.5)
+
         cell = cells.low, cells.high, cells.element, cells.value
         t = jnp.concatenate([t, _in_chunks(bisect, jnp.sum(cells.change != 0), *cell)])
         sizes, which = jnp.concatenate([sizes, cells.change]), cells.element

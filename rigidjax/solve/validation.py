@@ -201,7 +201,7 @@ def checked_times(ts: Any, throw: bool) -> Array:
         if _checks.is_known(ts) and (float(ts[i]) - float(ts[i - 1])) * (-1 if back else 1) > 0:
             where += (
                 f" in {found.dtype}, which cannot tell {ts[i - 1]!r} from {ts[i]!r}: "
-                + _checks.advice_for_large_times(found.dtype)
+                + _checks.advice_on_times(found.dtype)
             )
     kind = "decreasing" if back else "increasing"
     return _error_or_nan(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
@@ -228,8 +228,7 @@ def checked_first_step(dt0: Any, times: Array) -> Array:
         if abs(float(step)) < 8 * gap:
             raise ValueError(
                 f"dt0: steps of {dt0} s are too short for {times.dtype}, whose times near "
-                f"{float(far):g} s are {gap:.2g} s apart; "
-                + _checks.advice_for_large_times(times.dtype)
+                f"{float(far):g} s are {gap:.2g} s apart; " + _checks.advice_on_times(times.dtype)
             )
     return abs(step)
 

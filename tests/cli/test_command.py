@@ -93,7 +93,7 @@ def test_programs_are_kept_in_a_folder_of_the_users_own(
         (tmp_path / "rigidjax").mkdir()
         (tmp_path / "rigidjax").chmod(mode)
     monkeypatch.setattr(os, "getuid", lambda: user + owner)
-    command._keep_compiled_programs()
+    command._keep_programs()
     assert ("jax_compilation_cache_dir" in said) == used
     err = capsys.readouterr().err
     assert (err == "") == used and ("is not yours alone" in err) != used
@@ -216,7 +216,7 @@ def test_ctrl_c_is_not_lost_in_the_garbage_collector(monkeypatch):
         def __del__(self):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(sys, "unraisablehook", command._raise_interrupt_again)
+    monkeypatch.setattr(sys, "unraisablehook", command._raise_again)
     # A job in the background is started with Ctrl-C ignored.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     begin = time.monotonic()

@@ -307,7 +307,7 @@ def test_tables_against_numpy(rows):
     line = np.stack([np.interp(at, times, values[:, i]) for i in range(3)], axis=1)
     linear = torques.Linear(times, values)
     np.testing.assert_allclose(jax.vmap(linear)(at), line, rtol=1e-12, atol=1e-13)
-    inside = (at >= times[0]) & (at < times[-1])
+    inside = (at >= times[0]) & (at <= times[-1])
     table = torques.Tabulated(times, values)
     found = jax.vmap(lambda t: table(t, SPIN, INERTIA))(at)
     np.testing.assert_allclose(found, line * inside[:, None], rtol=1e-12, atol=1e-13)

@@ -429,7 +429,7 @@ way(
     lambda i, c, q, w: (
         EulerEquations(rj.Inertia(i), laws.ConstantTorque(c))(0.0, rj.Spin(w)),
         EulerEquations(rj.Inertia(i), laws.ConstantTorque(c)).angular_acceleration(0.0, rj.Spin(w)),
-        EulerEquations(rj.Inertia(i)).angular_acceleration_under(c, rj.Spin(w)),
+        EulerEquations(rj.Inertia(i)).acceleration_under(c, rj.Spin(w)),
         AttitudeEquations(rj.Inertia(i), laws.InSpace(c))(0.0, rj.Attitude(q, w)),
         rj.equations_of_motion(rj.Inertia(i), rj.Attitude(q, w), laws.InSpace(c))(
             0.0, rj.Attitude(q, w), None),

@@ -9,20 +9,16 @@ from rigidjax.cli.logs.columns import Columns
 
 
 def read_npz(path: Path, columns: Sequence[str]) -> Columns:
-    """Return two things: the names of all arrays in a `.npz` file; and a dict of the arrays that
-    `columns` name.
-    """
+    """Return the wanted arrays of a `.npz` file."""
     # The file is opened here, since NumPy does not close a file that it opened and cannot read.
     with path.open("rb") as raw, np.load(raw) as file:
-        return file.files, {name: file[name] for name in columns if name in file.files}
+        return Columns(file.files, {name: file[name] for name in columns if name in file.files})
 
 
 def read_mat(path: Path, columns: Sequence[str]) -> Columns:
-    """Return two things: the names of all arrays in a `.mat` file; and a dict of the arrays that
-    `columns` name.
-    """
+    """Return the wanted arrays of a `.mat` file (MATLAB up to v7)."""
     from scipy.io import loadmat, whosmat
 
     with path.open("rb") as raw:
         names = [name for name, *_ in whosmat(raw)]
-        return names, loadmat(raw, variable_names=list(columns))
+        return Columns(names, loadmat(raw, variable_names=list(columns)))

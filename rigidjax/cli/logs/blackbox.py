@@ -49,18 +49,15 @@ _LIKE_A_SCALE = re.compile(
 
 
 def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
-    """Return two things: the names of all fields in one flight of a Blackbox log; and a dict of the
-    fields that `columns` name.
+    """Return the wanted fields of one flight of a Blackbox log: rates in deg/s and accelerations in
+    g, by the scales in the header, as in the flight controllers' own viewer; other fields as
+    logged.
 
-    A frame is one record of the log: an I frame holds whole values, and a P frame holds differences
-    from the frames before it. P frames before the first I frame, and all frames from a damaged
-    frame to the next I frame, are left out with a warning. A log without its end mark is read to
-    the end of the file.
-
-    Rates are in deg/s and accelerations in g, by the scales in the header, as in the flight
-    controllers' own viewer; other fields are as logged. It **warns** of a scale that is missing or
-    not known. **Raises** `LogError` if no flight has frames, if several have and `flight` is
-    `None`, and for a flight without frames.
+    P frames before the first I frame, and all frames from a damaged frame to the next I frame, are
+    left out with a warning. A log without its end mark is read to the end of the file. It **warns**
+    of a scale that is missing or not known. **Raises** `LogError` if no flight has frames, if
+    several have and `flight` (from 1) is `None`, and for a flight that is not there or without
+    frames.
     """
     library = _checks.import_library("orangebox.reader", "blackbox", str(path))
     begins, whole = library.Reader(str(path)).log_pointers, path.read_bytes()
@@ -85,29 +82,27 @@ def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None)
     data = whole[flights[index]]
     log = _Flight(library.Reader(str(path), index), data)
     rows = {name: array("d") for name in columns if name in log.names}
-    factors, groups = _factors_to_deg_per_s_and_g(path, log.headers, list(rows)), array("q")
-    for group, frame in log.decode_frames_with_groups():
+    factors, groups = _factors(path, log.headers, list(rows)), array("q")
+    for group, frame in log.frames():
         groups.append(group)
         for name, numbers in rows.items():
             numbers.append(frame[name])
-    keep = ~np.isin(np.frombuffer(groups, np.int64), log.order.groups_with_missing_frames())
+    keep = ~np.isin(np.frombuffer(groups, np.int64), log.order.lossy_groups())
     log.left_out += int((~keep).sum())
     if log.left_out:
         warn(
             f"{path}: {log.left_out} of {log.count} frames are left out: they depend on an I frame "
             "that is missing, or on a frame that is damaged"
         )
-    return log.names, {
-        name: log.wrap_to_32_bits(name, np.frombuffer(numbers, float)[keep]) * factors[name]
-        for name, numbers in rows.items()
-    }
+    values = {name: np.frombuffer(numbers, float)[keep] for name, numbers in rows.items()}
+    return Columns(
+        log.names, {name: log.wrapped(name, x) * factors[name] for name, x in values.items()}
+    )
 
 
 class _Bytes:
-    """Provide the bytes of a Blackbox log one by one to the package orangebox, which decodes the
-    numbers in such logs.
-
-    The field `place` is the index of the byte that is read next.
+    """Provide the bytes of a log one by one to the package orangebox, which decodes the numbers;
+    `place` is the index of the next byte.
     """
 
     def __init__(self, data: bytes, place: int):
@@ -120,13 +115,7 @@ class _Bytes:
 
 
 class _Flight:
-    """Hold one flight of a Blackbox log: its header, and its frames in the order of the log.
-
-    A frame is one record of the log; an I frame holds whole values, and a P frame holds differences
-    from the frames before it. **Fields**, among others: `names` the names of all fields of the
-    frames; `count` the number of I and P frames that were read so far; `left_out` the number of
-    these frames that were left out.
-    """
+    """Hold one flight of a Blackbox log: its header, and its frames in the order of the log."""
 
     def __init__(self, reader: Any, data: bytes):
         types = _checks.import_library("orangebox.types", "blackbox", "a Blackbox log")
@@ -136,6 +125,7 @@ class _Flight:
         self.context = context(self.headers, self.fields)
         self.kinds = {ord(kind.value): kind for kind in types.FrameType}
         self.kind, self.frame = types.FrameType, types.Frame
+        # `count` I and P frames were read so far, of which `left_out` were left out.
         self.data, self.count, self.left_out = data, 0, 0
         self.order = _Order()
         self.main = [field.name for field in self.fields[self.kind.INTRA]]
@@ -143,11 +133,11 @@ class _Flight:
         self.others = [field.name for kind in others for field in kind]
         self.names = list(dict.fromkeys([*self.main, *self.others]))
 
-    def wrap_to_32_bits(self, name: str, values: np.ndarray) -> np.ndarray:
-        """Return the `values` of the field `name` as the 32-bit integers that the flight controller
-        had: sums of many differences may lie outside of the range of such integers. The time, and
-        the fields of slow frames and GPS frames (which hold other quantities than I and P frames),
-        are returned unchanged.
+    def wrapped(self, name: str, values: np.ndarray) -> np.ndarray:
+        """Return the values of a field as the 32-bit integers that the flight controller had, which
+        sums of many differences may leave.
+
+        The time, and the fields of slow and GPS frames, are no such sums.
         """
         if name not in self.main or name == "time":
             return values
@@ -155,20 +145,17 @@ class _Flight:
             return (values + _WRAP / 2) % _WRAP - _WRAP / 2
         return values % _WRAP
 
-    def decode_frames_with_groups(self) -> Iterator[tuple[int, Mapping[str, float]]]:
-        """Yield a pair for each frame that can be decoded: its group, and its fields by name.
+    def frames(self) -> Iterator[tuple[int, Mapping[str, float]]]:
+        """Yield each I and P frame that can be used, in order: its group, and its fields by name.
 
-        A frame is one record of the log. An I frame holds whole values; a P frame holds differences
-        from the frames before it. The group of a P frame is the number of the last I frame before
-        it, counted from 1. An I frame, which depends on no other frame, has the group -1. Fields of
-        slow and GPS frames have the values of the last such frame, and are NaN before the first
-        such frame.
+        The group of a P frame is the number of the last I frame before it, from 1; an I frame,
+        which depends on no other frame, has the group -1. Slow and GPS frames yield nothing: their
+        fields, NaN before the first such frame, stand in the I and P frames after them. The field
+        `time` goes on where the 32-bit counter of the log starts again from zero.
         """
         order, lost = self.order, 0
-        stream, others = (
-            _Bytes(self.data, _HEADER.match(self.data).end()),  # pyright: ignore
-            dict.fromkeys(self.others, np.nan),
-        )
+        stream = _Bytes(self.data, _HEADER.match(self.data).end())  # pyright: ignore
+        others = dict.fromkeys(self.others, np.nan)
         while stream.place < len(self.data):
             kind = self.kinds.get(next(stream))
             begin = stream.place
@@ -185,16 +172,16 @@ class _Flight:
                 lost = 0
             try:
                 if kind == self.kind.EVENT:
-                    event, numbers = self._read_event_kind_and_integers(stream)
+                    event, numbers = self._event(stream)
                     if event == _LOG_END:
                         return
                     if event == _RESUME:
-                        order.resume_after_pause(numbers)
+                        order.resume(numbers)
                     continue
-                values = self._decode_frame(stream, kind)
+                values = self._decode(stream, kind)
             except IndexError:
                 values = ()
-            if not values or not self._is_frame_or_end_at(stream.place):
+            if not values or not self._is_boundary(stream.place):
                 # This frame is damaged, so that its decoder may have read beyond the letter with
                 # which the next frame begins. Reading therefore begins again after the letter of
                 # this frame.
@@ -204,8 +191,11 @@ class _Flight:
                 others |= zip((field.name for field in self.fields[kind]), values, strict=True)
                 if kind != self.kind.SLOW:
                     self.context.add_frame(self.frame(kind, values))
-            elif not order.store_frame_if_in_order(
-                values[:2], kind == self.kind.INTRA, self._expected_iteration_of_next_frame()
+            elif not order.accept(
+                values[:2],
+                kind == self.kind.INTRA,
+                # The header says how many iterations are skipped after a frame.
+                self.context.last_iter + 1 + self.context.count_skipped_frames(),
             ):
                 self.left_out += 1
             else:
@@ -214,21 +204,9 @@ class _Flight:
                 fields = dict(zip(self.main, values, strict=True)) | {"time": order.time}
                 yield -1 if kind == self.kind.INTRA else order.groups, others | fields
 
-    def _expected_iteration_of_next_frame(self) -> int:
-        """Return the iteration of the flight controller's loop at which the next frame must have
-        been written, if no frame is missing.
-
-        A frame is one record of the log. The header says after how many iterations a frame is
-        written.
-        """
-        return self.context.last_iter + 1 + self.context.count_skipped_frames()
-
-    def _is_frame_or_end_at(self, index: int) -> bool:
-        """Return whether the byte `index` of the data is where one of three things begins: a frame;
-        a P frame whose first byte (its letter P) is damaged; or the end of the data.
-
-        If none of them begins there, the frame before this byte is probably damaged, and has too
-        few bytes or too many. Erased memory counts as the end of the data.
+    def _is_boundary(self, index: int) -> bool:
+        """Return whether a frame (or a P frame whose letter is damaged), erased memory or the end
+        of the data begins at a byte: else the frame before this byte is probably damaged.
         """
         if index == len(self.data) or self.data[index] in self.kinds:
             return True
@@ -236,18 +214,13 @@ class _Flight:
             return True
         stream = _Bytes(self.data, index + 1)
         try:
-            self._decode_frame(stream, self.kind.INTER)
+            self._decode(stream, self.kind.INTER)
         except IndexError:
             return False
         return stream.place == len(self.data) or self.data[stream.place] in self.kinds
 
-    def _decode_frame(self, stream: _Bytes, frame_type: Any) -> tuple[Any, ...]:
-        """Return the numbers of one frame (a record of the log), decoded from the bytes that begin
-        at the present place of `stream`.
-
-        `frame_type` is the type of the frame, such as INTRA for an I frame, which holds whole
-        values.
-        """
+    def _decode(self, stream: _Bytes, frame_type: Any) -> tuple[Any, ...]:
+        """Return the numbers of the frame that begins at the present place of `stream`."""
         context, fields, values = self.context, self.fields[frame_type], ()
         context.frame_type, context.field_index = frame_type, 0
         while context.field_index < len(fields):
@@ -258,77 +231,66 @@ class _Flight:
                 context.field_index += 1
         return values
 
-    def _read_event_kind_and_integers(self, stream: _Bytes) -> tuple[int, list[int]]:
-        """Read one event from the `stream`, and return its kind and the integers that it holds.
-
-        An event is a record of the log without readings, such as the end of a pause of the logging.
-        For an event of an unknown kind the kind is -1, and no integers are read.
+    def _event(self, stream: _Bytes) -> tuple[int, list[int]]:
+        """Read an event, and return its kind and the integers that it holds; of an unknown kind -1
+        and none.
         """
         event = next(stream)
-        if event == _LOG_END:
-            is_last = self.data.startswith(_END_MARK, stream.place)
-            return (_LOG_END if is_last else -1), []
+        if event == _LOG_END and self.data.startswith(_END_MARK, stream.place):
+            return event, []
+        count = _EVENT_NUMBERS.get(event)
         if event == _ADJUSTMENT:
+            count = 1
             if next(stream) > 127:
                 stream.place += 4
-                return event, []
-            return event, [_read_variable_length_integer(stream)]
-        if event not in _EVENT_NUMBERS:
+                count = 0
+        if count is None:
             return -1, []
-        return event, [_read_variable_length_integer(stream) for _ in range(_EVENT_NUMBERS[event])]
+        return event, [_varint(stream) for _ in range(count)]
 
 
 class _Order:
-    """Check the order of the frames of a Blackbox log by their iterations and times.
+    """Check the order of the frames by their iterations and times, µs.
 
-    An I frame holds whole values; a P frame holds differences from the frames before it. A group is
-    an I frame and the P frames after it, up to the next I frame.
-
-    **Fields**, among others:
-
-    - `groups`: the number of groups so far.
-    - `incomplete`: the numbers of the groups from which frames are missing.
-    - `time`: the time of the last frame, µs; it goes on where the 32-bit counter of the log starts
-      again from zero.
-    - `is_valid`: whether no frame since the last I frame was damaged or missing.
+    A group is an I frame and the P frames after it, up to the next I frame.
     """
 
     def __init__(self):
+        # `is_valid`: no frame since the last I frame was damaged or missing.
         self.is_valid, self.is_resumed = False, False
+        # The iteration and the time of the last frame, and of the last I frame.
         self.last: Sequence[int] = ()
         self.last_key: Sequence[int] = ()
+        # The times of these frames, µs, which go on where the 32-bit counter starts again.
         self.time, self.key_time = 0, 0
+        # The count of groups, and the numbers of those from which frames are missing.
         self.groups, self.incomplete = 0, list[int]()
 
-    def resume_after_pause(self, iteration_and_time: Sequence[int]) -> None:
-        """Set the iteration and the time of the last frame to those of the event that ends a pause
-        of the logging: the next frame is compared with this event, not with the last frame before
-        the pause.
+    def resume(self, iteration_and_time: Sequence[int]) -> None:
+        """Compare the next frame with the event that ends a pause of the logging, not with the
+        frame before it.
         """
         self.last = self.last_key = tuple(iteration_and_time)
         self.is_resumed = True
 
-    def store_frame_if_in_order(
-        self, iteration_and_time: Sequence[int], is_i_frame: bool, expected_iteration: int
-    ) -> bool:
-        """Return whether a frame can be used, and if so, store it as the last frame. An I frame can
-        be used if it follows the last I frame closely, or is the first one; a P frame, if it
-        follows the last frame closely and no frame since the last I frame was left out.
+    def accept(self, values: Sequence[int], is_i_frame: bool, expected: int) -> bool:
+        """Return whether a frame can be used: an I frame that follows the last I frame closely, or
+        is the first; a P frame that follows the last frame closely, if no frame since the last I
+        frame was left out.
 
-        - `iteration_and_time`: the iteration of the flight controller's loop at which the frame was
-          written, and the time, µs.
-        - `is_i_frame`: whether it is an I frame, which holds whole values; a P frame holds
-          differences.
-        - `expected_iteration`: the iteration that the frame has if no frame is missing.
+        A frame that can be used becomes the last frame. The iteration `expected` is that of the
+        frame if none is missing before it.
         """
-        values = iteration_and_time
         if is_i_frame:
-            is_unbroken = self.is_valid and not self.is_resumed
-            if is_unbroken and self._are_frames_missing_before(values, expected_iteration):
-                self.incomplete.append(self.groups)
-            self.is_valid = not self.last_key or _closely_follows_frame(self.last_key, values)
+            if self.is_valid and not self.is_resumed:
+                # An iteration that jumps by _ITERATION_JUMP or more means a pause of the logging,
+                # in which no frames are missing.
+                is_earlier = (values[1] - self.last[1]) % _WRAP >= _WRAP // 2
+                if is_earlier or 0 < (values[0] - expected) % _WRAP < _ITERATION_JUMP:
+                    self.incomplete.append(self.groups)
+            self.is_valid = not self.last_key or _follows(self.last_key, values)
         else:
-            self.is_valid = self.is_valid and _closely_follows_frame(self.last, values)
+            self.is_valid = self.is_valid and _follows(self.last, values)
         if self.is_valid:
             if is_i_frame:
                 # The time of a frame is computed from the time of the last I frame, since a wrong
@@ -345,34 +307,17 @@ class _Order:
             self.last_key, self.is_resumed = values, False
         return self.is_valid
 
-    def _are_frames_missing_before(self, i_frame: Sequence[int], expected_iteration: int) -> bool:
-        """Return whether frames (records of the log) are missing before an I frame, which is a
-        frame that holds whole values and not differences.
-
-        The first number of a frame counts the iterations of the flight controller's loop. If it
-        jumps by more than `_ITERATION_JUMP`, the logging was paused, and no frames are missing.
-
-        - `i_frame`: the iteration of the I frame, and its time, µs.
-        - `expected_iteration`: the iteration that the I frame has if no frame is missing.
-        """
-        is_earlier = (i_frame[1] - self.last[1]) % _WRAP >= _WRAP // 2
-        return is_earlier or 0 < (i_frame[0] - expected_iteration) % _WRAP < _ITERATION_JUMP
-
-    def groups_with_missing_frames(self) -> list[int]:
-        """Return the numbers of the groups from which frames are missing.
-
-        A group is an I frame and the P frames after it. The result is empty if frames seem to be
-        missing from half of all groups or more: the interval between frames that the header states
-        is then not the interval in the log.
+    def lossy_groups(self) -> list[int]:
+        """Return the groups from which frames are missing; none if these seem to be half of all
+        groups or more: the header then states another interval of frames than that of the log.
         """
         return self.incomplete if 2 * len(self.incomplete) < self.groups else []
 
 
-def _read_variable_length_integer(stream: _Bytes) -> int:
-    """Return the integer of variable length that begins at the present place of `stream`.
-
-    Each byte holds seven bits of the integer, the lowest bits first; the eighth bit is set if more
-    bytes follow. An integer of more than five bytes is damaged, and the result is zero.
+def _varint(stream: _Bytes) -> int:
+    """Return the integer of variable length at the present place of `stream`: seven bits a byte,
+    the lowest first; the eighth is set if more bytes follow. One of more than five bytes is
+    damaged, and gives zero.
     """
     number, shift = 0, 0
     while shift < 35:
@@ -384,25 +329,20 @@ def _read_variable_length_integer(stream: _Bytes) -> int:
     return 0
 
 
-def _closely_follows_frame(last_frame: Sequence[int], frame: Sequence[int]) -> bool:
-    """Return whether a frame follows the last frame closely: its iteration and its time are not
-    before those of the last frame, and not further after them than the flight controllers' own
-    decoder of such logs allows.
-
-    Both arguments hold an iteration of the flight controller's loop, and a time, µs.
+def _follows(last_frame: Sequence[int], frame: Sequence[int]) -> bool:
+    """Return whether a frame follows the last one as closely as the flight controllers' own decoder
+    wants.
     """
     iteration, time = ((new - old) % _WRAP for old, new in zip(last_frame, frame, strict=True))
     return iteration < _ITERATION_JUMP and time < _TIME_JUMP
 
 
-def _factors_to_deg_per_s_and_g(
-    path: Path, headers: Mapping[str, Any], columns: Sequence[str]
-) -> dict[str, float]:
-    """Return the factor of each of the `columns`, which converts the integers of the log at `path`:
-    rates to deg/s, accelerations to g, and commands to their usual unit.
+def _factors(path: Path, headers: Mapping[str, Any], columns: Sequence[str]) -> dict[str, float]:
+    """Return the factors of the wanted fields: from integers to deg/s, g, and the usual units of
+    commands.
 
-    It warns of a scale that is missing in the `headers`, and of a header that may change a unit in
-    a way that is not known.
+    It **warns** of a scale that is missing, and of a header that may change a unit in a way that is
+    not known.
     """
     finer = headers.get("blackbox_high_resolution", 0)
     gyro, one_g = headers.get("gyro_scale", headers.get("gyro.scale")), headers.get("acc_1G")

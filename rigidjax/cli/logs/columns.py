@@ -1,7 +1,13 @@
 """Define the type of the result of a reader of binary logs."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
-# The function that reads logs of one format returns this pair: the names of all columns of the log,
-# and a dict of the arrays of the wanted columns by name.
-Columns = tuple[list[str], dict[str, Any]]
+
+class Columns(NamedTuple):
+    """Hold the columns that were read from a binary log."""
+
+    # The names of all columns of the log, also of those that were not read.
+    names: Sequence[str]
+    # The wanted columns by name; a column that the log lacks is left out.
+    arrays: dict[str, Any]

@@ -15,13 +15,13 @@ FIRST_BYTE = 0xBC
 
 
 def read_crazyflie(path: Path, columns: Sequence[str]) -> Columns:
-    """Return two things: the names of all variables in a Crazyflie's µSD log, such as `gyro.x`; and
-    a dict of the variables that `columns` name.
+    """Return the wanted variables of a Crazyflie's µSD log, such as `gyro.x`; the times are the
+    variable `timestamp`, µs.
 
-    The times are the variable `timestamp`, µs. A log holds several events, each with its own
-    variables and times. The event that has most of the wanted variables is read, and if two events
-    have equally many, the event with more data. Source: the description of the format in the
-    documentation of the firmware, "µSD card deck", versions 1 and 2.
+    A log holds several events, each with its own variables and times. The event that has most of
+    the wanted variables is read, and of two events with equally many the one with more data.
+    Source: the description of the format in the documentation of the firmware, "µSD card deck",
+    versions 1 and 2.
     """
     data = path.read_bytes()
     version, count = struct.unpack_from("<HH", data, 1)
@@ -54,4 +54,5 @@ def read_crazyflie(path: Path, columns: Sequence[str]) -> Columns:
     arrays = dict(zip(names, table, strict=True))
     arrays["timestamp"] = arrays["timestamp"] * (1e3 if version == 1 else 1.0)
     every = [name for names, *_ in events.values() for name in names]
-    return list(dict.fromkeys(every)), {name: arrays[name] for name in columns if name in arrays}
+    wanted = {name: arrays[name] for name in columns if name in arrays}
+    return Columns(list(dict.fromkeys(every)), wanted)

@@ -9,28 +9,23 @@ from rigidjax import _checks
 
 
 class LogError(ValueError):
-    """Describe why a log, which is a file of measurements, cannot be read.
-
-    The message names the file and, if they are known, the line and the column.
+    """Describe why a log cannot be read: the message names the file and, if known, the line and
+    column.
     """
 
     def __str__(self) -> str:
-        """Return the message with control characters escaped, since the name of a file or column
-        may contain characters that are commands for a terminal.
+        """Return the message with control characters escaped: the name of a file or column may
+        contain commands for a terminal.
         """
         return _checks.escape_controls(super().__str__())
 
 
 class LogWarning(UserWarning):
-    """Describe which part of a log (a file of measurements) is left out, or why the units of the
-    log are doubtful.
-    """
+    """Describe which part of a log is left out, or why its units are doubtful."""
 
 
 def list_names(names: Sequence[str]) -> str:
-    """Return the `names` of the columns of a log for a message; of many names or a long one only
-    the first part.
-    """
+    """Return the names of columns for a message; of many names or a long one the first part."""
     more = f", and {len(names) - 40} more" if len(names) > 40 else ""
     return ", ".join(name[:60] for name in names[:40]) + more
 

@@ -6,18 +6,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rigidjax.cli.logs.blackbox import ACCELERATIONS, RATES
-from rigidjax.cli.logs.table import BINARY, lowercase_file_ending
+from rigidjax.cli.logs.errors import LogError
+from rigidjax.cli.logs.table import BINARY, file_ending
 from rigidjax.cli.logs.text import open_text, read_header
-from rigidjax.cli.logs.units import TIME_UNITS, unit_in_column_name
+from rigidjax.cli.logs.units import TIME_UNITS, unit_in_name
 
 
 class ImuColumns(NamedTuple):
-    """Hold the names and units of the columns of a log with the times and the body rates.
+    """Hold the names and units of the columns of a log with the times and the body rates."""
 
-    **Fields:** `columns` four names: of the column of the times, and of the columns of the body
-    rates about x, y and z; `unit` the unit of the rates; `time_unit` the unit of the times.
-    """
-
+    # The times, and the rates about x, y and z.
     columns: tuple[str, str, str, str]
     unit: str
     time_unit: str
@@ -36,70 +34,47 @@ _UNITS = {
 _UNITS[".bfl"] = _UNITS[".bbl"]
 
 
-def known_unit_of_column(path: str | Path, column: str) -> str | None:
-    """Return the unit that the column named `column` has in every log of one format, or `None` if
-    the format does not determine the unit. The format is that of the log at `path`, and follows
-    from the ending of this name.
+def known_unit(path: str | Path, column: str) -> str | None:
+    """Return the unit that a column has in every log of the format of `path`, or `None`; the ending
+    of the name tells the format.
     """
-    units = _UNITS.get(lowercase_file_ending(Path(path)), {})
+    units = _UNITS.get(file_ending(Path(path)), {})
     return next((units[part] for part in re.split(r"[.\[]", column) if part in units), None)
 
 
-def imu_columns_of(path: str | Path) -> ImuColumns:
-    """Return the columns of the times and the body rates of a log, or the usual columns t, wx, wy,
-    wz if the columns of this log are not known.
+def imu_columns(path: str | Path) -> ImuColumns:
+    """Return the columns of the times and the body rates of a log; the usual columns t, wx, wy, wz
+    if those of this log are not known.
 
-    The columns of a text log are found by the units in their names: the app phyphox, for example,
-    writes the same units in all languages, but not the same words.
+    Those of a text log are found by the units in their names: the app phyphox, for example, writes
+    the same units in all languages, but not the same words.
     """
     path = Path(path)
     # Errors of a log that cannot be read are suppressed here, since the function that reads the log
     # raises them later with better messages.
     with contextlib.suppress(Exception):
-        if lowercase_file_ending(path) in BINARY:
-            return _imu_columns_of_binary(path) or USUAL
+        if file_ending(path) in BINARY:
+            columns = _binary_columns(path)
+            unit = known_unit(path, columns[1]) or "rad/s"
+            return ImuColumns(columns, unit, known_unit(path, columns[0]) or "s")
         with open_text(path) as file:
-            return _imu_columns_by_units_in_names(read_header(file).names) or USUAL
+            units = {name: unit_in_name(name, ()) for name in read_header(file).names}
+        # There must be one column with a unit of time, and for each axis one with a unit of rates:
+        # unpacking raises an error, which is suppressed, if there are none or several.
+        (time,) = (name for name, unit in units.items() if unit in TIME_UNITS)
+        rates = [name for name, unit in units.items() if unit in ("rad/s", "deg/s")]
+        (x,), (y,), (z,) = (
+            [name for name in rates if re.search(rf"\b{axis}\W*[(\[]", name)] for axis in "xyz"
+        )
+        return ImuColumns((time, x, y, z), str(units[x]), str(units[time]))
     return USUAL
 
 
-def _imu_columns_by_units_in_names(column_names: list[str]) -> ImuColumns | None:
-    """Return the columns of a text log whose names contain the unit of a time, or an axis x, y or z
-    and the unit of a body rate.
-
-    The result is `None` unless there is exactly one such column for the time and one for the rate
-    about each axis.
+def _binary_columns(path: Path) -> tuple[str, str, str, str]:
+    """Return the fields of a binary log with the times and the rates about x, y and z; raise
+    `LogError` if it has no rates.
     """
-    times = {n: unit for n in column_names if (unit := unit_in_column_name(n, ())) in TIME_UNITS}
-    rates = {
-        n: unit for n in column_names if (unit := unit_in_column_name(n, ())) in ("rad/s", "deg/s")
-    }
-    axes = [[n for n in rates if re.search(rf"\b{axis}\W*[(\[]", n)] for axis in "xyz"]
-    if len(times) != 1 or any(len(one) != 1 for one in axes):
-        return None
-    (x,), (y,), (z,) = axes
-    ((time, time_unit),) = times.items()
-    return ImuColumns((time, x, y, z), str(rates[x]), str(time_unit))
-
-
-def _imu_columns_of_binary(path: Path) -> ImuColumns | None:
-    """Return the columns of the times and the body rates of a binary log, with their units, or
-    `None` if the log has no body rates.
-    """
-    columns = _time_and_rate_columns_of_binary(path)
-    if columns is None:
-        return None
-    time, x, *_ = columns
-    return ImuColumns(
-        columns, known_unit_of_column(path, x) or "rad/s", known_unit_of_column(path, time) or "s"
-    )
-
-
-def _time_and_rate_columns_of_binary(path: Path) -> tuple[str, str, str, str] | None:
-    """Return the names of the fields of a binary log with the times and with the body rates about
-    x, y and z, or `None` if the log has no body rates.
-    """
-    kind = lowercase_file_ending(path)
+    kind = file_ending(path)
     if kind in (".bbl", ".bfl"):
         return "time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]"
     if kind == ".usd":
@@ -117,4 +92,4 @@ def _time_and_rate_columns_of_binary(path: Path) -> tuple[str, str, str, str] | 
                 time = next(f"{topic}.{t}" for t in times if f"{topic}.{t}" in names)
                 x, y, z = (f"{topic}.{stem}{part}" for part in parts)
                 return time, x, y, z
-    return None
+    raise LogError(f"{path}: no body rates are in this log")

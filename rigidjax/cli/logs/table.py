@@ -57,10 +57,11 @@ def read_table(
     alone: all frames before the first I frame are left out, and all frames from a damaged frame to
     the next I frame.
 
-    **Raises:** `ValueError`, in one line that names file, line and column, for a file that is
-    missing, cut or of another kind; for a column that is missing, there twice, or wanted twice; for
-    a cell that is not a number, a line with more cells than the header, and columns of different
-    lengths; and for a log of several flights of which none is chosen.
+    **Raises:** `LogError`, a `ValueError`, in one line that names file, line and column, for a file
+    that is missing, cut or of another kind; for a column that is missing, there twice, or wanted
+    twice; for a cell that is not a number, a line with more cells than the header, and columns of
+    different lengths; for a flight of a log that has none, and a log of several flights of which
+    none is chosen. `TypeError` for columns that are no sequence of names.
 
     >>> read_table("missing.csv", ["t"])
     Traceback (most recent call last):
@@ -80,10 +81,12 @@ def read_table(
         raise LogError(f"{path}: no such file")
     if path.is_dir():
         raise LogError(f"{path}: is a folder, not a log")
-    if lowercase_file_ending(path) in _READERS:
-        return _read_binary_columns(path, columns, flight)
-    _refuse_flight_unless_blackbox(path, flight)
-    if path.suffix.lower() == ".gz" and lowercase_file_ending(path.with_suffix("")) in _READERS:
+    read = _READERS.get(file_ending(path))
+    if flight is not None and read is not read_blackbox:
+        raise LogError(f"{path}: flight {flight}: only a Blackbox log (.bbl, .bfl) has flights")
+    if read is not None:
+        return _binary(path, columns, flight)
+    if path.suffix.lower() == ".gz" and file_ending(path.with_suffix("")) in _READERS:
         raise LogError(f"{path}: only text is read while it is packed; unpack it first: gunzip")
     try:
         # The file is read line by line, so that only the numbers of a large file stay in memory.
@@ -94,7 +97,7 @@ def read_table(
         raise LogError(f"{path}: cannot be read as text ({why})") from None
 
 
-def lowercase_file_ending(path: Path) -> str:
+def file_ending(path: Path) -> str:
     """Return the ending of the name of a log in small letters; `.usd` for a Crazyflie's log without
     an ending.
     """
@@ -104,26 +107,13 @@ def lowercase_file_ending(path: Path) -> str:
         return ".usd" if file.read(1) == bytes([FIRST_BYTE]) else ""
 
 
-def _refuse_flight_unless_blackbox(path: Path, flight: int | None) -> None:
-    """Raise `LogError` if a `flight` is chosen. The caller has found that the log at `path` is not
-    a Blackbox log, and other logs have no flights.
+def _binary(path: Path, columns: Sequence[str], flight: int | None) -> dict[str, np.ndarray]:
+    """Read the wanted columns of a log that is not text, and return them by name; raise `LogError`
+    as `read_table`.
     """
-    if flight is not None:
-        raise LogError(f"{path}: flight {flight}: only a Blackbox log (.bbl, .bfl) has flights")
-
-
-def _read_binary_columns(
-    path: Path, columns: Sequence[str], flight: int | None
-) -> dict[str, np.ndarray]:
-    """Read the wanted columns of a log that is not text, and return them by name.
-
-    `flight` is the number of the flight in a Blackbox log, from 1, or `None`.
-    """
-    read: Any = _READERS[lowercase_file_ending(path)]
+    read: Any = _READERS[file_ending(path)]
     if read is read_blackbox:
         read = functools.partial(read_blackbox, flight=flight)
-    else:
-        _refuse_flight_unless_blackbox(path, flight)
     # For an empty or a cut file the readers raise errors of many kinds; the user gets a `LogError`
     # with the name of the file instead.
     try:
@@ -135,8 +125,7 @@ def _read_binary_columns(
     except Exception as error:
         why = f"{type(error).__name__}: {error}".splitlines()[0]
         raise LogError(
-            f"{path}: cannot be read; is it whole, and a {lowercase_file_ending(path)} file? "
-            f"({why})"
+            f"{path}: cannot be read; is it whole, and a {file_ending(path)} file? ({why})"
         ) from None
     out = {}
     for name in columns:

@@ -25,40 +25,34 @@ _LARGE, _MOST_TIMES = 10_000_000, 100
 
 
 def open_text(path: Path) -> io.TextIOWrapper:
-    """Return a text log as an open file, whether it is packed (`.gz`) or not; its encoding is found
-    from its first bytes.
+    """Return a text log, which may be packed (`.gz`), as an open file; its first bytes tell its
+    encoding.
+
+    **Raises** `LogError` for a packed file that unpacks to far more than its size.
     """
     packed = path.suffix.lower() == ".gz"
     if packed:
-        _refuse_if_packed_too_well(path)
+        # Nearly equal lines, which no readings are, would fill the memory or take minutes.
+        most, unpacked = max(_LARGE, _MOST_TIMES * path.stat().st_size), 0
+        with gzip.open(path, "rb") as file:
+            while piece := file.read(2**20):
+                unpacked += len(piece)
+                if unpacked > most:
+                    raise LogError(
+                        f"{path}: unpacks to more than {_MOST_TIMES} times its size: nearly all "
+                        "its lines are the same, so that it holds no readings"
+                    )
     raw: Any = gzip.open(path, "rb") if packed else path.open("rb")
     try:
-        return io.TextIOWrapper(raw, encoding=_encoding_of_first_bytes(raw.peek(8192)), newline="")
+        return io.TextIOWrapper(raw, encoding=_encoding(raw.peek(8192)), newline="")
     except BaseException:
         raw.close()
         raise
 
 
-def _refuse_if_packed_too_well(path: Path) -> None:
-    """Raise `LogError` if a packed file unpacks to far more than its size, as no readings do: it
-    would fill the memory, or take minutes.
-    """
-    most, unpacked = max(_LARGE, _MOST_TIMES * path.stat().st_size), 0
-    with gzip.open(path, "rb") as file:
-        while piece := file.read(2**20):
-            unpacked += len(piece)
-            if unpacked > most:
-                raise LogError(
-                    f"{path}: unpacks to more than {_MOST_TIMES} times its size: nearly all its "
-                    "lines are the same, so that it holds no readings"
-                )
-
-
-def _encoding_of_first_bytes(first_bytes: bytes) -> str:
-    """Return the encoding of a text, found from its `first_bytes`.
-
-    The encoding is UTF-16 if there is a byte-order mark, or if there are zeros between the letters.
-    Otherwise the encoding is UTF-8 if the bytes are valid in UTF-8, else Windows's code page 1252.
+def _encoding(first_bytes: bytes) -> str:
+    """Return the encoding of a text: UTF-16 if it has a byte-order mark or zeros between its
+    letters, UTF-8 if its bytes are valid there, else Windows's code page 1252.
     """
     if first_bytes[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return "utf-16"
@@ -73,20 +67,17 @@ def _encoding_of_first_bytes(first_bytes: bytes) -> str:
 
 
 class Header(NamedTuple):
-    """Hold the header of a text log.
-
-    **Fields:** `names` the names of the columns; `separator` the separator of cells; `line` the
-    number of the header's line; `after` the lines that were read after the header.
-    """
+    """Hold the header of a text log."""
 
     names: list[str]
     separator: str
+    # The number of the header's line, and the lines that were read after it.
     line: int
     after: list[str]
 
 
 def read_header(file: io.TextIOBase) -> Header:
-    """Read the header of a text log, open at its beginning: the first line that is neither empty
+    """Return the header of a text log, open at its beginning: its first line that is neither empty
     nor a comment (`#`).
 
     If this line contains a number in place of a name, or is missing, the last comment before it is
@@ -96,9 +87,9 @@ def read_header(file: io.TextIOBase) -> Header:
     while first.startswith("#") or (first and not first.strip()):
         comments = first if first.startswith("#") else comments
         first, line = file.readline(_LONGEST), line + 1
-    names, separator = _split_header_line(first)
+    names, separator = _split(first)
     if comments and (not first or any(map(_NUMBER.fullmatch, names))):
-        return Header(*_split_header_line(comments.lstrip("#")), line - 1, [first])
+        return Header(*_split(comments.lstrip("#")), line - 1, [first])
     return Header(names, separator, line, [])
 
 
@@ -108,20 +99,19 @@ _LONGEST = 131_072
 _NUMBER = re.compile(r"[-+.\d][-+.\deE]*")
 
 
-def _split_header_line(line: str) -> tuple[list[str], str]:
-    """Return two things: the names of columns in a header line; and their separator, which is the
-    comma, semicolon or tab that gives the most names.
+def _split(line: str) -> tuple[list[str], str]:
+    """Return the names of columns in a header line, and their separator: the comma, semicolon or
+    tab that gives the most names.
     """
     separator = max(SEPARATORS, key=line.count)
     return [name.strip() for name in next(csv.reader([line], delimiter=separator), [])], separator
 
 
 def read_columns(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read the wanted columns of a text line by line, and return them by name.
+    """Read the wanted columns of a text, open at its beginning, and return them by name.
 
-    - `path`: the path of the file, for error messages.
-    - `file`: the text, open at its beginning.
-    - `columns`: the names of the wanted columns.
+    **Raises** `LogError`, with the line and the column, for a column that is missing or there
+    twice, a line with more cells than the header, and a cell that is not a number.
     """
     header, separator, top, after = read_header(file)
     if not any(header):
@@ -166,8 +156,8 @@ def read_columns(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dic
 
 
 class _NumberReader:
-    """Read the cells of a text log as numbers; the first decimal sign in the log decides whether
-    all its decimals have a point or a comma.
+    """Read the cells of a text log as numbers: the first decimal sign decides whether all decimals
+    have a point or a comma.
     """
 
     def __init__(self, separator: str):
@@ -175,14 +165,12 @@ class _NumberReader:
         self.decimal: str | None = None
 
     def __call__(self, cell: str) -> float:
-        """Return the number in a cell, NaN for an empty cell; raise `ValueError` for other
-        cells.
-        """
+        """Return the number in a cell, NaN for an empty one; raise `ValueError` for other cells."""
         if not cell:
             return math.nan
         plain = cell
         if self.separator != "," and (self.decimal == "," or "," in cell):
-            plain = self._replace_decimal_comma(cell)
+            plain = self._with_point(cell)
         elif "." in cell:
             self.decimal = "."
         # `float` accepts more texts than a log may contain, such as 1_000 and digits of other
@@ -196,9 +184,9 @@ class _NumberReader:
             raise ValueError(f"{cell} is not a finite number; leave the cell empty for a gap")
         return value
 
-    def _replace_decimal_comma(self, cell: str) -> str:
-        """Return the cell with a point in place of its decimal comma; raise `ValueError` if earlier
-        cells have decimal points, or if the comma may mark thousands.
+    def _with_point(self, cell: str) -> str:
+        """Return the cell with a decimal point; raise `ValueError` after cells with points, and for
+        a comma that may mark thousands.
         """
         if "." in cell or self.decimal == ".":
             raise ValueError(f"{cell!r} is not a number; the decimals above have the other sign")

@@ -23,15 +23,12 @@ _SLOW = 0.1
 _GAP = 1e5
 
 
-def mask_of_increasing(t: np.ndarray) -> np.ndarray:
-    """Return a mask (n,) that keeps as many of the times `t` (n,) as possible, such that the kept
-    times increase.
+def increasing(t: np.ndarray) -> np.ndarray:
+    """Return a mask that keeps as many of the times `t` as possible, such that the kept times
+    increase.
 
-    The kept times are a longest increasing subsequence, found by patience sorting. If one time is
-    repeated, backward, far too large or missing (NaN), only the row of this time is therefore lost.
-
-    >>> mask_of_increasing(np.array([0.0, 1.0, 1.0, 90.0, 2.0, np.nan, 3.0])).tolist()
-    [True, True, False, False, True, False, True]
+    The kept times are a longest increasing subsequence, found by patience sorting: a time that is
+    repeated, backward, far too large or missing (NaN) costs its own row only.
     """
     if (np.diff(t) > 0).all() and np.isfinite(t).all():
         return np.ones(t.shape, bool)
@@ -56,16 +53,11 @@ def mask_of_increasing(t: np.ndarray) -> np.ndarray:
     return keep
 
 
-def rows_to_use(
+def increasing_rows(
     path: str | Path, t: np.ndarray, time_column: str, window: tuple[float, float] | None
 ) -> np.ndarray:
-    """Return the indices of the rows to use: those rows in the window whose times increase.
-
-    **Arguments:**
-
-    - `path`, `time_column`: the path of the file and the name of the time column, for messages.
-    - `t`: (T,) the times since the first time stamp, s.
-    - `window`: (from, to), s from the first time stamp, or `None` for all rows.
+    """Return the indices of the rows in the window whose times `t`, s since the first time stamp,
+    increase.
 
     It **warns** of rows in the window that are left out because their time is repeated, backward or
     missing. **Raises** `LogError` for fewer than four rows, if half of the times do not increase,
@@ -89,11 +81,23 @@ def rows_to_use(
                 f"{least:g} to {most:g} s"
             )
     rows = np.flatnonzero(inside)
-    keep = mask_of_increasing(t[rows])
+    keep = increasing(t[rows])
     if rows.size < _FEWEST:
         raise LogError(f"{path}: wanted at least {_FEWEST} samples, got {rows.size}")
-    bad = rows[~keep]
-    _refuse_clock_set_back(path, t, time_column, rows, keep)
+    # The clock was set back if successive rows that are not kept have times that form a second
+    # increasing series.
+    lost = np.flatnonzero(~keep)
+    for run in np.split(lost, np.flatnonzero(np.diff(lost) > 1) + 1):
+        if run.size >= _RESTART and (np.diff(t[rows[run]]) > 0).all():
+            # These rows are either the end of the series before the clock was set back, or the
+            # beginning of the series after it.
+            first, after = run[0], run[-1] + 1
+            row = rows[first if first and t[rows[first]] <= t[rows[first - 1]] else after]
+            raise LogError(
+                f"{path}: column {time_column!r}: the clock was set back at row {row + 1}, from "
+                f"{t[row - 1]:g} to {t[row]:g} s; make two logs of it, or choose a part by --window"
+            )
+    bad = rows[lost]
     if 2 * bad.size >= rows.size or keep.sum() < _FEWEST:
         raise LogError(
             f"{path}: column {time_column!r}: the times of {bad.size} of {rows.size} rows are "
@@ -108,38 +112,10 @@ def rows_to_use(
     return rows[keep]
 
 
-def _refuse_clock_set_back(
-    path: str | Path, t: np.ndarray, time_column: str, rows: np.ndarray, is_kept: np.ndarray
-) -> None:
-    """Raise `LogError` if the clock was set back: successive rows that are not kept then have times
-    that form a second increasing series.
+def warn_of_steps(path: str | Path, t: np.ndarray, time_unit: str, typical_rate: float) -> None:
+    """Warn of a long gap in the times `t`, s, and of times that are plainly not in their unit.
 
-    - `path`, `time_column`: the path of the file and the name of the time column, for messages.
-    - `t`: (T,) the times, s.
-    - `rows`: (n,) the indices of the rows in the wanted window.
-    - `is_kept`: (n,) whether each of these rows is kept.
-    """
-    bad = np.flatnonzero(~is_kept)
-    for run in np.split(bad, np.flatnonzero(np.diff(bad) > 1) + 1):
-        if run.size >= _RESTART and (np.diff(t[rows[run]]) > 0).all():
-            # The rows with bad times are either the end of the series before the clock was set
-            # back, or the beginning of the series after it.
-            first, after = run[0], run[-1] + 1
-            row = rows[first if first and t[rows[first]] <= t[rows[first - 1]] else after]
-            raise LogError(
-                f"{path}: column {time_column!r}: the clock was set back at row {row + 1}, from "
-                f"{t[row - 1]:g} to {t[row]:g} s; make two logs of it, or choose a part by --window"
-            )
-
-
-def warn_of_gap_or_wrong_unit(
-    path: str | Path, t: np.ndarray, time_unit: str, typical_rate: float
-) -> None:
-    """Warn of a long gap in the times, and of times that are plainly not in their unit.
-
-    **Arguments:** `path` the path of the file, for the message; `t` (T,) the times, s;
-    `time_unit` the unit in which the times were read; `typical_rate` a typical body rate, rad/s, or
-    zero without a gyro.
+    The typical body rate, rad/s, is zero without a gyro.
     """
     steps = np.diff(t)
     step = float(np.median(steps))

@@ -8,10 +8,10 @@ from rigidjax.cli.logs.columns import Columns
 
 
 def read_ulog(path: Path, columns: Sequence[str]) -> Columns:
-    """Return two things: the names of all fields in a ULog of PX4, as `topic.field`, such as
-    `sensor_combined.gyro_rad[0]`; and a dict of the fields that `columns` name.
+    """Return the wanted fields of a ULog of PX4, by names such as `sensor_combined.gyro_rad[0]`;
+    times are in µs.
 
-    A field of the second instance of a topic has the name `topic#1.field`. Times are in µs.
+    A field of the second instance of a topic has the name `topic#1.field`.
     """
     reader, arrays = _checks.import_library("pyulog", "ulog", str(path)).ULog, {}
     # The file is opened here, since the library pyulog does not close a file that it opened and
@@ -21,4 +21,4 @@ def read_ulog(path: Path, columns: Sequence[str]) -> Columns:
     for data in topics:
         topic = data.name + (f"#{data.multi_id}" if data.multi_id else "")
         arrays |= {f"{topic}.{name}": values for name, values in data.data.items()}
-    return list(arrays), {name: arrays[name] for name in columns if name in arrays}
+    return Columns(list(arrays), {name: arrays[name] for name in columns if name in arrays})

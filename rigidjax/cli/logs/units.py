@@ -42,57 +42,41 @@ _SIGNS = str.maketrans({
 })  # fmt: skip
 
 
-def unit_in_column_name(column: str, allowed: Sequence[str]) -> str | None:
+def unit_in_name(column: str, allowed: Sequence[str]) -> str | None:
     """Return the unit at the end of the name of a column, or `None` if no known unit is there.
 
-    A unit in brackets may be any of `UNITS`. A unit without brackets, after a blank, a comma or an
-    underscore, must be one of `allowed`. A power may be written with `^`, `**` or raised digits.
-
-    >>> unit_in_column_name("Gyroscope x (°/s)", ["rad/s"]), unit_in_column_name("wx", [])
-    ('deg/s', None)
-    >>> unit_in_column_name("wx_deg/s", ["deg/s"])
-    'deg/s'
+    A unit in brackets may be any of `UNITS`, since brackets hold little else; a unit after a blank,
+    a comma or an underscore must be one of `allowed`.
     """
     brackets = _IN_BRACKETS.search(column)
     if brackets:
-        return _UNIT_OF.get(_normalise_unit_spelling(brackets[1]))
+        return _UNIT_OF.get(_plain(brackets[1]))
     endings = (column[match.end() :] for match in re.finditer(r"[\s,_]+", column))
-    units = (_UNIT_OF.get(_normalise_unit_spelling(ending)) for ending in endings)
+    units = (_UNIT_OF.get(_plain(ending)) for ending in endings)
     return next((unit for unit in units if unit in allowed), None)
 
 
-def _normalise_unit_spelling(unit: str) -> str:
-    """Return the text of a unit in small letters and with one spelling of each sign. For example,
-    "°/S" gives "°/s", and "m/s²" gives "m/s2".
-
-    A capital G stays unchanged, since it means gauss, while g is the acceleration of gravity.
+def _plain(unit: str) -> str:
+    """Return a unit in small letters and with one spelling of each sign: "m/s2" for "m/s²". A
+    capital G means gauss, unlike g, and stays.
     """
     return unit.translate(_SIGNS).lower() if unit.strip() != "G" else unit
 
 
-def unit_of_columns(
+def common_unit(
     columns: Sequence[str],
     stated_unit: str | None,
     usual_unit: str,
     allowed: Sequence[str],
     message_start: str,
 ) -> str:
-    """Return the unit of columns of one quantity: the unit that the user states, else the unit in
-    the names of the columns, else the usual unit.
+    """Return the unit of columns of one quantity: the stated one, else that in their names, else
+    the usual one.
 
-    **Arguments:**
-
-    - `columns`: the names of the columns.
-    - `stated_unit`: the unit that the user states, or `None`.
-    - `usual_unit`: the unit of the columns if neither the names nor the user state a unit.
-    - `allowed`: the units that such a column may have.
-    - `message_start`: the first words of messages.
-
-    **Raises** `LogError` if the names and the user state different units, if two names do so, or if
-    a name states a unit that is not allowed. It **warns** of a name with an unknown unit in
-    brackets, if the user states no unit.
+    It **warns** of an unknown unit in brackets, if none is stated. **Raises** `LogError` for names
+    that contradict one another or the stated unit, and for a unit that is not allowed.
     """
-    in_names = {name: unit for name in columns if (unit := unit_in_column_name(name, allowed))}
+    in_names = {name: unit for name in columns if (unit := unit_in_name(name, allowed))}
     for name, unit in in_names.items():
         if unit not in allowed:
             wanted = " or ".join(allowed)

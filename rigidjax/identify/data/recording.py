@@ -153,7 +153,7 @@ class Recording(eqx.Module):
         index = int(np.argmax(off))
         words = (
             f"t: {self.t.dtype} changes the step of {steps[index]:.3g} s after {t[kept][index]} s "
-            f"to {held[index]:.3g} s; {_checks.advice_for_large_times(self.t.dtype)}"
+            f"to {held[index]:.3g} s; {_checks.advice_on_times(self.t.dtype)}"
         )
         if off[index] >= 1:
             raise ValueError(words)

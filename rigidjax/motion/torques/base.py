@@ -104,9 +104,8 @@ class AbstractTorque(eqx.Module):
 
 
 class AbstractForce(eqx.Module):
-    """Define a force on a body whose state is a `Rigid` (with position and velocity) and whose mass
-    is known (`MassProperties`): like `AbstractTorque`, but the value is a `Wrench`, a force and a
-    torque.
+    """Define a force on a body with a mass and a `Rigid` state: like `AbstractTorque`, but the
+    value is a `Wrench`.
     """
 
     feels: eqx.AbstractVar[type]
@@ -115,29 +114,25 @@ class AbstractForce(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, t: ScalarLike, state: PyTree, body: MassProperties) -> Wrench:
-        """Return the force (3,), N, world frame, and the torque (3,), N m, body frame, about the
-        centre of mass, on a `body` in the state of motion `state` at the time `t`, s.
+        """Return the force, N, world frame, and the torque about the centre of mass, N m, body
+        frame, at the time `t`, s.
         """
 
 
 class AbstractTimeTorque(AbstractTorque):
-    """Define a torque with vectors as fields, such as a magnetic field, each of which is constant
-    or a function of time.
+    """Define a torque with vectors as fields, such as a magnetic field, each constant or a function
+    of time.
     """
 
     @property
     def steady(self) -> bool:
-        """Return whether the torque does not depend on time: none of the vectors in its fields is a
-        function of time.
-        """
+        """Return whether no field of the torque is a function of time."""
         return not any(callable(part) for part in vars(self).values())
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times (n,), s, at which a vector in a field of the torque jumps or has a kink,
-        in ascending order.
-        """
-        return jump_times_of_fields(self)
+        """Return the times, s, ascending, at which a field of the torque jumps or has a kink."""
+        return field_jumps(self)
 
 
 # An argument with this type takes any callable `(t, state, body)` as a torque: the class of a
@@ -160,9 +155,6 @@ GRAVITY_HINT = "a vector in world axes, such as [0, 0, -9.81]"
 def require_torque(torque: object, name: str = "torque") -> None:
     """Raise `TypeError` unless `torque` can be called as a torque or force, with the arguments `(t,
     state, body)`.
-
-    - `torque`: any object that a user gave as a torque or force
-    - `name`: the name of the argument, for the message
     """
     if isinstance(torque, type):
         made = f"{torque.__name__}(...)"
@@ -184,11 +176,8 @@ def require_torque(torque: object, name: str = "torque") -> None:
 
 
 def may_read_attitude(torque: Torque | None) -> bool:
-    """Return whether a torque, or any torque in a `Sum`, may read the attitude of the body.
-
-    The attribute `feels` of the torque tells: a torque with `feels = HasSpin` reads the body rate
-    only, any other torque may read the attitude, and so may a torque without this attribute. The
-    torque `None` reads nothing.
+    """Return whether a torque, or any torque in a `Sum`, may read the attitude: unless it is `None`
+    or declares `feels = HasSpin`.
     """
     if hasattr(torque, "parts"):
         return any(may_read_attitude(part) for part in torque.parts)  # pyright: ignore
@@ -196,15 +185,15 @@ def may_read_attitude(torque: Torque | None) -> bool:
 
 
 def may_read_rate(torque: Torque | None) -> bool:
-    """Return whether a torque may read the body rate: true unless the torque is `None` or declares
-    `rate_free = True`.
+    """Return whether a torque may read the body rate: unless it is `None` or declares `rate_free =
+    True`.
     """
     return torque is not None and not getattr(torque, "rate_free", False)
 
 
 def require_state_type(torque: Torque, state: object) -> None:
-    """Raise `TypeError` unless `torque` can be called, and `state` has the parts (body rate,
-    attitude, position) that the torque declares in `feels`.
+    """Raise `TypeError` unless `torque` can be called, and `state` has the parts that it declares
+    in `feels`.
     """
     require_torque(torque)
     feels = getattr(torque, "feels", None)
@@ -216,12 +205,8 @@ def require_state_type(torque: Torque, state: object) -> None:
 
 
 def require_compatible(torque: Torque | None, state: object, body: object) -> None:
-    """Raise an error unless `torque` can be evaluated for this state of motion and this body.
-
-    - `torque`: a torque or force, or `None`; a torque with states of its own must have their values
-      inserted (see `freeze_own_states`)
-    - `state`: one state of motion with the parts that the torque reads
-    - `body`: one `Inertia` or `MassProperties`
+    """Raise an error unless `torque` can be evaluated for one state of motion and one body; states
+    of its own must be inserted.
     """
     _checks.require_unbatched_instance(
         state, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid"
@@ -229,20 +214,15 @@ def require_compatible(torque: Torque | None, state: object, body: object) -> No
     if torque is not None:
         require_state_type(torque, state)
         require_frozen_states(torque)
-        require_unbatched_torque(torque.law if isinstance(torque, FrozenLaw) else torque)
+        require_single(torque.law if isinstance(torque, FrozenLaw) else torque)
     _checks.require_unbatched_instance(body, (Inertia, MassProperties), "body")
 
 
 def evaluate_torque(
     torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> Vec3:
-    """Return the value (3,), N m, body frame, of a torque at one time. **Raises:** `TypeError` for
-    a model that returns a force as well, since this function returns the torque alone.
-
-    - `torque`: a callable (t, state, body)
-    - `t`: s, the time
-    - `state`: the state of motion, with the parts that the torque reads
-    - `body`: an `Inertia` or `MassProperties`
+    """Return the value of a torque, N m, body frame; raise `TypeError` for a model that returns a
+    force as well.
     """
     force, value = force_and_torque(torque, t, state, body)
     if force is not None:
@@ -256,15 +236,8 @@ def evaluate_torque(
 def force_and_torque(
     model: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> tuple[Vec3 | None, Vec3]:
-    """Evaluate a torque or force model at one time, and return two things: the force (3,) on the
-    centre of mass, N, world frame, or `None` for a pure torque; and the torque (3,) about the
-    centre of mass, N m, body frame.
-
-    - `model`: a callable (t, state, body) that returns a torque (3,) or a `Wrench`
-    - `t`: s, the time
-    - `state`: the state of motion, with the parts that `model` reads; the result has the precision
-      of this state
-    - `body`: an `Inertia` or `MassProperties`
+    """Return the force on the centre of mass, N, world frame, or `None` of a pure torque, and the
+    torque about the centre of mass, N m, body frame, in the precision of the state.
     """
     require_compatible(model, state, body)
     dtype = state.omega.dtype
@@ -277,12 +250,13 @@ def force_and_torque(
         with _checks.explain_tracing("torque", model):
             result = in_precision(model, dtype)(t, state, in_precision(body, dtype))
     except AttributeError as error:
-        message = missing_state_part_message(name, error)
+        message = missing_part(name, error)
         if message is None:
             raise
-        hint = "; a subclass of AbstractTorque declares the state that it reads by feels, such as"
-        hint += " feels = HasAttitude"
-        raise TypeError(message + hint) from error
+        raise TypeError(
+            f"{message}; a subclass of AbstractTorque declares the state that it reads by feels, "
+            "such as feels = HasAttitude"
+        ) from error
     # A model that returns a force is recognised by the field `force` of its value, not by the class
     # of the value: the modules of moving frames do not import this module, and have a class of
     # their own for a force and a torque.
@@ -301,12 +275,9 @@ _QUANTITY_AND_STATE_OF_FIELD = {
 }
 
 
-def missing_state_part_message(caller: str, error: AttributeError) -> str | None:
-    """Return the message for a user's function that reads a part which its state does not have,
-    such as the attitude of a `Spin`; return `None` if the error has another cause.
-
-    - `caller`: the name of the function, for the message
-    - `error`: the `AttributeError` that the function raised
+def missing_part(caller: str, error: AttributeError) -> str | None:
+    """Return the message for a user's function that reads a part which its state lacks, such as the
+    attitude of a `Spin`; `None` for another error.
     """
     if error.name not in _QUANTITY_AND_STATE_OF_FIELD or not isinstance(error.obj, HasSpin):
         return None
@@ -315,10 +286,9 @@ def missing_state_part_message(caller: str, error: AttributeError) -> str | None
     return f"{caller} looks at state.{error.name}, {has_none}: start from {state_with_field}"
 
 
-def require_unbatched_torque(torque: Torque) -> None:
-    """Raise `ValueError` if an array in a field of `torque` has the shape of many torques, such as
-    in a batch made by `jax.vmap`. A torque that a user defined is not checked, because its fields
-    may have any shape.
+def require_single(torque: Torque) -> None:
+    """Raise `ValueError` if a field has the shape of many torques, as in a batch by `jax.vmap`. A
+    user's own torque may have fields of any shape.
     """
     if not type(torque).__module__.startswith(__package__ or ""):
         return
@@ -333,78 +303,55 @@ def require_unbatched_torque(torque: Torque) -> None:
 
 
 def in_precision(tree: PyTree, dtype: DTypeLike) -> PyTree:
-    """Return `tree` (any tree of arrays and other objects) with every floating-point array
-    converted to `dtype`; integers, functions and other objects do not change.
-    """
+    """Return a pytree with every floating-point array converted to `dtype`; all else stays."""
 
-    def convert_floats(leaf: PyTree) -> PyTree:
-        if eqx.is_array_like(leaf) and hasattr(leaf, "dtype"):
-            return leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
-        return leaf
+    def convert(leaf: PyTree) -> PyTree:
+        is_array = eqx.is_array_like(leaf) and hasattr(leaf, "dtype")
+        return leaf.astype(dtype) if is_array and jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
-    return jax.tree.map(convert_floats, tree)
+    return jax.tree.map(convert, tree)
 
 
 def vector_at(source: PyTree, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:
-    """Return a vector (size,) at the time `t`, s, from a source that is constant or depends on
-    time.
-
-    - `source`: a vector (size,), or a function of time to such a vector
-    - `name`: the name of the source, for messages
-    - `size`: the number of components
-    """
+    """Return a vector at the time `t`, s, of a source that is constant or a function of time."""
     return _checks.array_of_shape(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
 def vector_converter(name: str, *, hint: str = "") -> Callable[[Any], Array]:
-    """Return a function that checks a value and converts it to an array of three finite numbers,
-    for `equinox.field(converter=…)`.
-
-    - `name`: the name of the field, for messages
-    - `hint`: advice, which is added at the end of a message
-    """
+    """Return a converter for `equinox.field` that makes three finite numbers of a value."""
     return lambda value: _checks.finite_array(value, (3,), name, hint=hint)
 
 
 def number_converter(name: str) -> Callable[[Any], Array]:
-    """Return a function that checks a value and converts it to a scalar array, one finite number,
-    for `equinox.field(converter=…)`; `name` is the name of the field, for messages.
-    """
+    """Return a converter for `equinox.field` that makes one finite number of a value."""
     return lambda value: _checks.finite_array(value, (), name)
 
 
-def vector_or_function_converter(name: str) -> Callable[[Any], Any]:
-    """Return a function that checks a value and converts it to a vector (3,), or leaves it
-    unchanged if it is a function of time to such a vector, for `equinox.field(converter=…)`; `name`
-    is the name of the field, for messages.
+def source_converter(name: str) -> Callable[[Any], Any]:
+    """Return a converter for `equinox.field` that makes a finite vector of a value, and leaves a
+    function of time.
     """
-    return lambda value: checked_vector_or_function(value, name)
+    return lambda value: checked_source(value, name)
 
 
-def checked_vector_or_function(source: object, name: str, size: int = 3) -> Any:
-    """Check a quantity that is constant or depends on time, and return it: a function of time
-    unchanged, anything else as a vector (size,) of finite numbers.
-
-    - `source`: a function of time to (size,), or the numbers
-    - `name`: the name of the quantity, for messages
-    - `size`: the number of components
-    """
+def checked_source(source: object, name: str, size: int = 3) -> Any:
+    """Return a function of time unchanged, anything else as a vector of finite numbers."""
     if callable(source):
         return _checks.require_function(source, name, f"of time to ({size},)")
     return _checks.finite_array(source, (size,), name)
 
 
 def jump_times_of(source: object) -> Float[Array, " n"]:
-    """Return the times (n,), s, at which `source`, a torque or a function of time, jumps or has a
-    kink: its attribute `jump_times`, or an empty array if it has no such attribute.
+    """Return the times, s, at which a torque or a function of time declares to jump or to have a
+    kink.
     """
     times = getattr(source, "jump_times", None)
     return jnp.zeros(0) if times is None else times
 
 
-def sorted_jump_times_of(*sources: object) -> Float[Array, " n"]:
-    """Return the times (n,), s, at which any of the `sources` (torques or functions of time) jumps
-    or has a kink, in ascending order.
+def sorted_jumps(*sources: object) -> Float[Array, " n"]:
+    """Return the times, s, ascending, at which any of several torques or functions of time jumps or
+    has a kink.
     """
     times = [jumps for source in sources if (jumps := jump_times_of(source)).shape[0]]
     if len(times) < 2:
@@ -413,20 +360,14 @@ def sorted_jump_times_of(*sources: object) -> Float[Array, " n"]:
     return jnp.sort(jnp.concatenate([jumps.astype(dtype) for jumps in times]))
 
 
-def jump_times_of_fields(torque: object) -> Float[Array, " n"]:
-    """Return the times (n,), s, at which any field of `torque`, such as a function of time or
-    another torque inside it, jumps or has a kink, in ascending order.
-    """
-    return sorted_jump_times_of(*vars(torque).values())
+def field_jumps(torque: object) -> Float[Array, " n"]:
+    """Return the times, s, ascending, at which any field of `torque` jumps or has a kink."""
+    return sorted_jumps(*vars(torque).values())
 
 
-def checked_unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array, "n 3"]:
-    """Return an array (count, 3) of directions, one in each row. **Raises:** `ValueError` if a row
-    is not a unit vector, unless JAX traces the numbers.
-
-    - `value`: the directions, as an array or nested lists
-    - `name`: the name of the argument, for messages
-    - `count`: the number of rows that is wanted
+def unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array, "n 3"]:
+    """Return unit vectors, one in each row; raise `ValueError` for a known row of another
+    length.
     """
     rows = _checks.finite_array(value, (count, 3), name)
     if _checks.is_known(rows):
@@ -437,12 +378,8 @@ def checked_unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array,
 
 
 def row_count(value: NumbersLike, name: str, item: str) -> int:
-    """Return the number R of rows of an array (R, 3): the number of wheels from their axes, for
-    example. **Raises:** `ValueError` for another shape, or for an array without rows.
-
-    - `value`: the array, or nested lists
-    - `name`: the name of the argument, for messages
-    - `item`: what a row belongs to, such as "wheel", for messages
+    """Return the number of rows of an array (R, 3): of wheels, from their axes; raise `ValueError`
+    for another shape.
     """
     shape = _checks.numeric_array(value, name).shape
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
@@ -450,23 +387,16 @@ def row_count(value: NumbersLike, name: str, item: str) -> int:
     return shape[0]
 
 
-def scalar_or_one_each(value: NumbersLike, count: int, name: str) -> Array:
-    """Return the value of a property of several items (wheels, rotors): a scalar array if `value`
-    is one number, which holds for all items, or an array (count,) of one number for each item.
-
-    - `value`: one number, or `count` numbers
-    - `count`: the number of items
-    - `name`: the name of the argument, for messages
-    """
+def one_or_each(value: NumbersLike, count: int, name: str) -> Array:
+    """Return one number that holds for all items (wheels, rotors), or an array of one for each."""
     return _checks.finite_array(
         value, (count,) if _checks.numeric_array(value, name).ndim else (), name
     )
 
 
 def length_or_zero(v: Vec3) -> Scalar:
-    """Return the length |v| of a vector `v` (3,), in any unit. At v = 0, where the derivative of
-    the length does not exist, its derivative is set to 0: the first derivative of a product such as
-    |v| v is then right.
+    """Return the length of a vector, with the derivative 0 at v = 0, where it has none: the first
+    derivative of a product such as |v| v is then right.
     """
     v = _checks.array_of_shape(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]

@@ -69,7 +69,7 @@ class Sum(eqx.Module):
         """Return the times (n,), s, at which any torque in this sum jumps or has a kink, in
         ascending order.
         """
-        return base.sorted_jump_times_of(*self.parts)
+        return base.sorted_jumps(*self.parts)
 
     def __call__(self, t: ScalarLike, state: PyTree, body: Body) -> Vec3 | base.Wrench:
         forces, torque = [], None
@@ -83,8 +83,8 @@ class Sum(eqx.Module):
 
 
 def parts_of(torque: base.Torque | None) -> tuple[Any, ...]:
-    """Return the single torques and forces in `torque`, as a tuple: the members of a `Sum` and of
-    every `Sum` inside it; the torque alone if it is no `Sum`; an empty tuple for `None`.
+    """Return the single torques and forces in `torque`: the members of a `Sum` and of every `Sum`
+    inside it.
     """
     if isinstance(torque, Sum):
         return tuple(inner for part in torque.parts for inner in parts_of(part))
@@ -150,7 +150,7 @@ class ChangingInertia(eqx.Module):
         needed = [getattr(part, "feels", HasSpin) for part in (self.inertia, self.torque)]
         return max(needed, key=base.STATE_TYPES_BY_SIZE.index)
 
-    jump_times = property(base.jump_times_of_fields)
+    jump_times = property(base.field_jumps)
 
     def tensor(self, t: ScalarLike, state: PyTree = None, body: Body | None = None) -> Mat3:
         """Return the inertia tensor I (3, 3), kg m², body frame, at the time `t`, s. The arguments
@@ -196,9 +196,7 @@ class ChangingInertia(eqx.Module):
 
 
 def tensor_or_nan(tensor: Mat3) -> Mat3:
-    """Return `tensor` (3, 3), kg m², if a body can have this inertia tensor; otherwise return NaN
-    in all its entries, which ends a run of a solver.
-    """
+    """Return the inertia tensor if a body can have it, else NaN, which ends a run of a solver."""
     return jnp.where(is_physical_inertia(tensor), tensor, jnp.full_like(tensor, jnp.nan))
 
 
@@ -237,7 +235,7 @@ class Tide(eqx.Module):
     response: Scalar = eqx.field(converter=base.number_converter("response"))
     delay: Scalar = eqx.field(converter=base.number_converter("delay"))
     mu: Scalar = eqx.field(converter=base.number_converter("mu"))
-    position: Any = eqx.field(converter=base.vector_or_function_converter("position"))
+    position: Any = eqx.field(converter=base.source_converter("position"))
     mean_rate: Scalar = eqx.field(converter=base.number_converter("mean_rate"), default=0.0)
 
     __repr__ = _show.fields_as_text

@@ -47,9 +47,7 @@ class InSpace(base.AbstractTimeTorque):
 
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True
-    torque: eqx.Module | Float[Array, "3"] = eqx.field(
-        converter=base.vector_or_function_converter("torque")
-    )
+    torque: eqx.Module | Float[Array, "3"] = eqx.field(converter=base.source_converter("torque"))
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
         return quaternion.rotate_inverse(state.q, base.vector_at(self.torque, t, "torque"))

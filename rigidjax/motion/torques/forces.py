@@ -1,7 +1,7 @@
 """Define forces on a body that moves: gravity, a centre of attraction, drag, rotors."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -78,11 +78,11 @@ class CentralGravity(base.AbstractForce):
         """Return the potential energy of the body in the gravity of the centre, J, which is zero at
         an infinite distance from the centre.
         """
-        r, up, pull, trace = _distance_direction_inertia_and_trace(state, body.inertia.tensor)
+        r, up, pull, trace = _centre(state, body.inertia.tensor)
         return -(self.mu / r) * (body.mass + 0.5 * (trace - 3 * dot(up, pull)) / r / r)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
-        r, up, pull, trace = _distance_direction_inertia_and_trace(state, body.inertia.tensor)
+        r, up, pull, trace = _centre(state, body.inertia.tensor)
         strength, along = self.mu / r / r, dot(up, pull)
         # In body axes the force, minus the gradient of the potential energy, is the sum of two
         # vectors: one along r̂, and one along I r̂.
@@ -91,21 +91,23 @@ class CentralGravity(base.AbstractForce):
         return base.Wrench(quaternion.rotate(state.q, force), cross(3 * strength / r * up, pull))
 
 
-def _distance_direction_inertia_and_trace(
-    state: HasPose, inertia_tensor: Mat3
-) -> tuple[Scalar, Vec3, Vec3, Scalar]:
-    """Return four quantities for the gravity of a centre at the world's origin, by MacCullagh's
-    formula: the distance r of the centre of mass from the origin, m; the unit vector r̂ (3,) from
-    the origin to the centre of mass, body axes; the product I r̂ (3,) with the inertia tensor I of
-    the body, kg m²; and the trace of I, kg m².
+class _Centre(NamedTuple):
+    """Hold the terms of MacCullagh's formula for the gravity of a centre at the world's origin."""
 
-    - `state`: a state with the position of the centre of mass (m, world frame) and the attitude
-    - `inertia_tensor`: I (3, 3), kg m², body frame, about the centre of mass
-    """
+    # The distance r of the centre of mass from the origin, m.
+    distance: Scalar
+    # The unit vector r̂ from the origin to the centre of mass, body axes.
+    direction: Vec3
+    # The product I r̂, kg m², body axes, and the trace of I, kg m².
+    product: Vec3
+    trace: Scalar
+
+
+def _centre(state: HasPose, inertia_tensor: Mat3) -> _Centre:
     r = jnp.sqrt(dot(state.x, state.x))
     up = quaternion.rotate_inverse(state.q, state.x / r)
     trace = inertia_tensor[0, 0] + inertia_tensor[1, 1] + inertia_tensor[2, 2]
-    return r, up, apply(inertia_tensor, up), trace
+    return _Centre(r, up, apply(inertia_tensor, up), trace)
 
 
 class Drag(base.AbstractForce):
@@ -188,17 +190,17 @@ class Rotors(base.AbstractForce):
     ):
         count = base.row_count(positions, "positions", "rotor")
         self.positions = _checks.finite_array(positions, (count, 3), "positions")
-        self.directions = base.checked_unit_rows(directions, "directions", count)
+        self.directions = base.unit_rows(directions, "directions", count)
         self.spins = _checks.finite_array(spins, (count,), "spins")
         if _checks.is_known(self.spins) and (abs(np.asarray(self.spins)) != 1).any():
             raise ValueError(f"spins: wanted 1 or -1 for each rotor, got {np.asarray(self.spins)}")
         self.thrust, self.drag = (
-            base.scalar_or_one_each(thrust, count, "thrust"),
-            base.scalar_or_one_each(drag, count, "drag"),
+            base.one_or_each(thrust, count, "thrust"),
+            base.one_or_each(drag, count, "drag"),
         )
-        self.speeds = base.checked_vector_or_function(speeds, "speeds", count)
+        self.speeds = base.checked_source(speeds, "speeds", count)
 
-    jump_times = property(base.jump_times_of_fields)
+    jump_times = property(base.field_jumps)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         n = base.vector_at(self.speeds, t, "speeds", self.spins.shape[0]).astype(self.spins.dtype)

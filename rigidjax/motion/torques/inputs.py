@@ -47,12 +47,9 @@ class Input(eqx.Module):
         )
 
 
-class _ConstantFunction(eqx.Module):
-    """Return one `value` at every time.
-
-    An `Input` is a signal that a torque reads by name and whose values the caller gives. This
-    object, a function of time, replaces an `Input` while the value of the signal is constant, such
-    as during one step of an integrator.
+class _Constant(eqx.Module):
+    """Return one value at every time, in the place of an `Input` that is constant, as during one
+    step.
     """
 
     value: Array
@@ -160,12 +157,12 @@ class Lagged(eqx.Module):
         dtype = jnp.result_type(float)
         time = _checks.check_if_known(
             _checks.require_positive,
-            _finite_nonempty_array(time, "time"),
+            _numbers(time, "time"),
             "time",
             "a positive time, s",
         )
         self.time = time.astype(dtype)
-        self.start = None if start is None else _finite_nonempty_array(start, "start").astype(dtype)
+        self.start = None if start is None else _numbers(start, "start").astype(dtype)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -197,33 +194,26 @@ class Lagged(eqx.Module):
 
 
 def require_no_jumps(source: PyTree, name: str) -> None:
-    """Raise `TypeError` if `source`, a function of time or a tree of them, holds samples constant
-    between times: a torque that uses the derivative of its source would lose the jumps.
+    """Raise `TypeError` if a function of time, or one in a pytree, holds samples constant: a torque
+    that uses its derivative would lose the jumps.
 
     An `Input` is checked only when it has a value, because `bind` may give it a smooth function of
-    time. The text `name` names the argument in the message.
+    time.
     """
-    jumping = (Held, _ConstantFunction)
+    jumping = (Held, _Constant)
     nodes = jax.tree.leaves(source, is_leaf=lambda node: isinstance(node, jumping))
     for node in nodes:
         if isinstance(node, jumping):
-            what = (
-                "an Input with held samples"
-                if isinstance(node, _ConstantFunction)
-                else type(node).__name__
-            )
+            what = "Held" if isinstance(node, Held) else "an Input with held samples"
             raise TypeError(
                 f"{name}: wanted a function of time without jumps, since its derivative acts on "
                 f"the body, got {what}; take Linear(times, values) or Series(times, values)"
             )
 
 
-def _finite_nonempty_array(value: NumbersLike, name: str) -> Array:
-    """Return `value` as an array of its own shape. **Raises:** `ValueError` for an empty array, and
-    for a number that is not finite, unless JAX traces the numbers.
-
-    - `value`: one number, or one for each channel (component) of a signal
-    - `name`: the name of the argument, for messages
+def _numbers(value: NumbersLike, name: str) -> Array:
+    """Return one number, or one for each channel of a signal; raise `ValueError` for none, and for
+    known numbers that are not finite.
     """
     array = _checks.numeric_array(value, name)
     if not array.size:
@@ -232,14 +222,12 @@ def _finite_nonempty_array(value: NumbersLike, name: str) -> Array:
 
 
 class InputRow(NamedTuple):
-    """Hold the values of all inputs of a torque during one step of an integrator, or during a part
-    of a step, if the step is split where a delayed input changes.
-
-    - `values`: the value of each `Input`, by name
-    - `delayed`: the value of each delayed input, in the order of these inputs in the torque
+    """Hold the values of all inputs of a torque during one step, or the part of a step up to where
+    a delayed input changes.
     """
 
     values: Mapping[str, Any]
+    # The value of each delayed input, in the order of these inputs in the torque.
     delayed: tuple[Any, ...]
 
 
@@ -265,51 +253,44 @@ def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
     queue = list(later or ())
 
     def with_value(node: PyTree) -> Any:
-        if _is_delayed_input(node):
+        if _is_delayed(node):
             if later is not None:
-                return _ConstantFunction(jnp.asarray(queue.pop(0)))
+                return _Constant(jnp.asarray(queue.pop(0)))
             bound = with_value(node.source)
-            return bound if isinstance(bound, _ConstantFunction) else Delayed(bound, node.delay)
+            return bound if isinstance(bound, _Constant) else Delayed(bound, node.delay)
         if not isinstance(node, Input):
             return node
         if node.name not in values:
             names = ", ".join(map(repr, values)) or "none"
             raise ValueError(f"inputs: the torque reads {node.name!r}, got {names}")
         bound = values[node.name]
-        return bound if callable(bound) else _ConstantFunction(jnp.asarray(bound))
+        return bound if callable(bound) else _Constant(jnp.asarray(bound))
 
-    return jax.tree.map(
-        with_value, law, is_leaf=lambda n: isinstance(n, Input) or _is_delayed_input(n)
-    )
+    return jax.tree.map(with_value, law, is_leaf=lambda n: isinstance(n, Input) or _is_delayed(n))
 
 
-def _is_delayed_input(node: PyTree) -> bool:
-    """Return whether `node`, a torque or anything that a torque contains, is a delayed input: a
-    `Delayed` whose `source` is an `Input`.
-
-    A `Delayed` is a function of time, its `source`, that is shifted by a delay. An `Input` is a
-    signal that a torque reads by name and whose values the caller gives.
-    """
+def _is_delayed(node: PyTree) -> bool:
+    """Return whether `node` is a `Delayed` whose source is an `Input`."""
     return isinstance(node, Delayed) and isinstance(node.source, Input)
 
 
 def delays_of(torque: PyTree) -> list[tuple[str, Array]]:
-    """Return a pair for each delayed input of `torque`, in the order of these inputs in the torque:
-    the name of the input, and its delay, a scalar array, s.
+    """Return the name and the delay, s, of each delayed input of `torque`, in their order in the
+    torque.
     """
-    nodes = jax.tree.leaves(torque, is_leaf=_is_delayed_input)
-    return [(node.source.name, node.delay) for node in nodes if _is_delayed_input(node)]
+    nodes = jax.tree.leaves(torque, is_leaf=_is_delayed)
+    return [(node.source.name, node.delay) for node in nodes if _is_delayed(node)]
 
 
 def input_names_of(torque: PyTree) -> list[str]:
-    """Return the names of the inputs (`Input`) that `torque` reads, each name once."""
+    """Return the names of the inputs that `torque` reads, each name once."""
     nodes = jax.tree.leaves(torque, is_leaf=lambda node: isinstance(node, Input))
     return list(dict.fromkeys(node.name for node in nodes if isinstance(node, Input)))
 
 
 def require_inputs(torque: PyTree, inputs: object) -> Mapping[str, Any]:
-    """Return `inputs` as a mapping from names to values, empty for `None`. **Raises:** `ValueError`
-    unless the names are exactly the names of the inputs (`Input`) that `torque` reads.
+    """Return the inputs by name; raise `ValueError` unless the names are exactly those that
+    `torque` reads.
     """
     read, mapping = input_names_of(torque), {} if inputs is None else inputs
     if not isinstance(mapping, Mapping):

@@ -17,9 +17,7 @@ Rows = Float[ArrayLike, "rows 3"] | Sequence[Any]
 
 
 class _Table(eqx.Module):
-    """Hold a table of a quantity over time: `times` (n,), s, and `values` (n, *k), which has one
-    row, a number or an array of the shape (*k), for each of the n times.
-    """
+    """Hold a table of a quantity over time, s."""
 
     times: Float[Array, " n"]
     values: Float[Array, "n *k"]
@@ -27,13 +25,11 @@ class _Table(eqx.Module):
     __repr__ = _show.fields_as_text
 
     def __init__(self, times: Times, values: Float[ArrayLike, "rows *k"] | Sequence[Any]):
-        self.times, self.values = _checked_times_and_rows("times", times, "values", values)
+        self.times, self.values = _checked("times", times, "values", values)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times (n,) of the rows of this table, s, at each of which the tabulated
-        quantity jumps or has a kink.
-        """
+        """Return the times of the rows, s, at each of which the quantity jumps or has a kink."""
         return self.times
 
 
@@ -59,9 +55,7 @@ class Linear(_Table):
         shape (*k) is that of one row.
         """
         t = jnp.asarray(t, self.times.dtype)
-        return _interpolate_linearly(
-            self.times, self.values, jnp.clip(t, self.times[0], self.times[-1])
-        )
+        return _interpolate(self.times, self.values, jnp.clip(t, self.times[0], self.times[-1]))
 
 
 class Held(_Table):
@@ -81,7 +75,7 @@ class Held(_Table):
         """Return the value at the time `t`, s: the row of `values` that is held at this time, of
         the shape (*k).
         """
-        i = _index_of_row_at(self.times, jnp.asarray(t, self.times.dtype))
+        i = _row_at(self.times, jnp.asarray(t, self.times.dtype))
         return self.values[jnp.clip(i, 0, self.times.shape[0] - 1)]
 
 
@@ -106,9 +100,7 @@ class Tabulated(AbstractTorque):
     torques: Float[Array, "n 3"]
 
     def __init__(self, times: Times, torques: Rows):
-        self.times, self.torques = _checked_times_and_rows(
-            "times", times, "torques", torques, times_beyond_rows=0
-        )
+        self.times, self.torques = _checked("times", times, "torques", torques, beyond=0)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -120,7 +112,7 @@ class Tabulated(AbstractTorque):
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         t = jnp.asarray(t, self.times.dtype)
         inside = (t >= self.times[0]) & (t <= self.times[-1])
-        value = _interpolate_linearly(self.times, self.torques, t)
+        value = _interpolate(self.times, self.torques, t)
         return jnp.where(inside, value, jnp.zeros_like(value))
 
 
@@ -146,9 +138,7 @@ class Pulses(AbstractTorque):
     torques: Float[Array, "n 3"]
 
     def __init__(self, edges: Times, torques: Rows):
-        self.edges, self.torques = _checked_times_and_rows(
-            "edges", edges, "torques", torques, times_beyond_rows=1
-        )
+        self.edges, self.torques = _checked("edges", edges, "torques", torques, beyond=1)
 
     @property
     def jump_times(self) -> Float[Array, " edges"]:
@@ -167,18 +157,12 @@ class Pulses(AbstractTorque):
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         t = jnp.asarray(t, self.edges.dtype)
         inside = (t >= self.edges[0]) & (t <= self.edges[-1])
-        value = self.torques[
-            jnp.clip(_index_of_row_at(self.edges, t), 0, self.torques.shape[0] - 1)
-        ]
+        value = self.torques[jnp.clip(_row_at(self.edges, t), 0, self.torques.shape[0] - 1)]
         return jnp.where(inside, value, jnp.zeros_like(value))
 
 
-def _index_of_row_at(times: Float[Array, " n"], t: Scalar) -> Int[Array, ""]:
-    """Return the index of the row of a table that applies at the time `t`, s: the last row whose
-    time is not after t, or −1 before the first row. Exactly at the time of a row, this row applies.
-
-    - `times`: (n,) s, increasing, the times of the rows
-    """
+def _row_at(times: Float[Array, " n"], t: Scalar) -> Int[Array, ""]:
+    """Return the index of the last row whose time is not after t, or −1 before the first row."""
     # The row is found by a comparison of t with the times of all rows in a short table, since XLA
     # compiles this comparison into the one kernel of the solver; a binary search would be a loop of
     # its own.
@@ -186,54 +170,39 @@ def _index_of_row_at(times: Float[Array, " n"], t: Scalar) -> Int[Array, ""]:
     return jnp.searchsorted(times, t, side="right", method=method) - 1
 
 
-def _interpolate_linearly(
-    times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar
-) -> Array:
-    """Return the value (*k) of a table at the time `t`, s, on the straight line between the rows
-    before and after t. Before the first row the line through the first two rows is continued, and
-    after the last row the line through the last two.
-
-    - `times`: (n,) s, increasing, the times of the rows
-    - `rows`: (n, *k), the row of the table, a number or an array (*k), at each time
-    - `t`: s, one time
+def _interpolate(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar) -> Array:
+    """Return the value at one time on the straight line through the rows before and after it; the
+    first and the last line are continued.
     """
-    i = jnp.clip(_index_of_row_at(times, t), 0, times.shape[0] - 2)
+    i = jnp.clip(_row_at(times, t), 0, times.shape[0] - 2)
     part = (t - times[i]) / (times[i + 1] - times[i])
     return rows[i] + part * (rows[i + 1] - rows[i])
 
 
-def _checked_times_and_rows(
+def _checked(
     times_name: str,
     times: NumbersLike,
     rows_name: str,
     values: NumbersLike,
-    times_beyond_rows: int | None = None,
-) -> tuple[Array, Array]:
-    """Check a table of a quantity over time, and return two things as arrays of finite numbers: the
-    times, increasing, s; and the rows, which are the values of the quantity.
+    beyond: int | None = None,
+) -> tuple[Float[Array, " times"], Float[Array, "rows *k"]]:
+    """Return increasing times and a quantity as arrays of finite numbers of one dtype.
 
-    - `times_name`: the name of the argument `times`, for messages
-    - `times`: (n,) s, the times of the rows, or the edges of intervals with a constant value
-    - `rows_name`: the name of the argument `values`, for messages
-    - `values`: the rows
-    - `times_beyond_rows`: the number of times minus the number of rows, where each row has the
-      shape (3,): 0 for a row at each time, 1 for a row in each interval between two times. `None`
-      also means a row at each time, but rows of any shape.
+    With `beyond`, the number of times less that of rows, each row has the shape (3,): 0 for a row
+    at each time, 1 for a row between two times. `None` also means a row at each time, of any shape.
     """
-    edges, rows = (
-        _checks.array_of_rows(times, (), times_name),
-        _checks.numeric_array(values, rows_name),
-    )
+    edges = _checks.array_of_rows(times, (), times_name)
+    rows = _checks.numeric_array(values, rows_name)
     count = edges.shape[0]
     if count < 2:
         raise ValueError(f"{times_name}: wanted at least 2 times, shape (n,), got {edges.shape}")
-    if times_beyond_rows is None and rows.shape[:1] != edges.shape:
+    if beyond is None and rows.shape[:1] != edges.shape:
         raise ValueError(f"{rows_name}: wanted a row for each of {count} times, got {rows.shape}")
-    if times_beyond_rows is not None and rows.shape != (count - times_beyond_rows, 3):
+    if beyond is not None and rows.shape != (count - beyond, 3):
         lines = "n times go with n rows (constant pieces: Pulses)"
         pieces = "n constant pieces have n + 1 edges (Tabulated draws lines between n rows)"
-        advice = pieces if times_beyond_rows else lines
-        words = f"{rows_name}: wanted {count - times_beyond_rows} rows of 3"
+        advice = pieces if beyond else lines
+        words = f"{rows_name}: wanted {count - beyond} rows of 3"
         raise ValueError(f"{words}, got shape {rows.shape}; {advice}")
     edges, rows = _checks.require_finite(edges, times_name), _checks.require_finite(rows, rows_name)
     ordered = _checks.array_module(edges).asarray(edges)

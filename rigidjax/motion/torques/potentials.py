@@ -3,7 +3,7 @@ U(q).
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -73,6 +73,17 @@ class HeavyTop(base.AbstractTorque):
         return cross(self.mass * self.com, quaternion.rotate_inverse(state.q, self.gravity))
 
 
+class _Pull(NamedTuple):
+    """Hold what the gravity of a far point mass depends on at one time."""
+
+    # The unit vector u from the body to the point mass, body axes.
+    direction: Vec3
+    # The gravity gradient μ/r³, 1/s².
+    strength: Scalar
+    # μ/rⁿ⁺¹ ∇Hₙ(u) for each degree n = 3, 4, …
+    slopes: list[Vec3]
+
+
 class GravityGradient(base.AbstractTimeTorque):
     """Apply the gravity-gradient torque of a far point mass on a body with the inertia I: `τ =
     (3μ/r³) u × Iu − Σ (μ/rⁿ⁺¹) u × ∇Hₙ(u)`, a sum over the degrees n = 3, 4, … of `harmonics`.
@@ -110,7 +121,7 @@ class GravityGradient(base.AbstractTimeTorque):
 
     def __init__(self, mu: ScalarLike, position: object, harmonics: Sequence[ArrayLike] = ()):
         self.mu = _checks.finite_array(mu, (), "mu")
-        self.position = base.checked_vector_or_function(position, "position")
+        self.position = base.checked_source(position, "position")
         self.harmonics = tuple(
             _checks.finite_array(row, (2 * n + 1,), f"harmonics: degree {n}")
             for n, row in enumerate(harmonics, 3)
@@ -133,7 +144,7 @@ class GravityGradient(base.AbstractTimeTorque):
         (μ/2r³)(3 u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`, with the quantities that the class defines.
         """
         tensor = tensor_of(body)
-        u, strength, slopes = self._direction_strength_and_harmonic_gradients(t, state)
+        u, strength, slopes = self._pull(t, state)
         trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
         potential = 0.5 * strength * (3 * dot(u, apply(tensor, u)) - trace)
         for n, slope in enumerate(slopes, 3):
@@ -141,28 +152,13 @@ class GravityGradient(base.AbstractTimeTorque):
         return potential
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Vec3:
-        u, strength, slopes = self._direction_strength_and_harmonic_gradients(t, state)
+        u, strength, slopes = self._pull(t, state)
         pull = 3 * strength * apply(tensor_of(body), u)
         for slope in slopes:
             pull = pull - slope
         return cross(u, pull)
 
-    def _direction_strength_and_harmonic_gradients(
-        self, t: ScalarLike, state: HasAttitude
-    ) -> tuple[Vec3, Scalar, list[Vec3]]:
-        """Return three things about a far point mass that attracts the body at the distance r, with
-        μ, the constant of gravitation times its mass:
-
-        - the direction from the body to the point mass, a unit vector u (3,), body axes
-        - the strength μ/r³ of the gravity gradient of the point mass, 1/s²
-        - a list with one vector (3,) for each degree n = 3, 4, … in the field `harmonics`: μ/rⁿ⁺¹
-          times the gradient at u of Hₙ, the solid harmonic of degree n of the body's own gravity
-
-        **Arguments:**
-
-        - `t`: s, the time
-        - `state`: a state with the attitude of the body
-        """
+    def _pull(self, t: ScalarLike, state: HasAttitude) -> _Pull:
         r = base.vector_at(self.position, t, "position")
         distance = jnp.sqrt(dot(r, r))
         # The strength μ/r³ is computed by three divisions by the distance r, because r³ overflows
@@ -170,23 +166,18 @@ class GravityGradient(base.AbstractTimeTorque):
         strength = self.mu / distance / distance / distance
         u = quaternion.rotate_inverse(state.q, r / distance)
         slopes, factor = [], strength
-        for slope in _solid_harmonic_gradients(self.harmonics, u):
+        for slope in _gradients(self.harmonics, u):
             factor = factor / distance
             slopes.append(factor * slope)
-        return u, strength, slopes
+        return _Pull(u, strength, slopes)
 
 
-def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
-    """Return the gradients (3,) of solid harmonics at a unit vector, one for each degree n = 3, 4,
-    …, by Cunningham's recurrence (1970, doi:10.1007/BF01229495).
+def _gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
+    """Return the gradients at a unit vector of the solid harmonics Hₙ = Σ rⁿ Pₙₘ (C cos mλ + S sin
+    mλ) of the degrees n = 3, 4, …, by Cunningham's recurrence (1970, doi:10.1007/BF01229495).
 
-    The solid harmonic of degree n at a point (x, y, z) is Hₙ = Σ rⁿ Pₙₘ (C cos mλ + S sin mλ), a
-    sum over m = 0, …, n, with the distance r of the point from the origin, its longitude λ, and the
-    associated Legendre functions Pₙₘ of z/r.
-
-    - `harmonics`: for each degree n an array (2n + 1,) of the coefficients C and S, in the order
-      Cn0, Cn1, Sn1, Cn2, Sn2, …
-    - `u`: (3,), the unit vector at which the gradients are taken
+    The coefficients of a degree have the order Cn0, Cn1, Sn1, Cn2, Sn2, …; Pₙₘ is a function of
+    z/r.
     """
     x, y, z = components(u)
     zero = jnp.zeros_like(z)
@@ -197,7 +188,7 @@ def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]
     out = []
     for n in range(1, len(harmonics) + 3):
         if n >= 3:
-            out.append(_solid_harmonic_gradient(components(harmonics[n - 3]), n, here))
+            out.append(_gradient(components(harmonics[n - 3]), n, here))
         k = 2 * n - 1
         (re, im), following = here[n - 1], []
         for m in range(n):
@@ -208,31 +199,20 @@ def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]
     return out
 
 
-def _solid_harmonic_gradient(
-    coefficients: Sequence[Scalar], n: int, lower_harmonics: Sequence[tuple[Scalar, Scalar]]
+def _gradient(
+    coefficients: Sequence[Scalar], n: int, lower: Sequence[tuple[Scalar, Scalar]]
 ) -> Vec3:
-    """Return the gradient (3,) of the solid harmonic Hₙ = Σ rⁿ Pₙₘ (C cos mλ + S sin mλ) at one
-    point (x, y, z), a sum over m = 0, …, n.
-
-    Here r is the distance of the point from the origin, λ its longitude, and Pₙₘ the associated
-    Legendre functions of z/r.
-
-    - `coefficients`: C and S, the 2n + 1 numbers Cn0, Cn1, Sn1, Cn2, Sn2, …
-    - `n`: the degree
-    - `lower_harmonics`: for m = 0, 1, …, n the real and imaginary parts of rⁿ⁻¹ Pₙ₋₁,ₘ exp(imλ),
-      the solid harmonics of degree n − 1, at the point; zero for m = n
+    """Return the gradient of the solid harmonic of degree n at a point, from the real and imaginary
+    parts of rⁿ⁻¹ Pₙ₋₁,ₘ exp(imλ) there for m = 0, …, n.
     """
     zonal = coefficients[0]
-    along, flat_x, flat_y = (
-        n * zonal * lower_harmonics[0][0],
-        -zonal * lower_harmonics[1][0],
-        -zonal * lower_harmonics[1][1],
-    )
+    along = n * zonal * lower[0][0]
+    flat_x, flat_y = (-zonal * part for part in lower[1])
     for m in range(1, n + 1):
         c, s = coefficients[2 * m - 1 : 2 * m + 1]
-        (a, b), (p, q) = lower_harmonics[m - 1], lower_harmonics[m + 1] if m < n else (0.0, 0.0)
+        (a, b), (p, q) = lower[m - 1], lower[m + 1] if m < n else (0.0, 0.0)
         half = 0.5 * (n + m) * (n + m - 1)
-        along = along + (n + m) * (c * lower_harmonics[m][0] + s * lower_harmonics[m][1])
+        along = along + (n + m) * (c * lower[m][0] + s * lower[m][1])
         flat_x = flat_x + c * (half * a - 0.5 * p) + s * (half * b - 0.5 * q)
         flat_y = flat_y - c * (half * b + 0.5 * q) + s * (half * a + 0.5 * p)
     return jnp.stack([flat_x, flat_y, along])
@@ -255,9 +235,7 @@ class MagneticDipole(base.AbstractTimeTorque):
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True
     moment: Float[Array, "3"] = eqx.field(converter=base.vector_converter("moment"))
-    field: eqx.Module | Float[Array, "3"] = eqx.field(
-        converter=base.vector_or_function_converter("field")
-    )
+    field: eqx.Module | Float[Array, "3"] = eqx.field(converter=base.source_converter("field"))
 
     @property
     def axis(self) -> base.AxisWithoutTorque | None:
@@ -271,15 +249,13 @@ class MagneticDipole(base.AbstractTimeTorque):
         """Return the potential energy, J: `U = −m·RᵀB`, with the magnetic moment m, the field B and
         the attitude R.
         """
-        return -dot(self.moment, self._magnetic_field_in_body(t, state))
+        return -dot(self.moment, self._field_at(t, state))
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
-        return cross(self.moment, self._magnetic_field_in_body(t, state))
+        return cross(self.moment, self._field_at(t, state))
 
-    def _magnetic_field_in_body(self, t: ScalarLike, state: HasAttitude) -> Vec3:
-        """Return the magnetic field (3,), T, body axes, at the time `t`, s, from the attitude of
-        `state`.
-        """
+    def _field_at(self, t: ScalarLike, state: HasAttitude) -> Vec3:
+        """Return the magnetic field, T, body axes."""
         return quaternion.rotate_inverse(state.q, base.vector_at(self.field, t, "field"))
 
 
@@ -312,14 +288,14 @@ class FromPotential(base.AbstractTorque):
         """Return the potential energy, J: the value of the user's function `potential` at the
         attitude of `state`.
         """
-        return self._potential_energy_at(state.q)
+        return self._energy_at(state.q)
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
-        slope = jax.grad(self._potential_energy_at)(state.q)
+        slope = jax.grad(self._energy_at)(state.q)
         return -0.5 * quaternion.multiply(quaternion.conjugate(state.q), slope)[1:]
 
-    def _potential_energy_at(self, q: Quat) -> Scalar:
-        """Return the potential energy, J, at the attitude `q` (4,), a quaternion. **Raises:** an
-        error if the user's function does not return one number.
+    def _energy_at(self, q: Quat) -> Scalar:
+        """Return the potential energy, J; raise an error if the user's function does not return one
+        number.
         """
         return _checks.array_of_shape(self.potential(q), (), "potential", hint="one number, J")

@@ -32,7 +32,7 @@ class RandomTorque(AbstractTorque):
     density: Float[Array, "3"]
 
     def __init__(self, density: NumbersLike):
-        self.density = checked_spectral_density(density)
+        self.density = checked_density(density)
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         return jnp.zeros_like(self.density)
@@ -60,7 +60,7 @@ class CorrelatedTorque(AbstractTorque):
     time: Scalar
 
     def __init__(self, density: NumbersLike, time: NumbersLike):
-        self.density = checked_spectral_density(density)
+        self.density = checked_density(density)
         number = _checks.array_of_shape(time, (), "time").astype(self.density.dtype)
         self.time = _checks.require_positive(number, "time", "a positive correlation time, s")
 
@@ -75,13 +75,9 @@ class CorrelatedTorque(AbstractTorque):
         return jnp.zeros_like(self.density)
 
 
-def checked_spectral_density(value: NumbersLike, name: str = "density", size: int = 3) -> Array:
-    """Check the spectral density of a white noise, and return it with one number for each axis,
-    (size,). **Raises:** `ValueError` for a density below zero.
-
-    - `value`: one number for all axes, or `size` numbers
-    - `name`: the name of the argument, for messages
-    - `size`: the number of axes
+def checked_density(value: NumbersLike, name: str = "density", size: int = 3) -> Array:
+    """Return the spectral density of a white noise, one number for each axis; raise `ValueError`
+    for one below zero.
     """
     density = _checks.numeric_array(value, name)
     if density.shape not in ((), (size,)):

@@ -47,17 +47,12 @@ class Series(eqx.Module):
     __repr__ = _show.fields_as_text
 
     def __init__(self, times: Float[ArrayLike, " n"] | Sequence[Any], values: Samples):
-        t, rows = (
-            _numbers_in_full_precision(times, "times"),
-            _numbers_in_full_precision(values, "values"),
-        )
+        t, rows = (_numbers(value, name) for value, name in ((times, "times"), (values, "values")))
         if t.ndim != 1 or t.size < 4 or rows.shape[:1] != t.shape:
             words = f"got shapes {t.shape} and {rows.shape}"
             raise ValueError(f"Series: wanted at least four times and as many rows, {words}")
-        t, rows = (
-            _checks.require_finite(t, "Series: times"),
-            _checks.require_finite(rows, "Series: values"),
-        )
+        t = _checks.require_finite(t, "Series: times")
+        rows = _checks.require_finite(rows, "Series: values")
         step = (t[-1] - t[0]) / (t.size - 1)
         kind = np.dtype(getattr(times, "dtype", float))
         kind = kind if kind == jnp.bfloat16 else np.promote_types(kind, np.float16)
@@ -68,9 +63,7 @@ class Series(eqx.Module):
         dtype = jnp.result_type(float)
         self.start, self.step = jnp.asarray(t[0], dtype), jnp.asarray(step, dtype)
         self.values = jnp.asarray(rows, dtype)
-        self.slopes = _checks.require_finite(
-            _spline_slopes(self.values), "Series: slopes of the values"
-        )
+        self.slopes = _checks.require_finite(_slopes(self.values), "Series: slopes of the values")
 
     def __call__(self, t: ScalarLike) -> Any:
         """Return the value of the spline at the time `t`, s; its shape, () or (k,), is that of one
@@ -95,29 +88,21 @@ class Series(eqx.Module):
         return left + s * (out + s * (bend + s * twist))
 
 
-def _numbers_in_full_precision(value: NumbersLike, name: str) -> Any:
-    """Return numbers as an array in the highest precision that is possible, because the times of a
-    log have more than the seven digits of float32: as a NumPy array of float64, or, if JAX traces
-    the numbers, as a JAX array in the default precision of JAX.
-
-    - `value`: the numbers
-    - `name`: the name of the argument, for messages
+def _numbers(value: NumbersLike, name: str) -> Any:
+    """Return known numbers in float64 on the host, since the times of a log have more digits than
+    float32; traced numbers in JAX's default precision.
     """
     if _checks.is_known(value):
         return _checks.host_array(value, f"Series: {name}")
     return _checks.numeric_array(value, f"Series: {name}").astype(jnp.result_type(float))
 
 
-def _spline_slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
-    """Return the slope of a cubic spline at each of n evenly spaced samples, as the change for one
-    step between samples, in the shape of `values`.
+def _slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
+    """Return the slopes of a cubic spline at evenly spaced samples, as the change for one step.
 
-    - `values`: (n, *channels), the samples, each of them a number or an array of the shape
-      (*channels)
-
-    With vᵢ the sample and sᵢ the slope at sample i, the slopes solve sᵢ₋₁ + 4 sᵢ + sᵢ₊₁ = 3
-    (vᵢ₊₁ − vᵢ₋₁): the second derivative of the spline is then continuous. At the two ends the
-    condition is "not a knot": the third derivative does not jump at the sample next to the end.
+    With vᵢ the sample and sᵢ the slope at sample i, the slopes solve sᵢ₋₁ + 4 sᵢ + sᵢ₊₁ = 3 (vᵢ₊₁ −
+    vᵢ₋₁): the second derivative is then continuous. The condition at the ends is "not a knot": the
+    third derivative does not jump at the sample next to the end.
     """
     n = values.shape[0]
     v = values.reshape(n, -1)

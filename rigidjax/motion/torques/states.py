@@ -25,9 +25,8 @@ _MEMBERS_THAT_TAKE_STATES = ("energy", "internal_momentum")
 
 
 class FrozenLaw(eqx.Module):
-    """Hold a torque or function of time `law` that has states of its own (such as the speed of a
-    wheel) together with the values `own` of these states, so that `law` can be called without them.
-    `freeze_own_states` makes this object.
+    """Hold a torque or function of time with the values of its own states, so that it can be called
+    without them.
     """
 
     law: Any
@@ -47,23 +46,22 @@ class FrozenLaw(eqx.Module):
 
 
 def has_own_states(node: object) -> bool:
-    """Return whether `node`, a torque or a function of time, has states of its own, such as the
-    speed of a wheel: it then has the members `state0` (the initial states) and `rate` (their
-    derivative).
+    """Return whether a torque or a function of time has states of its own: the members `state0` and
+    `rate`.
     """
     return not isinstance(node, type) and hasattr(node, "state0") and hasattr(node, "rate")
 
 
 def contains_own_states(torque: PyTree) -> bool:
-    """Return whether `torque`, or any torque or function of time inside it, has states of its own,
-    such as the speed of a wheel.
+    """Return whether `torque`, or any torque or function of time inside it, has states of
+    its own.
     """
-    return any(map(has_own_states, jax.tree.leaves(torque, is_leaf=_has_states_or_is_frozen)))
+    return any(map(has_own_states, jax.tree.leaves(torque, is_leaf=_is_node)))
 
 
 def require_no_own_states(torque: PyTree, caller: str) -> None:
-    """Raise `ValueError` if `torque` has states of its own, such as the speed of a wheel, which the
-    calling function does not integrate. The text `caller` names this function in the message.
+    """Raise `ValueError` if `torque` has states of its own, which the calling function does not
+    integrate.
     """
     if contains_own_states(torque):
         raise ValueError(
@@ -74,11 +72,8 @@ def require_no_own_states(torque: PyTree, caller: str) -> None:
 
 
 def freeze_own_states(torque: Tree, own: tuple[PyTree, ...]) -> Tree:
-    """Return `torque`, or a tree that contains a torque (such as a vector field), with the values
-    `own` of its own states inserted, so that it can be called without them.
-
-    `own` holds the states of each part of `torque` that has states, in the order of these parts in
-    `torque`, inner parts first.
+    """Return a torque, or a pytree that contains one (such as a vector field), with the values of
+    its own states inserted; inner parts come first in `own`.
     """
     queue = list(own)
     if not queue and not contains_own_states(torque):
@@ -90,7 +85,7 @@ def freeze_own_states(torque: Tree, own: tuple[PyTree, ...]) -> Tree:
             raise ValueError(f"own: {words}, got no states for {type(node).__name__}")
         return queue.pop(0)
 
-    frozen = _insert_states(torque, next_states)
+    frozen = _inserted(torque, next_states)
     if queue:
         count = len(own) - len(queue)
         words = f"wanted one tree of states for each of the {count} parts of the torque with states"
@@ -98,66 +93,49 @@ def freeze_own_states(torque: Tree, own: tuple[PyTree, ...]) -> Tree:
     return frozen
 
 
-def initial_own_states(
-    torque: PyTree, t: ScalarLike, state: PyTree, body: Body
-) -> tuple[PyTree, ...]:
-    """Return the initial values of the states that a torque has of its own, in the precision of the
-    state of the body: a tuple with one tree of arrays for each part of the torque with states.
-
-    If a part contains another part with states, the states of the inner part come first.
-
-    - `torque`: the torque
-    - `t`: s, the time of the start
-    - `state`: the state of motion at the start
-    - `body`: an `Inertia` or `MassProperties`
+def initial_states(torque: PyTree, t: ScalarLike, state: PyTree, body: Body) -> tuple[PyTree, ...]:
+    """Return the initial states of each part of the torque with states of its own, inner parts
+    first, in the precision of the body's state.
     """
     states: list[Any] = []
 
     def initial_state_of(node: PyTree) -> PyTree:
         here = node.state0(t, state, body) if callable(node.state0) else node.state0
-        own = _cast_numeric_leaves(here, f"state0 of {type(node).__name__}", state.omega.dtype)
+        own = _cast(here, f"state0 of {type(node).__name__}", state.omega.dtype)
         if not jax.tree.leaves(own):
             raise ValueError(f"state0 of {type(node).__name__}: wanted a tree of arrays, got none")
         states.append(own)
         return own
 
-    _insert_states(torque, initial_state_of)
+    _inserted(torque, initial_state_of)
     return tuple(states)
 
 
-def rates_of_own_states(
+def state_rates(
     torque: PyTree, t: ScalarLike, own: tuple[PyTree, ...], state: PyTree, body: Body
 ) -> tuple[PyTree, ...]:
-    """Return the derivatives with respect to time of the states that a torque has of its own, as a
-    tuple of trees like `own`. **Raises:** `ValueError` for a derivative whose shape is not that of
-    the state.
-
-    - `torque`: the torque
-    - `t`: s, the time
-    - `own`: for each part of the torque that has states, inner parts first, a tree with their
-      values
-    - `state`: the state of motion
-    - `body`: an `Inertia` or `MassProperties`
+    """Return the derivatives by time of the states of a torque, as pytrees like `own`; raise
+    `ValueError` for a shape that is not that of the state.
     """
     queue, rates = list(own), []
 
     def rate_of_node(node: PyTree) -> PyTree:
         here = queue.pop(0)
         name = f"rate of {type(node).__name__}"
-        rate = _cast_numeric_leaves(node.rate(t, here, state, body), name, state.omega.dtype)
+        rate = _cast(node.rate(t, here, state, body), name, state.omega.dtype)
         wanted, shapes = (jax.tree.map(jnp.shape, tree) for tree in (here, rate))
         if wanted != shapes:
             raise ValueError(f"{name}: wanted arrays as in state0, {wanted}, got {shapes}")
         rates.append(rate)
         return here
 
-    _insert_states(torque, rate_of_node)
+    _inserted(torque, rate_of_node)
     return tuple(rates)
 
 
 def require_frozen_states(torque: PyTree) -> None:
-    """Raise `TypeError` if `torque` has states of its own, such as the speed of a wheel, and is not
-    yet wrapped together with their values (see `freeze_own_states`).
+    """Raise `TypeError` if `torque` has states of its own that are not inserted (see
+    `freeze_own_states`).
     """
     if has_own_states(torque):
         words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate and "
@@ -165,39 +143,31 @@ def require_frozen_states(torque: PyTree) -> None:
         raise TypeError(f"{type(torque).__name__} {words}: torque(t, state, body, own)")
 
 
-def _insert_states(torque: PyTree, states_of: Callable[[PyTree], PyTree]) -> PyTree:
-    """Return a torque in which each torque with states of its own (such as the speed of a wheel) is
-    replaced by a `FrozenLaw`: this torque together with the values of its states.
-
-    - `torque`: the torque, or a tree of torques
-    - `states_of`: a function (torque) that returns the values of the states of one torque. If a
-      torque contains another one, the function is called for the inner torque first.
+def _inserted(torque: PyTree, states_of: Callable[[PyTree], PyTree]) -> PyTree:
+    """Return a torque in which each one with states of its own is a `FrozenLaw` with the states
+    that `states_of` returns, which is called for inner torques first.
     """
 
     def is_leaf(node: PyTree) -> bool:
-        return node is not torque and _has_states_or_is_frozen(node)
+        return node is not torque and _is_node(node)
 
     def insert_in_node(node: PyTree) -> PyTree:
         inner = node is not torque and has_own_states(node)
-        return _insert_states(node, states_of) if inner else node
+        return _inserted(node, states_of) if inner else node
 
     inserted = jax.tree.map(insert_in_node, torque, is_leaf=is_leaf)
     return FrozenLaw(inserted, (states_of(inserted),)) if has_own_states(torque) else inserted
 
 
-def _has_states_or_is_frozen(node: PyTree) -> bool:
-    """Return whether `node` is a torque or a function of time with states of its own (such as the
-    speed of a wheel), or a `FrozenLaw`, in which the values of such states are already inserted.
+def _is_node(node: PyTree) -> bool:
+    """Return whether `node` has states of its own, or is a `FrozenLaw`, in which they are
+    inserted.
     """
     return isinstance(node, FrozenLaw) or has_own_states(node)
 
 
-def _cast_numeric_leaves(tree: PyTree, name: str, dtype: DTypeLike) -> PyTree:
-    """Return a tree of arrays with each array converted to `dtype`, after a check that each array
-    holds numbers.
-
-    - `tree`: the states of a user's torque, or their derivatives, as the torque returned them
-    - `name`: the name of the tree, for messages
-    - `dtype`: the dtype of the result
+def _cast(tree: PyTree, name: str, dtype: DTypeLike) -> PyTree:
+    """Return a pytree of a user's torque, such as its states, with each array checked and converted
+    to `dtype`.
     """
     return jax.tree.map(lambda leaf: _checks.numeric_array(leaf, name).astype(dtype), tree)

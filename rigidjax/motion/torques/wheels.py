@@ -53,7 +53,7 @@ class Flywheel(base.AbstractTimeTorque):
     momentum: eqx.Module | Float[Array, "3"]
 
     def __init__(self, momentum: object):
-        self.momentum = base.checked_vector_or_function(momentum, "momentum")
+        self.momentum = base.checked_source(momentum, "momentum")
         if contains_own_states(momentum):
             raise TypeError(
                 "Flywheel: wanted a momentum whose derivative with respect to time is known, got "
@@ -153,21 +153,19 @@ class ReactionWheels(base.AbstractTorque):
         turn_over: ScalarLike = 1.0,
     ):
         count = base.row_count(axes, "axes", "wheel")
-        self.axes = base.checked_unit_rows(axes, "axes", count)
+        self.axes = base.unit_rows(axes, "axes", count)
         inertia = _checks.finite_array(inertia, (count,), "inertia")
         self.inertia = _checks.check_if_known(_checks.require_positive, inertia, "inertia", "> 0")
         self.speeds = _checks.finite_array(speeds, (count,), "speeds")
-        self.motor = (
-            None if motor is None else base.checked_vector_or_function(motor, "motor", count)
-        )
+        self.motor = None if motor is None else base.checked_source(motor, "motor", count)
         words = "(t, state, speeds) → torques (R,), N m"
         self.feedback = (
             None if feedback is None else _checks.require_function(feedback, "feedback", words)
         )
-        self.max_torque = _checked_wheel_property(max_torque, count, "max_torque", "> 0")
-        self.max_speed = _checked_wheel_property(max_speed, count, "max_speed", "> 0")
-        self.viscous = _checked_wheel_property(viscous, count, "viscous", "≥ 0")
-        self.coulomb = _checked_wheel_property(coulomb, count, "coulomb", "≥ 0")
+        self.max_torque = _checked(max_torque, count, "max_torque", "> 0")
+        self.max_speed = _checked(max_speed, count, "max_speed", "> 0")
+        self.viscous = _checked(viscous, count, "viscous", "≥ 0")
+        self.coulomb = _checked(coulomb, count, "coulomb", "≥ 0")
         turn_over = _checks.finite_array(turn_over, (), "turn_over")
         self.turn_over = _checks.check_if_known(
             _checks.require_positive, turn_over, "turn_over", "> 0"
@@ -181,7 +179,7 @@ class ReactionWheels(base.AbstractTorque):
         parts = (self.motor, self.feedback, self.viscous, self.coulomb)
         return all(part is None for part in parts)
 
-    jump_times = property(base.jump_times_of_fields)
+    jump_times = property(base.field_jumps)
 
     def without_wheels(self, body: OneBody) -> OneBody:
         """Return the body with the inertia I − Σ J a aᵀ: the moments of inertia J of the wheels
@@ -226,7 +224,9 @@ class ReactionWheels(base.AbstractTorque):
         if self.max_speed is not None:
             top = self.max_speed
             room = jnp.where(total > 0, top - speeds, top + speeds)
-            total = total * _smooth_step(jnp.clip(room / (_FADE * top), 0, 1))
+            # A smooth step from 0 to 1, whose first two derivatives vanish at both ends.
+            x = jnp.clip(room / (_FADE * top), 0, 1)
+            total = total * (x * x * x * (10.0 + x * (6.0 * x - 15.0)))
         if self.viscous is not None:
             total = total - self.viscous * speeds
         if self.coulomb is not None:
@@ -255,7 +255,7 @@ class ReactionWheels(base.AbstractTorque):
         """Return the momentum of the wheels Σ h a, (3,), N m s, body frame, with the axes a of the
         wheels and their axial momenta h = `own` (R,), N m s.
         """
-        return self._vector_sum_over_wheels(own)
+        return self._along_axes(own)
 
     def energy(self, t: ScalarLike, state: HasSpin, body: object, own: Array) -> Scalar:
         """Return the kinetic energy of the wheels about their axes, Σ h²/2J, in joules, with their
@@ -264,17 +264,11 @@ class ReactionWheels(base.AbstractTorque):
         return jnp.sum(own * own / (2.0 * self.inertia))
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object, own: Array) -> Vec3:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return cross(self._vector_sum_over_wheels(own), state.omega) - self._vector_sum_over_wheels(
-            self.torques_of(t, own, state)
-        )
+        motors = self._along_axes(self.torques_of(t, own, state))
+        return cross(self._along_axes(own), state.omega) - motors
 
-    def _vector_sum_over_wheels(self, axial_components: Float[Array, " wheels"]) -> Vec3:
-        """Return the vector Σ xᵢ aᵢ (3,), body frame, a sum over the R wheels, with the unit
-        vectors aᵢ along their axes.
-
-        - `axial_components`: x (R,), one number for each wheel, such as its momentum, N m s, or its
-          torque, N m
-        """
+    def _along_axes(self, axial_components: Float[Array, " wheels"]) -> Vec3:
+        """Return Σ xᵢ aᵢ, body frame, a sum over the wheels with their axes aᵢ."""
         # The sum is written out wheel by wheel: there are few wheels, and in a batch of bodies
         # `jnp.sum` is slow.
         total = jnp.zeros(3, axial_components.dtype)
@@ -283,27 +277,13 @@ class ReactionWheels(base.AbstractTorque):
         return total
 
 
-def _smooth_step(x: Array) -> Array:
-    """Return the polynomial 6 x⁵ − 15 x⁴ + 10 x³ for numbers x from 0 to 1: a smooth step from 0 at
-    x = 0 to 1 at x = 1, whose first two derivatives vanish at both ends.
-    """
-    return x * x * x * (10.0 + x * (6.0 * x - 15.0))
-
-
-def _checked_wheel_property(
-    value: NumbersLike | None, count: int, name: str, requirement: str
-) -> Array | None:
-    """Return a property of the wheels, such as the largest torque, checked: a scalar array if it is
-    the same for all wheels, an array (count,) if each wheel has its own; `None` for `None`.
-
-    - `value`: the number or numbers
-    - `count`: the number of wheels
-    - `name`: the name of the argument, for messages
-    - `requirement`: "> 0" or "≥ 0", which the numbers must fulfil
+def _checked(value: NumbersLike | None, count: int, name: str, requirement: str) -> Array | None:
+    """Return a property of the wheels, such as the largest torque, as one number, or one for each
+    wheel.
     """
     if value is None:
         return None
-    numbers = base.scalar_or_one_each(value, count, name)
+    numbers = base.one_or_each(value, count, name)
     return _checks.check_if_known(
         _checks.require_positive, numbers, name, requirement, allow_zero=requirement == "≥ 0"
     )

@@ -10,7 +10,7 @@ import pytest
 
 from rigidjax.cli.command import main
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.layouts import imu_columns_of, known_unit_of_column
+from rigidjax.cli.logs.layouts import imu_columns, known_unit
 from rigidjax.identify import read_table
 
 
@@ -60,7 +60,7 @@ ROWS = [(1000 * i, 100 - i, -7 * i, 3000, 2048) for i in range(50)]
 def test_blackbox_rates_come_in_degrees_a_second(tmp_path, end):
     path = tmp_path / "FLIGHT.BBL"
     path.write_bytes(blackbox_log(ROWS, end=end))
-    layout = imu_columns_of(path)
+    layout = imu_columns(path)
     assert (layout.unit, layout.time_unit) == ("deg/s", "us")
     table = read_table(path, [*layout.columns, "accSmooth[0]"])
     # Without its last mark the last frame of a log cannot be told from half a frame.
@@ -98,7 +98,7 @@ def test_of_a_high_resolution_rates_and_commands_are_ten_times_finer(tmp_path):
         table = read_table(path, list(scale))
     for k, (name, factor) in enumerate(scale.items(), 3):
         np.testing.assert_allclose(table[name], factor * k * np.arange(40), 1e-12, err_msg=name)
-        assert known_unit_of_column(path, name) == {"g": "deg/s", "a": "g"}.get(name[0])
+        assert known_unit(path, name) == {"g": "deg/s", "a": "g"}.get(name[0])
 
 
 @pytest.mark.parametrize(
@@ -394,4 +394,4 @@ def test_only_blackbox_has_flights(tmp_path):
 def test_fields_have_their_units(tmp_path):
     path = tmp_path / "flight.bbl"
     units = {"time": "us", "gyroADC[1]": "deg/s", "accSmooth[2]": "g", "motor[0]": None}
-    assert {name: known_unit_of_column(path, name) for name in units} == units
+    assert {name: known_unit(path, name) for name in units} == units

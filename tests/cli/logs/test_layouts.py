@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rigidjax.cli.logs.layouts import USUAL, imu_columns_of
+from rigidjax.cli.logs.layouts import USUAL, imu_columns
 from rigidjax.identify import read_table
 
 PHYPHOX = '"Time (s)","{0} x (rad/s)","{0} y (rad/s)","{0} z (rad/s)","{1} (rad/s)"\n'
@@ -16,7 +16,7 @@ def test_phyphox_is_known_by_its_header(tmp_path, words, separator):
     header = PHYPHOX.format(*words).replace(",", separator)
     rows = "\n".join(separator.join(map(str, row)) for row in np.arange(20.0).reshape(4, 5))
     path.write_text(header + rows)
-    layout = imu_columns_of(path)
+    layout = imu_columns(path)
     assert (layout.unit, layout.time_unit) == ("rad/s", "s")
     table = read_table(path, layout.columns)
     np.testing.assert_array_equal(table[layout.columns[0]], [0, 5, 10, 15])
@@ -27,5 +27,5 @@ def test_phyphox_is_known_by_its_header(tmp_path, words, separator):
 def test_other_texts_have_the_usual_columns(tmp_path, text):
     path = tmp_path / "log.csv"
     path.write_text(text)
-    assert imu_columns_of(path) == USUAL
-    assert imu_columns_of(tmp_path / "none.csv") == imu_columns_of(tmp_path) == USUAL
+    assert imu_columns(path) == USUAL
+    assert imu_columns(tmp_path / "none.csv") == imu_columns(tmp_path) == USUAL

@@ -14,7 +14,7 @@ import rigidjax as rj
 from rigidjax.cli import spec
 from rigidjax.cli.command import main
 from rigidjax.cli.logs.errors import LogError
-from rigidjax.cli.logs.layouts import USUAL, imu_columns_of
+from rigidjax.cli.logs.layouts import USUAL, imu_columns
 from rigidjax.identify import read_table
 
 T = np.arange(40) * 0.01
@@ -120,7 +120,7 @@ FILES = {
 def test_time_and_rates_are_found_in_si(tmp_path, kind):
     name, write, exact = FILES[kind]
     write(tmp_path / name)
-    layout = imu_columns_of(tmp_path / name)
+    layout = imu_columns(tmp_path / name)
     rates = spec.parse_channel(f"gyro={','.join(layout.columns[1:])}:{layout.unit}")
     record = spec.read_log(
         tmp_path / name, [rates], time=layout.columns[0], time_unit=layout.time_unit
@@ -162,7 +162,7 @@ def test_a_name_that_is_not_there_or_a_cut_file_is_one_line(tmp_path, capsys, ki
 
 def test_a_text_file_without_ending_is_text(tmp_path):
     (tmp_path / "log").write_text("t,wx,wy,wz\n0,1,2,3\n")
-    assert imu_columns_of(tmp_path / "log") == USUAL
+    assert imu_columns(tmp_path / "log") == USUAL
     assert read_table(tmp_path / "log", ["wy"])["wy"].tolist() == [2.0]
 
 

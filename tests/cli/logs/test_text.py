@@ -13,7 +13,7 @@ from scipy.io import savemat
 import rigidjax as rj
 from rigidjax.cli.command import main
 from rigidjax.cli.logs.errors import LogError
-from rigidjax.cli.logs.layouts import imu_columns_of
+from rigidjax.cli.logs.layouts import imu_columns
 from rigidjax.identify import read_table
 
 GOOD = "t,wx,wy,wz\n" + "\n".join(
@@ -213,7 +213,7 @@ def test_a_layout_has_the_units_in_its_names(unit, time_unit, tmp_path):
     path = tmp_path / "log.csv"
     names = [f"Zeit ({time_unit})", "Betrag", *(f"Gyroskop {axis} ({unit})" for axis in "zyx")]
     path.write_text(";".join(names) + "\n")
-    layout = imu_columns_of(path)
+    layout = imu_columns(path)
     assert layout.columns == (names[0], names[4], names[3], names[2])
     assert layout.unit == unit.replace("°", "deg") and layout.time_unit == time_unit
 
@@ -222,7 +222,7 @@ def test_a_header_that_is_a_comment_is_known_as_that_of_phyphox(tmp_path):
     names = ["Time (s)", *(f"Gyroscope {axis} (rad/s)" for axis in "xyz")]
     path = tmp_path / "log.csv"
     path.write_text("# export\n# " + ",".join(names) + "\n0,,1,\n1,2,3,4\n")
-    assert imu_columns_of(path).columns == tuple(names)
+    assert imu_columns(path).columns == tuple(names)
     np.testing.assert_array_equal(rj.identify.read_table(path, names[:2])[names[1]], [np.nan, 2.0])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.times import mask_of_increasing, rows_to_use, warn_of_gap_or_wrong_unit
+from rigidjax.cli.logs.times import increasing, increasing_rows, warn_of_steps
 
 NAN = np.nan
 
@@ -28,7 +28,7 @@ def longest(t):
 def test_as_few_rows_as_possible_are_left_out(seed):
     rng = np.random.default_rng(seed)
     t = np.where(rng.random(9) < 0.15, NAN, rng.integers(0, 9, 9).astype(float))
-    keep = mask_of_increasing(t)
+    keep = increasing(t)
     assert (np.diff(t[keep]) > 0).all() and np.isfinite(t[keep]).all()
     assert keep.sum() == longest(t)
 
@@ -59,7 +59,7 @@ def test_a_bad_stamp_costs_its_own_row_and_is_named(case):
     shown = ", ".join(str(row + 1) for row in bad)
     words = f"log: column 'time': {len(bad)} of 60 rows are left out.*rows? {shown}\\)"
     with pytest.warns(LogWarning, match=words):
-        rows = rows_to_use("log", t, "time", None)
+        rows = increasing_rows("log", t, "time", None)
     assert sorted({*range(60)} - {*rows.tolist()}) == bad
 
 
@@ -67,21 +67,21 @@ def test_many_bad_rows_are_counted_and_the_first_five_named():
     t = T.copy()
     t[2::3] = t[1::3]
     with pytest.warns(LogWarning, match=r"20 of 60 rows .*rows 3, 6, 9, 12, 15, …\)"):
-        assert rows_to_use("log", t, "time", None).size == 40
+        assert increasing_rows("log", t, "time", None).size == 40
 
 
 @pytest.mark.parametrize("case", [name for name in ONE_BAD if name != "missing"])
 def test_a_bad_stamp_outside_the_window_is_no_matter(case):
     t, bad = ONE_BAD[case]
     low = T[max(bad) + 1]
-    rows = rows_to_use("log", t, "time", (low, 14.0))
+    rows = increasing_rows("log", t, "time", (low, 14.0))
     np.testing.assert_array_equal(rows, np.flatnonzero((low <= T) & (T <= 14.0)))
 
 
 def test_a_missing_stamp_inside_the_window_is_told_and_one_outside_is_not():
     t = changed(r5=NAN, r30=NAN)
     with pytest.warns(LogWarning, match=r"1 of 17 rows .*row 31\)"):
-        rows = rows_to_use("log", t, "time", (6.0, 10.0))
+        rows = increasing_rows("log", t, "time", (6.0, 10.0))
     assert rows.tolist() == [k for k in range(24, 41) if k != 30]
 
 
@@ -89,10 +89,10 @@ def test_an_empty_window_is_told_with_the_range_there_is():
     for window in ((15.0, 20.0), (-5.0, -1.0)):
         words = r"wanted at least 4 samples between .* from the first stamp, got .; the log goes from 0 to 14.75 s"
         with pytest.raises(LogError, match=words):
-            rows_to_use("log", T, "time", window)
+            increasing_rows("log", T, "time", window)
     for window in ((3.0, 3.0), (4.0, 1.0), (NAN, 1.0)):
         with pytest.raises(LogError, match="window: wanted FROM below TO"):
-            rows_to_use("log", T, "time", window)
+            increasing_rows("log", T, "time", window)
 
 
 @pytest.mark.parametrize("second", [T, T[:20], T + 0.01, T[:20] + 0.01, 3.0 + T])
@@ -101,18 +101,18 @@ def test_two_logs_in_one_file_are_not_mixed(second, order):
     t = np.concatenate([T, second][::order])
     row = (T if order == 1 else second).size
     with pytest.raises(LogError, match=f"the clock was set back at row {row + 1}, from .*--window"):
-        rows_to_use("log", t, "time", None)
+        increasing_rows("log", t, "time", None)
 
 
 def test_a_part_before_the_clock_is_set_back_can_be_chosen():
     t = np.concatenate([T, 10.0 + T])
-    np.testing.assert_array_equal(rows_to_use("log", t, "time", (0.0, 9.9)), np.arange(40))
+    np.testing.assert_array_equal(increasing_rows("log", t, "time", (0.0, 9.9)), np.arange(40))
 
 
 def test_a_log_without_times_is_refused():
     for t in (np.full(20, NAN), np.full(20, 3.0), T[:3], np.zeros(0)):
         with pytest.raises(LogError, match=r"are repeated, backward or missing|at least 4 samples"):
-            rows_to_use("log", t, "time", None)
+            increasing_rows("log", t, "time", None)
 
 
 @pytest.mark.parametrize(
@@ -127,14 +127,14 @@ def test_a_log_without_times_is_refused():
 )
 def test_times_that_are_plainly_in_another_unit_are_remarked_upon(step, unit, rate, words):
     with pytest.warns(LogWarning, match=re.escape(words)):
-        warn_of_gap_or_wrong_unit("log", step * np.arange(50), unit, rate)
+        warn_of_steps("log", step * np.arange(50), unit, rate)
 
 
 @pytest.mark.parametrize(("step", "rate"), [(2e-4, 300.0), (0.02, 20.0), (60.0, 1e-3), (1.0, 0.02)])
 def test_usual_times_are_not_remarked_upon(step, rate):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_gap_or_wrong_unit("log", step * np.arange(50), "s", rate)
+        warn_of_steps("log", step * np.arange(50), "s", rate)
 
 
 @pytest.mark.parametrize("rate", [0.0, 2.0, 300.0])
@@ -142,15 +142,15 @@ def test_usual_times_are_not_remarked_upon(step, rate):
 def test_numbers_of_frames_are_no_times(rate, left_out):
     t = np.delete(np.arange(50.0), left_out)
     with pytest.warns(LogWarning, match="is exactly 1 s: are they the numbers of rows or frames"):
-        warn_of_gap_or_wrong_unit("log", t, "s", rate)
+        warn_of_steps("log", t, "s", rate)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_gap_or_wrong_unit("log", 1.001 * t, "s", min(rate, 5.0))
-        warn_of_gap_or_wrong_unit("log", 1e-3 * t, "ms", rate)
+        warn_of_steps("log", 1.001 * t, "s", min(rate, 5.0))
+        warn_of_steps("log", 1e-3 * t, "ms", rate)
 
 
 def test_a_clock_that_was_set_forward_is_told():
     with pytest.warns(
         LogWarning, match=r"no time between 14.75 and 1.7e\+09 s, other steps are 0.25"
     ):
-        warn_of_gap_or_wrong_unit("log", np.concatenate([T, 1.7e9 + T]), "s", 0.0)
+        warn_of_steps("log", np.concatenate([T, 1.7e9 + T]), "s", 0.0)

@@ -5,7 +5,7 @@ import warnings
 import pytest
 
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.units import unit_in_column_name, unit_of_columns
+from rigidjax.cli.logs.units import common_unit, unit_in_name
 
 RATES, ACCELERATIONS, TIMES = ("rad/s", "deg/s", "rpm"), ("m/s2", "g"), ("s", "ms", "us", "ns")
 NAMES = {
@@ -19,7 +19,7 @@ NAMES = {
 
 @pytest.mark.parametrize("name", NAMES)
 def test_units_of_rates(name):
-    assert unit_in_column_name(name, RATES) == NAMES[name]
+    assert unit_in_name(name, RATES) == NAMES[name]
 
 
 @pytest.mark.parametrize(
@@ -34,34 +34,34 @@ def test_units_of_rates(name):
     ],
 )  # fmt: skip
 def test_units_of_other_columns(name, allowed, unit):
-    assert unit_in_column_name(name, allowed) == unit
+    assert unit_in_name(name, allowed) == unit
 
 
 def test_the_name_decides_where_nothing_is_stated():
     names = ["x (deg/s)", "y (deg/s)", "z"]
-    assert unit_of_columns(names, None, "rad/s", RATES, "log") == "deg/s"
-    assert unit_of_columns(names, "deg/s", "rad/s", RATES, "log") == "deg/s"
-    assert unit_of_columns(["x", "y"], None, "rad/s", RATES, "log") == "rad/s"
-    assert unit_of_columns(["x", "y"], "rpm", "rad/s", RATES, "log") == "rpm"
+    assert common_unit(names, None, "rad/s", RATES, "log") == "deg/s"
+    assert common_unit(names, "deg/s", "rad/s", RATES, "log") == "deg/s"
+    assert common_unit(["x", "y"], None, "rad/s", RATES, "log") == "rad/s"
+    assert common_unit(["x", "y"], "rpm", "rad/s", RATES, "log") == "rpm"
 
 
 def test_units_that_disagree_are_refused():
     with pytest.raises(
         LogError, match=r"log: column 'x \(deg/s\)' is in deg/s by its name, and rad/s"
     ):
-        unit_of_columns(["x (deg/s)"], "rad/s", "rad/s", RATES, "log")
+        common_unit(["x (deg/s)"], "rad/s", "rad/s", RATES, "log")
     with pytest.raises(LogError, match=r"'x \(deg/s\)' is in deg/s, column 'y \(rad/s\)' in rad/s"):
-        unit_of_columns(["x (deg/s)", "y (rad/s)"], None, "rad/s", RATES, "log")
+        common_unit(["x (deg/s)", "y (rad/s)"], None, "rad/s", RATES, "log")
     with pytest.raises(LogError, match=r"'x \(m/s\^2\)' is in m/s2; wanted rad/s or deg/s or rpm"):
-        unit_of_columns(["x (m/s^2)"], None, "rad/s", RATES, "log")
+        common_unit(["x (m/s^2)"], None, "rad/s", RATES, "log")
 
 
 def test_a_unit_that_is_not_known_is_told_unless_one_is_stated():
     with pytest.warns(
         LogWarning, match=r"'x \(mdps\)': its unit is not known; it is read in rad/s"
     ):
-        assert unit_of_columns(["x (mdps)"], None, "rad/s", RATES, "log") == "rad/s"
+        assert common_unit(["x (mdps)"], None, "rad/s", RATES, "log") == "rad/s"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert unit_of_columns(["x (mdps)"], "deg/s", "rad/s", RATES, "log") == "deg/s"
-        assert unit_of_columns(["gyro[0]", "w (x)"], None, "rad/s", RATES, "log") == "rad/s"
+        assert common_unit(["x (mdps)"], "deg/s", "rad/s", RATES, "log") == "deg/s"
+        assert common_unit(["gyro[0]", "w (x)"], None, "rad/s", RATES, "log") == "rad/s"
