@@ -28,9 +28,8 @@ from rigidjax._types import ScalarLike
 from rigidjax.motion.manifold import leaf_names, minus, parts_by_name
 from rigidjax.solve import difference, validation
 from rigidjax.solve.linear_map import known_with_derivatives_of
+from rigidjax.solve.peaks import times_of_peaks
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
-from rigidjax.solve.sides import hold_piecewise_constant_laws_at
-from rigidjax.solve.switching import depends_on_time
 
 # The error of a run is measured by a second, more accurate run. This number is the tolerance of the
 # second run divided by the tolerance of the first. With this value the second run of a method of
@@ -41,13 +40,6 @@ _CLOSER = 2e-2
 # step before it. In a run of a few steps this limit, and not the tolerance, sets the lengths of the
 # steps: without the parts the second run would take the same steps as the first.
 _CUTS = 8
-# A run evaluates the torque law at its stages only. To find short pulses between the stages, the
-# law is sampled at `_SAMPLES_OF_PART` times in each of `_PARTS` parts of the run. A sample is
-# called sudden if its distance from the chord between its two neighbours is greater than `_SUDDEN`
-# times the geometric mean of these distances in the part, plus `_ROUGH` times the relative rounding
-# error of the dtype. The distances are relative to the largest sample of the part. (A few sudden
-# samples hardly change the geometric mean. The median takes more time than all samples together.)
-_PARTS, _SAMPLES_OF_PART, _SUDDEN, _ROUGH = 32, 512, 20.0, 1e3
 # The round-off of a run is measured by its neighbours: runs whose inputs differ from those of the
 # run in the last digit. These two numbers are the number of neighbours, and the number of standard
 # deviations that are reported as the error. Three standard deviations over four runs (the run and
@@ -255,7 +247,7 @@ def estimate_error_of_run(
         factor = 0.0
     else:
         second, rtol, factor = _more_accurate_setup(
-            setup, ts, _times_of_sudden_torque(setup, ts, ys)
+            setup, ts, _times_of_peaks(setup, ts, ys, num_steps)
         )
         others, *_ = solve(second, jax.tree.map(lambda leaf: leaf[0], ys), ts)
     steps = jax.tree.map(lambda part: factor * part, _distances_of_states(others, ys))
@@ -522,16 +514,21 @@ def solve_to_accuracy(
     """
     still = _without_derivatives((setup, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
-    sudden = _times_of_sudden_torque(still[0], ts, jax.tree.map(lambda leaf: leaf[None], still[1]))
-    cut = dataclasses.replace(still[0], cuts=sudden)
+    quiet = dataclasses.replace(still[0], throw=False)
     first_rtol = jnp.asarray(max(_FIRST, 100 * floor), ts.dtype)
+    begun = _placeholder_run(quiet, still[1], ts, first_rtol)
+    peaks = lambda run: _times_of_peaks(quiet, ts, run.ys, run.accepted_steps)  # noqa: E731
+    cuts = jnp.full(jax.eval_shape(peaks, begun).shape, ts[0])
 
     def closer(carry: Any) -> Any:
-        number, first, _, before, rtol, ended = carry
+        number, first, _, before, rtol, cuts, ended = carry
         # In a batch, the loop goes on until the searches of all bodies have ended. A body whose
         # search has ended is run with all times equal to the first time, and takes no step.
-        new = _run_at_tolerance(cut, still[1], jnp.where(ended, ts[0], ts), rtol)
+        run = dataclasses.replace(quiet, cuts=cuts)
+        new = _run_at_tolerance(run, still[1], jnp.where(ended, ts[0], ts), rtol)
         is_first = number == 0
+        if cuts.size:
+            cuts = lax.cond(is_first, peaks, lambda _: cuts, new)
         count, counted = new.accepted_steps.astype(ts.dtype), before.accepted_steps.astype(ts.dtype)
         off = jnp.nanmax(
             _largest_relative_distance(
@@ -561,12 +558,11 @@ def solve_to_accuracy(
         )
         found = ~is_first & ((sound & (off <= still[3])) | (rtol <= floor))
         first = jax.tree.map(lambda a, b: jnp.where(is_first, a, b), new, first)
-        return number + 1, first, before, new, following, found | none_reached
+        return number + 1, first, before, new, following, cuts, found | none_reached
 
-    begun = _placeholder_run(cut, still[1], ts, first_rtol)
-    carry = (0, begun, begun, begun, first_rtol, jnp.asarray(False))
-    _, first, before, new, *_ = lax.while_loop(lambda carry: ~carry[-1], closer, carry)
-    setup = dataclasses.replace(_with_tolerance(setup, lax.stop_gradient(new.rtol)), cuts=sudden)
+    carry = (0, begun, begun, begun, first_rtol, cuts, jnp.asarray(False))
+    _, first, before, new, _, cuts, _ = lax.while_loop(lambda carry: ~carry[-1], closer, carry)
+    setup = dataclasses.replace(_with_tolerance(setup, lax.stop_gradient(new.rtol)), cuts=cuts)
     run = _with_derivatives_of_solve(setup, state0, ts, new.ys), new.stats, new.result
     return setup, run, (first, before)
 
@@ -599,60 +595,11 @@ def _with_tolerance(setup: DiffraxRun, rtol: Array) -> DiffraxRun:
     return dataclasses.replace(setup, rtol=rtol, atol=_SMALL * rtol, throw=False)
 
 
-def _times_of_sudden_torque(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: PyTree) -> Array:
-    """Return times at which the torque changes suddenly, so that a run may miss a short pulse.
-
-    A run evaluates the torque only at the stages of its steps, and does not notice a short pulse
-    between two stages. The time of the run is therefore divided into 32 equal parts, and in each
-    part the torque is sampled at 512 times. For all samples of a part the state is the last saved
-    state before the middle of the part. A sample is sudden if its distance from the chord between
-    its two neighbours is far greater than the distances of most other samples of the part.
-
-    **Arguments:**
-
-    - `setup`: the body, the torque and the solver of the run.
-    - `ts`, `ys`: the saved times, s, and the states at these times, with a leading time axis. If
-      there are fewer states than times, the last state stands for all later times.
-
-    **Returns** an array (32,): for each part the time, s, of its most sudden sample, or the first
-    of `ts` if no sample is sudden. The array has no times if the torque does not depend on the
-    time, or is constant between its jumps (`Held`, `Pulses`): steps end at these jumps, so that no
-    pulse is missed.
-    """
+def _times_of_peaks(setup: DiffraxRun, ts: Array, ys: PyTree, num_steps: Array) -> Array:
+    """Return times of narrow peaks of the torque, which steps of a run may pass over."""
     state0 = jax.tree.map(lambda leaf: leaf[0], ys)
-    # Steps end at each jump of a law that is constant between its jumps, so that no pulse of such a
-    # law is missed. These laws are therefore held fixed here, at their values at the first time.
     field = equations_of_motion(setup.body, state0, setup.torque)
-    field = hold_piecewise_constant_laws_at(field, ts[0])
-    if not depends_on_time(lambda t: ravel_pytree(field(t, state0, None))[0], ts[0]):
-        return ts[:0]
-    # The samples are at uneven times: on an even grid, pulses that come once a second could all
-    # fall between the samples.
-    uneven = np.random.default_rng(1).uniform(-0.25, 0.25, (_PARTS, _SAMPLES_OF_PART + 2))
-    # The first and the last sample of a part serve only as neighbours of other samples. The last
-    # two times of a part are therefore also the first two times of the next part.
-    uneven[1:, :2] = uneven[:-1, -2:]
-    number = _SAMPLES_OF_PART * np.arange(_PARTS)[:, None] + np.arange(_SAMPLES_OF_PART + 2) - 0.5
-    share = np.clip((number + uneven) / (_PARTS * _SAMPLES_OF_PART), 0.0, 1.0)
-    times = ts[0] + (ts[-1] - ts[0]) * jnp.asarray(share, ts.dtype)
-    way = jnp.sign(ts[-1] - ts[0])
-    saved = jnp.searchsorted(way * ts, way * times[:, _SAMPLES_OF_PART // 2], side="right") - 1
-
-    def sudden(part: tuple[Array, Array]) -> Array:
-        t, index = part
-        y = jax.tree.map(lambda leaf: leaf[index], ys)
-        f = jax.vmap(lambda t: ravel_pytree(field(t, y, None))[0])(t)
-        left, here, right = t[:-2, None], t[1:-1, None], t[2:, None]
-        chord = (f[:-2] * (right - here) + f[2:] * (here - left)) / (right - left)
-        size = jnp.max(jnp.abs(f), 0)
-        missed = jnp.abs(f[1:-1] - chord) / jnp.where(size > 0, size, 1)[None]
-        missed = jnp.max(jnp.where(jnp.isfinite(missed), missed, 0), 1)
-        least = _ROUGH * float(jnp.finfo(t.dtype).eps)
-        usual = jnp.exp(jnp.mean(jnp.log(jnp.maximum(missed, least))))
-        most = jnp.argmax(missed)
-        return jnp.where(missed[most] > _SUDDEN * usual + least, t[1 + most], ts[0])
-
-    return lax.stop_gradient(lax.map(sudden, (times, saved)))
+    return times_of_peaks(field, setup.sign, ts, ys, num_steps)
 
 
 def _more_accurate_setup(
