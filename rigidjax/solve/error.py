@@ -35,11 +35,10 @@ from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, s
 # second run divided by the tolerance of the first. With this value the second run of a method of
 # order 8 takes 1.6 times as many steps as the first.
 _CLOSER = 2e-2
-# The second, more accurate run, by which the error of a first run is measured, is divided into this
-# many equal parts, and a step ends at the end of each part. No step is longer than ten times the
-# step before it. In a run of a few steps this limit, and not the tolerance, sets the lengths of the
-# steps: without the parts the second run would take the same steps as the first.
-_CUTS = 8
+# No step of the second run is longer than this part of the run. A step is at most ten times as long
+# as the step before it: in a run of a few steps this limit, and not the tolerance, sets the lengths
+# of the steps, and the second run would otherwise take the same steps as the first.
+_PARTS = 8
 # The round-off of a run is measured by its neighbours: runs whose inputs differ from those of the
 # run in the last digit. These two numbers are the number of neighbours, and the number of standard
 # deviations that are reported as the error. Three standard deviations over four runs (the run and
@@ -77,20 +76,20 @@ _SMALL = 1e-3
 # each result.
 _ABOVE, _ABOVE_ONE, _CLEAR, _PLAIN, _COARSE = 100.0, 10.0, 3.0, 1e6, 1e5
 # `simulate(…, accuracy=…)` searches for a tolerance at which a run is as accurate as wanted. The
-# search starts with a run at the tolerance `_FIRST`, which takes n steps. The tolerance of the next
-# run is found from n: in 800 motions of `bench_error` the error was n²/100 times the tolerance,
-# within a factor of ten. At one tolerance this formula gives the wanted error; the next run has
-# `_SECOND` times this tolerance, since a run that is too accurate costs more than a further run.
-# From the second run on, the error is measured. Where the tolerance changes, the error changes in
-# proportion only within a factor of four: an error that is predicted is therefore multiplied by
-# `_ALLOWED`. The search aims at the wanted accuracy divided by `_AIM`.
+# search starts with a run at the tolerance `_FIRST`, which takes n steps. In 500 motions the error
+# at a tolerance was n^1.5 / 35 times the tolerance, within a factor of six. The second run aims at
+# `_NEXT` times the wanted accuracy; if the first run is too far off to measure its error (more than
+# `_FAR`), at `_SECOND` times, since the error of the second run is then measured by a third.
+# Where the tolerance changes, the error changes in proportion within a factor of `_ALLOWED` (98 of
+# 100 motions): a predicted error is multiplied by it. The search aims at the wanted accuracy
+# divided by `_AIM`.
 #
 # In three cases the error is not proportional to the tolerance: if the error is above `_FORESEEN`
 # (0.1 rad); if the run has fewer than `_FEW` steps; and if the number of steps grew from the run
 # before by less than `_GROWTH` times the factor that the order of the method implies. The measured
 # error is then not used, and the next run has a hundredth of the tolerance.
-_FIRST, _SECOND, _ALLOWED, _AIM = 1e-4, 20.0, 4.0, 2.0
-_FORESEEN, _FEW, _GROWTH = 0.1, 8, 0.9
+_FIRST, _NEXT, _FAR, _SECOND, _ALLOWED, _AIM = 3e-5, 0.1, 0.01, 20.0, 6.0, 1.25
+_FORESEEN, _FEW, _GROWTH = 0.1, 8, 0.6
 # The smallest tolerance, as a multiple of the relative rounding error of the dtype: `_FLOOR` in the
 # search for a tolerance, and `_DEEPEST` for a run that serves for comparison only.
 _FLOOR, _DEEPEST = 20.0, 4.0
@@ -107,7 +106,7 @@ class Error(eqx.Module):
     - `steps`: the error of the steps, one array (T,) for each name (`q`, `omega`, `x`, `v`,
       `own.0`, …). For a quaternion it is the angle of the turn, rad; for other arrays it is the
       length of the difference (rad/s, m, m/s). This error is accurate to some percent; after
-      `simulate(…, accuracy=…)` it is too large by a factor of about four.
+      `simulate(…, accuracy=…)` it is too large by a factor of about five.
     - `round_off`: the error of rounding, three standard deviations, in arrays by name as in
       `steps`. It includes the effect of the last digits of body, torque and initial state (in
       closed form also of the times). If this error is far below `steps`, only an upper bound is
@@ -229,7 +228,7 @@ def estimate_error_of_run(
     - `search`: `None`, or two runs that `simulate(…, accuracy=…)` tried while it searched for the
       tolerance of the given run: the first run of the search, and the last one before the given
       run. Both have larger tolerances. The error of the steps is then measured by the last run
-      before the given one, not by a more accurate run, and is too large by a factor of about four.
+      before the given one, not by a more accurate run, and is too large by a factor of about five.
     """
     setup, ts, ys, num_steps, search = _without_derivatives((setup, ts, ys, num_steps, search))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
@@ -294,6 +293,7 @@ def _error_with_round_off(
     eps = float(jnp.finfo(ts.dtype).eps)
     plain = {name: _ABOVE * eps * num_steps.astype(ts.dtype) ** 1.5 * sizes[name] for name in sizes}
     coarse = rtol > _COARSE * eps
+    known = _largest_relative_distance(step_errors, sizes)
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
     setup, ys, more = _run_at_larger_tolerance(setup, start, ts, ys, num_steps, search)
     free = isinstance(setup, ClosedFormRun)
@@ -311,9 +311,9 @@ def _error_with_round_off(
         changes = changes_of_neighbour(near, jnp.where(clear, ts[0], ts * later))
         shown = _lengths_of_changes_by_name(start, _DEVIATIONS * _ABOVE_ONE * changes)
         bounds = {name: jnp.maximum(plain[name], shown[name]) for name in sizes}
-        above = jnp.stack([(step_errors[name] > _CLEAR * bounds[name])[1:] for name in sizes])
-        small = coarse & jnp.all(above | ~reached[None, 1:])
-        return jnp.where(number == 0, small, clear), (changes, bounds)
+        above = known > _CLEAR * _largest_relative_distance(bounds, sizes)
+        small = coarse & jnp.all((above | ~reached)[1:])
+        return jnp.where(number == 0, small, clear), (changes, shown)
 
     rng = np.random.default_rng(0)
     near = jax.tree.map(
@@ -326,16 +326,16 @@ def _error_with_round_off(
     inputs = jnp.arange(_NEIGHBOURS), near, later
     # The neighbours (runs with changed inputs) are run one after another: a batch of them would
     # take no less time, and the first neighbour may show that the others are not needed.
-    clear, (changes, bounds) = lax.scan(neighbour, jnp.asarray(False), inputs)
+    clear, (changes, shown) = lax.scan(neighbour, jnp.asarray(False), inputs)
     off = _lengths_of_changes_by_name(
         start, _DEVIATIONS * jnp.sqrt(_variance_over_neighbours(changes))
     )
-    off = {name: jnp.where(clear, bounds[name][0], off[name]) for name in off}
+    off = {name: jnp.where(clear, shown[name][0], off[name]) for name in off}
 
-    def known(part: Array) -> Array:
-        return jnp.where(reached, jnp.where(jnp.isnan(part), jnp.inf, part), jnp.nan)
-
-    step_errors, off = jax.tree.map(known, (step_errors, off))
+    step_errors, off = jax.tree.map(
+        lambda part: jnp.where(reached, jnp.where(jnp.isnan(part), jnp.inf, part), jnp.nan),
+        (step_errors, off),
+    )
     return Error(ts, step_errors, off, sizes)
 
 
@@ -398,6 +398,8 @@ def _run_at_larger_tolerance(
     else:
         near = is_near(search[0])
         run = jax.tree.map(lambda first, last: jnp.where(near, first, last), *search)
+        if setup.cuts is not None:  # the first run was made before the peaks were known
+            setup = dataclasses.replace(setup, cuts=jnp.where(near, ts[0], setup.cuts))
     fewer = jnp.maximum(run.accepted_steps, 1)
     setup = _with_tolerance(setup, run.rtol)
     return setup, run.ys, (jnp.maximum(num_steps / fewer, 1.0) ** 0.25).astype(ts.dtype)
@@ -543,10 +545,13 @@ def solve_to_accuracy(
         # full length.
         more = (before.rtol / rtol) ** (1 / setup.solver.tableau.order)
         sound = foreseen & (count >= _FEW) & (count >= _GROWTH * more * counted)
-        wanted = jnp.where(
-            sound, jnp.minimum(rtol * still[3] / (_AIM * off), rtol / 3), 0.01 * rtol
-        )
-        second = jnp.minimum(_SECOND * still[3] * 100 / count**2, rtol / 30)
+        # The first run may be so far off that its distance tells nothing of the second run.
+        less = jnp.where((number == 1) & ~foreseen, 0.1, 0.01)
+        wanted = jnp.minimum(rtol * still[3] / (_AIM * off), rtol / 3)
+        wanted = jnp.where(sound, wanted, less * rtol)
+        usual = count**1.5 / 35  # the error of a run, divided by its tolerance
+        share = jnp.where(usual * rtol < _FAR, _NEXT, _SECOND)
+        second = jnp.minimum(share * still[3] / usual, rtol / 30)
         following = jnp.maximum(jnp.where(is_first, second, wanted), floor)
         # A run that reached none of the times will reach none at a smaller tolerance either.
         none_reached = ~jnp.any(
@@ -602,9 +607,7 @@ def _times_of_peaks(setup: DiffraxRun, ts: Array, ys: PyTree, num_steps: Array) 
     return times_of_peaks(field, setup.sign, ts, ys, num_steps)
 
 
-def _more_accurate_setup(
-    setup: Any, ts: Array, sudden_times: Array
-) -> tuple[DiffraxRun, Array, float]:
+def _more_accurate_setup(setup: Any, ts: Array, peaks: Array) -> tuple[DiffraxRun, Array, float]:
     """Return the set-up of a more accurate run, by which the error of a given run is measured.
 
     **Arguments:**
@@ -612,8 +615,8 @@ def _more_accurate_setup(
     - `setup`: the body, the torque, the solver and the tolerances (or the fixed step) of the given
       run.
     - `ts`: (T,) the times of its saved states, s.
-    - `sudden_times`: (m,) the times, s, at which the torque changes suddenly, so that steps of the
-      more accurate run are to end there. Under fixed steps they are not used.
+    - `peaks`: (m,) the times, s, of narrow peaks of the torque, at which steps of the more accurate
+      run are to end. Under fixed steps they are not used.
 
     **Returns** three things: the set-up of the more accurate run, whose steps are half as long if
     the given run has fixed steps; the relative tolerance of the given run, 0 under fixed steps; and
@@ -622,16 +625,15 @@ def _more_accurate_setup(
     """
     eps = float(jnp.finfo(ts.dtype).eps)
     most = None if setup.max_steps is None else 4 * setup.max_steps
+    cuts = peaks if peaks.size else None
     setup = dataclasses.replace(setup, max_steps=most, throw=False)
     if setup.controller is None:
         rtol = jnp.asarray(setup.rtol, ts.dtype)
         less = jnp.maximum(_CLOSER * rtol, _DEEPEST * eps)
-        cuts = sudden_times
-        if setup.ends_steps_at_jumps:
-            parts = jnp.arange(1, _CUTS).astype(ts.dtype) / _CUTS
-            cuts = jnp.concatenate([ts[0] + (ts[-1] - ts[0]) * parts, sudden_times])
-        new = dict(rtol=less, atol=setup.atol * (less / rtol), cuts=cuts if cuts.size else None)
-        return dataclasses.replace(setup, **new), rtol, 1.0
+        longest = jnp.abs(ts[-1] - ts[0]) / _PARTS
+        longest = longest if setup.max_step is None else jnp.minimum(longest, setup.max_step)
+        new = dict(rtol=less, atol=setup.atol * (less / rtol), max_step=longest)
+        return dataclasses.replace(setup, cuts=cuts, **new), rtol, 1.0
     pid = lambda node: isinstance(node, dfx.PIDController)  # noqa: E731
     inside: Any = lambda c: [n for n in jax.tree.leaves(c, is_leaf=pid) if pid(n)]  # noqa: E731
     if found := inside(setup.controller):
@@ -639,8 +641,7 @@ def _more_accurate_setup(
         both = less, found[0].atol * (less / found[0].rtol)
         where = lambda s: (inside(s.controller)[0].rtol, inside(s.controller)[0].atol)  # noqa: E731
         setup = eqx.tree_at(where, setup, both)
-        setup = dataclasses.replace(setup, cuts=sudden_times) if sudden_times.size else setup
-        return setup, jnp.asarray(found[0].rtol, ts.dtype), 1.0
+        return dataclasses.replace(setup, cuts=cuts), jnp.asarray(found[0].rtol, ts.dtype), 1.0
     if not isinstance(setup.controller, dfx.ConstantStepSize):
         raise TypeError(
             "error: a second run needs a diffrax.PIDController or ConstantStepSize, got "

@@ -15,15 +15,22 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from rigidjax.solve import switching
 from rigidjax.solve.sides import evaluate_on_correct_sides
 from rigidjax.solve.stops import trace_program
-from rigidjax.solve.switching import BENT, FIXED, PIECES, PLAIN, STRAIGHT
+from rigidjax.solve.switching import (
+    BENT,
+    DECLARED,
+    FIXED,
+    PIECES,
+    PLAIN,
+    STRAIGHT,
+    Interpreter,
+)
 
 # The operands are sampled `_A_STEP` times in a mean step of the run, in blocks of `_WINDOWS` times
 # `_SAMPLES` times, of which at most `_BLOCKS` are taken. A block gives one peak of each window.
 _A_STEP, _WINDOWS, _SAMPLES, _BLOCKS = 64, 32, 16, 32
-_HALVINGS, _LARGE = 60, 1e30
+_SHORTER, _LARGE = 60, 1e30
 _STEEP = {"tanh", "logistic", "erf", "erfc", "atan", "asinh", "sinh", "cosh", "expm1"}
 
 
@@ -58,71 +65,73 @@ def times_of_peaks(
 ) -> Array:
     """Return the times (32,), s, of narrow peaks of a vector field, `ts[0]` for none.
 
-    `ys` are the states at the first of the times `ts`: those after the last have this state. `sign`
-    is the direction of time, as for `evaluate_on_correct_sides`. There are no times (0,) if no part
-    of the field is a steep function of the time.
+    `ys` are the states at `ts`, and `sign` is the direction of time, as for
+    `evaluate_on_correct_sides`. There are no times (0,) if no part of the field is a steep function
+    of the time.
     """
-    start, span = ts[0], ts[-1] - ts[0]
-    tree = jax.tree.map(lambda leaf: leaf[0], ys)
+    begin, span = ts[0], ts[-1] - ts[0]
+    way, dtype = jnp.sign(span), ts.dtype
+    tree = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], ys))[1]
     numbers = jax.vmap(lambda y: ravel_pytree(y)[0])(ys)
     sided = evaluate_on_correct_sides(field, sign, None)
-    restored = ravel_pytree(tree)[1]
-    flat = lambda t, y: ravel_pytree(sided(t, restored(y), None))[0]  # noqa: E731
-    program, way = trace_program(flat, start, numbers[0]).closed, jnp.sign(span)
-    itself: list[np.ndarray] = []
+    flat = lambda t, y: ravel_pytree(sided(t, tree(y), None))[0]  # noqa: E731
+    program = trace_program(flat, begin, numbers[0]).closed
+    itself: list[bool] = []  # of each operand
 
     def operands(t: Array) -> Array:
-        rows = []
+        rows: list[tuple[Array, bool]] = []
 
         def see(path: Any, inputs: Any, kinds: Any, out: Any) -> None:
-            if any(switching.DECLARED in str(eqn.source_info.name_stack) for eqn in path):
+            if any(DECLARED in str(eqn.source_info.name_stack) for eqn in path):
                 return  # steps end at the jumps of the law, and between them it has no peak
             found = (_height(path[-1], inputs, kinds, one) for one in out)
-            rows.extend((jnp.ravel(h).astype(t.dtype), own) for h, own in filter(None, found))
+            rows.extend((jnp.ravel(h).astype(dtype), own) for h, own in filter(None, found))
 
-        y = numbers[jnp.clip(jnp.searchsorted(way * ts, way * t, side="right"), 1, len(numbers)) - 1]
-        keep = lambda path, inputs, result, kind: result  # noqa: E731
-        reader = switching.Interpreter(keep, False, see=see)
-        reader.run(program.jaxpr, program.consts, [(t, STRAIGHT), (y, FIXED)])
-        itself[:] = [np.full(row.size, own) for row, own in rows]
-        return jnp.concatenate([row for row, _ in rows]) if rows else jnp.zeros(0, t.dtype)
+        saved = jnp.searchsorted(way * ts[1:], way * t, side="right")
+        given = [(t, STRAIGHT), (numbers[jnp.minimum(saved, len(numbers) - 1)], FIXED)]
+        reader = Interpreter(lambda path, inputs, result, kind: result, False, see=see)
+        reader.run(program.jaxpr, program.consts, given)
+        itself[:] = [own for row, own in rows for _ in range(row.size)]
+        return jnp.concatenate([jnp.zeros(0, dtype), *(row for row, _ in rows)])
 
-    if not jax.eval_shape(operands, start).size:
+    if not (m := jax.eval_shape(operands, begin).size):
         return ts[:0]
-    own, first = np.concatenate(itself), operands(start)
+    first, own = operands(begin), np.array(itself)
 
     def height(t: Array) -> Array:
         x = operands(t)
         x = jnp.where(own, jnp.log(jnp.abs(x - first)), x) if own.any() else x
         return jnp.nan_to_num(x, nan=-_LARGE, posinf=_LARGE, neginf=-_LARGE)
 
-    count = jnp.asarray(_WINDOWS * _SAMPLES, ts.dtype)
-    blocks = jnp.clip(jnp.ceil(_A_STEP * num_steps / count), 1, _BLOCKS).astype(ts.dtype)
-    least = 4 * (num_steps / (blocks * count)) ** 2  # falls by 1/2 within half of a mean step
+    size = float(_WINDOWS * _SAMPLES)
+    steps = num_steps.astype(dtype)
+    blocks = jnp.clip(jnp.ceil(_A_STEP / size * steps), 1.0, _BLOCKS)
 
-    def block(i: Array, best: Any) -> Any:
-        share = (i * count + np.arange(-1, _WINDOWS * _SAMPLES + 1)) / (blocks * count)
+    def block(i: Array, best: tuple[Array, ...]) -> tuple[Array, ...]:
+        share = (i.astype(dtype) * size + np.arange(-1.0, size + 1.0)) / (blocks * size)
         # On an even grid, peaks that come once a second could all fall between the samples.
-        t = start + span * jnp.clip(share * (1.25 - 0.25 * share), 0, 1)
+        t = begin + span * jnp.clip(share * (1.25 - 0.25 * share), 0.0, 1.0)
         h = jax.vmap(height)(t)
-        curve = jnp.where(
-            (h[1:-1] > h[:-2]) & (h[1:-1] >= h[2:]), 2 * h[1:-1] - h[:-2] - h[2:], 0
-        ).reshape(_WINDOWS, -1)
-        most = jnp.argmax(curve, 1)
-        new = jnp.max(curve, 1), t[:-2][row := most // own.size + _SAMPLES * np.arange(_WINDOWS)], t[2:][row], most % own.size
+        left, right = h[1:-1] - h[:-2], h[1:-1] - h[2:]
+        curve = jnp.where((left > 0) & (right >= 0), left + right, 0).reshape(_WINDOWS, -1)
+        most = jnp.argmax(curve, 1).astype(jnp.int32)
+        row = most // m + _SAMPLES * np.arange(_WINDOWS, dtype=np.int32)
+        new = jnp.max(curve, 1), t[row], t[row + 2], most % m
         return jax.tree.map(lambda a, b: jnp.where(new[0] > best[0], a, b), new, best)
 
-    none = jnp.full(_WINDOWS, start)
-    begin = jnp.full(_WINDOWS, least, ts.dtype), none, none, jnp.zeros(_WINDOWS, int)
-    _, low, high, element = lax.fori_loop(0, blocks.astype(int), block, begin)
+    # A peak is narrow if its height falls by more than 1/2 within half of a mean step.
+    least = jnp.full(_WINDOWS, 4 * (steps / (blocks * size)) ** 2)
+    none = jnp.full(_WINDOWS, begin)
+    found = least, none, none, jnp.zeros(_WINDOWS, jnp.int32)
+    _, low, high, element = lax.fori_loop(0, blocks.astype(jnp.int32), block, found)
     at = jax.vmap(lambda t, i: height(t)[i])
 
-    def shorter(_: Any, ends: Any) -> Any:
+    def shorter(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         third = (high - low) / 3
         rises = at(low + third, element) < at(high - third, element)
         return jnp.where(rises, low + third, low), jnp.where(rises, high, high - third)
 
-    halvings = jnp.where(jnp.any(high != low), _HALVINGS, 0)
-    low, high = lax.fori_loop(0, halvings, shorter, (low, high))
+    many = jnp.where(jnp.any(high != low), _SHORTER, 0)
+    low, high = lax.fori_loop(0, many, shorter, (low, high))
     return lax.stop_gradient(0.5 * (low + high))

@@ -63,7 +63,8 @@ _SMOOTH = {"expm"}  # functions of JAX that compare only to choose between equal
 _ELEMENTWISE = {
     "add", "sub", "add_any", "neg", "copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze",
     "slice", "transpose", "rev", "concatenate", "expand_dims", "convert_element_type",
-    "stop_gradient", "optimization_barrier", "gather", "dynamic_slice", "select_n",
+    "stop_gradient", "optimization_barrier", "gather", "dynamic_slice", "select_n", "stack",
+    "unstack",
 }  # fmt: skip
 _SUMS = {"reduce_sum", "cumsum"}
 _PRODUCTS = {"mul", "div", "dot_general"}
