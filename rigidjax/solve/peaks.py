@@ -5,7 +5,6 @@ the operand of exp(−(t − c)²/2w²) is a parabola, for any width w. The oper
 at a few times of each step, and not the law. Sums, products, sines and roots make no narrow peak.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,6 +14,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from rigidjax.solve.run import DiffraxRun, equations_of_motion
 from rigidjax.solve.sides import evaluate_on_correct_sides
 from rigidjax.solve.stops import trace_program
 from rigidjax.solve.switching import (
@@ -60,20 +60,17 @@ def _height(eqn: Any, inputs: list[Any], kinds: list[int], out: Any) -> tuple[Ar
     return (out, True) if jnp.issubdtype(jnp.result_type(out), jnp.floating) else None
 
 
-def times_of_peaks(
-    field: Callable[..., PyTree], sign: Array | None, ts: Array, ys: PyTree, num_steps: Array
-) -> Array:
-    """Return the times (32,), s, of narrow peaks of a vector field, `ts[0]` for none.
+def times_of_peaks(setup: DiffraxRun, ts: Array, ys: PyTree, num_steps: Array) -> Array:
+    """Return the times (32,), s, of narrow peaks of the field of a run, `ts[0]` for none.
 
-    `ys` are the states at `ts`, and `sign` is the direction of time, as for
-    `evaluate_on_correct_sides`. There are no times (0,) if no part of the field is a steep function
-    of the time.
+    There are no times (0,) if no part of the field is a steep function of the time.
     """
     begin, span = ts[0], ts[-1] - ts[0]
     way, dtype = jnp.sign(span), ts.dtype
-    tree = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], ys))[1]
-    numbers = jax.vmap(lambda y: ravel_pytree(y)[0])(ys)
-    sided = evaluate_on_correct_sides(field, sign, None)
+    state0 = jax.tree.map(lambda leaf: leaf[0], ys)
+    tree, numbers = ravel_pytree(state0)[1], jax.vmap(lambda y: ravel_pytree(y)[0])(ys)
+    field = equations_of_motion(setup.body, state0, setup.torque)
+    sided = evaluate_on_correct_sides(field, setup.sign, None)
     flat = lambda t, y: ravel_pytree(sided(t, tree(y), None))[0]  # noqa: E731
     program = trace_program(flat, begin, numbers[0]).closed
     itself: list[bool] = []  # of each operand

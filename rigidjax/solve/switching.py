@@ -39,7 +39,7 @@ from jaxtyping import Array
 
 from rigidjax.solve.batching import Arrays
 
-# The scope (`jax.named_scope`) in which a law that declares its jumps is called: it is not searched.
+# The scope (`jax.named_scope`) in which a law that declares its jumps is called: not searched.
 DECLARED = "rigidjax_declared_jumps"
 MOST = 256  # the most elements, and the most changes, of the switches of one law
 FEW_KINKS = 8  # steps do not end at the kinks of an operation that has more

@@ -255,7 +255,9 @@ def test_second_derivatives_go_through_an_accuracy():
 
 
 def test_a_law_that_holds_the_state_says_the_same_with_an_accuracy():
-    stop = lambda t, state, body: jnp.where(state.omega > 0, -0.6, 0.4)  # noqa: E731
+    def stop(t, state, body):
+        return jnp.where(state.omega > 0, -0.6, 0.4)
+
     said = []
     for how in ({}, dict(accuracy=1e-6)):
         with pytest.raises(RuntimeError, match="all at one place") as error:

@@ -53,12 +53,12 @@ def test_an_accuracy_holds_for_a_pulse_between_steps():
 
 
 def times_of_peaks(sol):
-    from rigidjax.solve.error import _times_of_peaks
+    from rigidjax.solve import peaks
 
-    return _times_of_peaks(sol._setup, sol.ts, sol._states, sol.stats["num_steps"])
+    return peaks.times_of_peaks(sol._setup, sol.ts, sol._states, sol.stats["num_steps"])
 
 
-def peaks(law, ts, **how):
+def peaks_of(law, ts, **how):
     sol = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), ts, law, **how)
     return np.asarray(times_of_peaks(sol))
 
@@ -72,14 +72,14 @@ def test_smooth_laws_of_time_have_no_peaks():
         "still": rj.torques.Damping([0.1, 0.1, 0.1]),
     }
     for name, law in smooth.items():
-        assert peaks(law, [0.0, 30.0]).size == 0, name
+        assert peaks_of(law, [0.0, 30.0]).size == 0, name
     slow = {
         "decay": lambda t, state, body: jnp.exp(-0.1 * t) * Z,
         "orbit": lambda t, state, body: Z / (2.0 + jnp.cos(0.3 * t)),
         "square": lambda t, state, body: Z * (1.0 + 0.1 * t) ** 6,
     }
     for name, law in slow.items():
-        assert not np.any(peaks(law, [0.0, 30.0])), name
+        assert not np.any(peaks_of(law, [0.0, 30.0])), name
 
 
 # Shapes of width 1 about 0, by their narrow operations.
@@ -111,7 +111,7 @@ def test_a_peak_of_any_width_is_found(name):
 
 
 def test_peaks_that_come_once_a_second_and_peaks_of_tables_are_found():
-    train = peaks(
+    train = peaks_of(
         lambda t, state, body: Z * jnp.exp(3e4 * (jnp.cos(2 * jnp.pi * t) - 1)), [0.0, 512.0]
     )
     found = train[train > 0]
@@ -119,7 +119,7 @@ def test_peaks_that_come_once_a_second_and_peaks_of_tables_are_found():
     rows = jnp.zeros(2000).at[1234].set(5.0)
     times = jnp.linspace(0.0, 20.0, 2000)
     for table in (rj.torques.Series(times, rows), lambda t: jnp.interp(t, times, rows)):
-        at = peaks(lambda t, state, body, table=table: Z * table(t), [0.0, 20.0], max_step=0.2)
+        at = peaks_of(lambda t, state, body, table=table: Z * table(t), [0.0, 20.0], max_step=0.2)
         assert np.min(np.abs(at - times[1234])) < 0.02
 
 
@@ -135,12 +135,12 @@ class PulseOfAngle(eqx.Module):
 def test_laws_that_declare_their_jumps_have_no_peaks():
     edges, rng = jnp.linspace(0.0, 9.0, 31), np.random.default_rng(3)
     pulses = rj.torques.Pulses(edges, jnp.asarray(rng.normal(size=(30, 3))))
-    assert peaks(pulses, [0.0, 8.0]).size == 0
-    both = peaks(rj.torques.Sum(pulses, gaussian), [0.0, 8.0])
+    assert peaks_of(pulses, [0.0, 8.0]).size == 0
+    both = peaks_of(rj.torques.Sum(pulses, gaussian), [0.0, 8.0])
     assert np.min(np.abs(both - 7.3131)) < 1e-4
     # A law may be a pulse as a function of a straight line: 0.5 rad/s, 2.3 rad at 4.6 s.
     angle = rj.torques.Linear(jnp.array([0.0, 9.0]), jnp.array([0.0, 4.5]))
-    assert np.min(np.abs(peaks(PulseOfAngle(angle), [0.0, 8.0]) - 4.6)) < 1e-4
+    assert np.min(np.abs(peaks_of(PulseOfAngle(angle), [0.0, 8.0]) - 4.6)) < 1e-4
 
 
 class Until(eqx.Module):
