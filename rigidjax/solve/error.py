@@ -28,26 +28,17 @@ from rigidjax._types import ScalarLike
 from rigidjax.motion.manifold import leaf_names, minus, parts_by_name
 from rigidjax.solve import difference, validation
 from rigidjax.solve.linear_map import with_derivatives
-from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
-from rigidjax.solve.sides import hold_piecewise_constant_laws_at
-from rigidjax.solve.switching import depends_on_time
+from rigidjax.solve.peaks import times_of_peaks
+from rigidjax.solve.run import ClosedFormRun, DiffraxRun, solve
 
 # The error of a run is measured by a second, more accurate run. This number is the tolerance of the
 # second run divided by the tolerance of the first. With this value the second run of a method of
 # order 8 takes 1.6 times as many steps as the first.
 _CLOSER = 2e-2
-# The second, more accurate run, by which the error of a first run is measured, is divided into this
-# many equal parts, and a step ends at the end of each part. No step is longer than ten times the
-# step before it. In a run of a few steps this limit, and not the tolerance, sets the lengths of the
-# steps: without the parts the second run would take the same steps as the first.
-_CUTS = 8
-# A run evaluates the torque law at its stages only. To find short pulses between the stages, the
-# law is sampled at `_SAMPLES_OF_PART` times in each of `_PARTS` parts of the run. A sample is
-# called sudden if its distance from the chord between its two neighbours is greater than `_SUDDEN`
-# times the geometric mean of these distances in the part, plus `_ROUGH` times the relative rounding
-# error of the dtype. The distances are relative to the largest sample of the part. (A few sudden
-# samples hardly change the geometric mean. The median takes more time than all samples together.)
-_PARTS, _SAMPLES_OF_PART, _SUDDEN, _ROUGH = 32, 512, 20.0, 1e3
+# No step of the second run is longer than this part of the run. A step is at most ten times as long
+# as the step before it: in a run of a few steps this limit, and not the tolerance, sets the lengths
+# of the steps, and the second run would otherwise take the same steps as the first.
+_PARTS = 8
 # The round-off of a run is measured by its neighbours: runs whose inputs differ from those of the
 # run in the last digit. These two numbers are the number of neighbours, and the number of standard
 # deviations that are reported as the error. Three standard deviations over four runs (the run and
@@ -85,20 +76,20 @@ _SMALL = 1e-3
 # each result.
 _ABOVE, _ABOVE_ONE, _CLEAR, _PLAIN, _COARSE = 100.0, 10.0, 3.0, 1e6, 1e5
 # `simulate(…, accuracy=…)` searches for a tolerance at which a run is as accurate as wanted. The
-# search starts with a run at the tolerance `_FIRST`, which takes n steps. The tolerance of the next
-# run is found from n: in 800 motions of `bench_error` the error was n²/100 times the tolerance,
-# within a factor of ten. At one tolerance this formula gives the wanted error; the next run has
-# `_SECOND` times this tolerance, since a run that is too accurate costs more than a further run.
-# From the second run on, the error is measured. Where the tolerance changes, the error changes in
-# proportion only within a factor of four: an error that is predicted is therefore multiplied by
-# `_ALLOWED`. The search aims at the wanted accuracy divided by `_AIM`.
+# search starts with a run at the tolerance `_FIRST`, which takes n steps. In 500 motions the error
+# at a tolerance was n^1.5 / 35 times the tolerance, within a factor of six. The second run aims at
+# `_NEXT` times the wanted accuracy; if the first run is too far off to measure its error (more than
+# `_FAR`), at `_SECOND` times, since the error of the second run is then measured by a third.
+# Where the tolerance changes, the error changes in proportion within a factor of `_ALLOWED` (98 of
+# 100 motions): a predicted error is multiplied by it. The search aims at the wanted accuracy
+# divided by `_AIM`.
 #
 # In three cases the error is not proportional to the tolerance: if the error is above `_FORESEEN`
 # (0.1 rad); if the run has fewer than `_FEW` steps; and if the number of steps grew from the run
 # before by less than `_GROWTH` times the factor that the order of the method implies. The measured
 # error is then not used, and the next run has a hundredth of the tolerance.
-_FIRST, _SECOND, _ALLOWED, _AIM = 1e-4, 20.0, 4.0, 2.0
-_FORESEEN, _FEW, _GROWTH = 0.1, 8, 0.9
+_FIRST, _NEXT, _FAR, _SECOND, _ALLOWED, _AIM = 3e-5, 0.1, 0.01, 20.0, 6.0, 1.25
+_FORESEEN, _FEW, _GROWTH = 0.1, 8, 0.6
 # The smallest tolerance, as a multiple of the relative rounding error of the dtype: `_FLOOR` in the
 # search for a tolerance, and `_DEEPEST` for a run that serves for comparison only.
 _FLOOR, _DEEPEST = 20.0, 4.0
@@ -115,7 +106,7 @@ class Error(eqx.Module):
     - `steps`: the error of the steps, one array (T,) for each name (`q`, `omega`, `x`, `v`,
       `own.0`, …). For a quaternion it is the angle of the turn, rad; for other arrays it is the
       length of the difference (rad/s, m, m/s). This error is accurate to some percent; after
-      `simulate(…, accuracy=…)` it is too large by a factor of about four.
+      `simulate(…, accuracy=…)` it is too large by a factor of about five.
     - `round_off`: the error of rounding, three standard deviations, in arrays by name as in
       `steps`. It includes the effect of the last digits of body, torque and initial state (in
       closed form also of the times). If this error is far below `steps`, only an upper bound is
@@ -221,33 +212,18 @@ def estimate_error_of_run(
     num_steps: Array,
     search: tuple[TriedRun, TriedRun] | None = None,
 ) -> Error:
-    """Return an estimate of the error of a run that is already known, at each of its saved times.
+    """Return an estimate of the error of a known run, at each of its saved times.
 
-    The error of the steps is the distance to a second, more accurate run; a run in closed form has
-    no error of steps. The error of round-off is measured by runs with inputs changed in the last
-    digit.
-
-    **Arguments:**
-
-    - `setup`: the body, the torque, the solver and the tolerances of the run, a `ClosedFormRun` or
-      a `DiffraxRun`.
-    - `ts`: (T,) the times of the states, s.
-    - `ys`: the states at `ts` that the run gave, with a leading time axis.
-    - `num_steps`: the number of steps of the run.
-    - `search`: `None`, or two runs that `simulate(…, accuracy=…)` tried while it searched for the
-      tolerance of the given run: the first run of the search, and the last one before the given
-      run. Both have larger tolerances. The error of the steps is then measured by the last run
-      before the given one, not by a more accurate run, and is too large by a factor of about four.
+    `search` holds two of the runs that `simulate(…, accuracy=…)` tried: the first one, and the one
+    before the given run. The error of the steps is then measured by the latter, not by a more
+    accurate run, and is too large by a factor of about five.
     """
     setup, ts, ys, num_steps, search = _without_derivatives((setup, ts, ys, num_steps, search))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
     if search is not None:
         before = search[1]
         rtol, others = setup.rtol, before.ys
-        far = (
-            _largest_relative_distance(_distances_of_states(others, ys), _error_scales_by_name(ys))
-            > _FORESEEN
-        )
+        far = _relative_distance(others, ys) > _FORESEEN
         factor = jnp.where(far, jnp.inf, _ALLOWED * rtol / before.rtol)
     elif isinstance(setup, ClosedFormRun):
         # The distance of a state from itself may be a rounding error; at times that the run did not
@@ -255,7 +231,7 @@ def estimate_error_of_run(
         factor = 0.0
     else:
         second, rtol, factor = _more_accurate_setup(
-            setup, ts, _times_of_sudden_torque(setup, ts, ys)
+            setup, ts, times_of_peaks(setup, ts, ys, num_steps)
         )
         others, *_ = solve(second, jax.tree.map(lambda leaf: leaf[0], ys), ts)
     steps = jax.tree.map(lambda part: factor * part, _distances_of_states(others, ys))
@@ -263,7 +239,7 @@ def estimate_error_of_run(
 
 
 def _without_derivatives(tree: PyTree) -> PyTree:
-    """Return a tree with the same numbers as `tree`, whose arrays are constants for derivatives."""
+    """Return the same tree, whose arrays are constants for derivatives."""
     return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_array(a) else a, tree)
 
 
@@ -276,32 +252,21 @@ def _error_with_round_off(
     rtol: Array,
     search: tuple[TriedRun, TriedRun] | None,
 ) -> Error:
-    """Measure the round-off of a run, and return it together with the known error of its steps.
+    """Return the known error of the steps together with the round-off, measured by neighbours.
 
-    The error of round-off is measured by neighbouring runs, whose body, torque and start differ
-    from those of the run by about a unit in the last digit.
-
-    **Arguments:**
-
-    - `setup`: the body, the torque, the solver and the tolerances of the run.
-    - `ts`, `ys`: the saved times (T,), s, and the states of the run at these times.
-    - `num_steps`: the number of steps of the run.
-    - `step_errors`: the known error of the steps, one array (T,) for each array of a state, by its
-      name (`q`, `omega`, …).
-    - `rtol`: the relative tolerance of the run.
-    - `search`: `None`, or two runs that `simulate(…, accuracy=…)` tried while it searched for the
-      tolerance of the run: the first one and the one before the last. Both have larger tolerances,
-      and take fewer steps. Round-off is measured on one of them in place of the run, so that no run
-      at a larger tolerance has to be made.
+    A neighbour is a run whose body, torque and start differ by about a unit in the last digit.
+    With a `search` (see `estimate_error_of_run`) neighbours of one of its two runs are taken, so
+    that no run at a larger tolerance has to be made.
     """
     sizes, start = _error_scales_by_name(ys), jax.tree.map(lambda leaf: leaf[0], ys)
-    reached = jnp.isfinite(_largest_relative_distance(_distances_of_states(ys, ys), sizes))
+    reached = jnp.isfinite(_relative_distance(ys, ys))
     # `plain` is `_ABOVE` times the sum of the rounding errors of n = `num_steps` steps in a motion
     # without growth of errors. In the body rate the sum is about n^0.5 relative rounding errors.
     # The angle is the sum of the body rate over n steps, and has an error of about n^1.5 of them.
     eps = float(jnp.finfo(ts.dtype).eps)
     plain = {name: _ABOVE * eps * num_steps.astype(ts.dtype) ** 1.5 * sizes[name] for name in sizes}
     coarse = rtol > _COARSE * eps
+    known = _largest_relative_distance(step_errors, sizes)
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
     setup, ys, more = _run_at_larger_tolerance(setup, start, ts, ys, num_steps, search)
     free = isinstance(setup, ClosedFormRun)
@@ -319,9 +284,9 @@ def _error_with_round_off(
         changes = changes_of_neighbour(near, jnp.where(clear, ts[0], ts * later))
         shown = _lengths_of_changes_by_name(start, _DEVIATIONS * _ABOVE_ONE * changes)
         bounds = {name: jnp.maximum(plain[name], shown[name]) for name in sizes}
-        above = jnp.stack([(step_errors[name] > _CLEAR * bounds[name])[1:] for name in sizes])
-        small = coarse & jnp.all(above | ~reached[None, 1:])
-        return jnp.where(number == 0, small, clear), (changes, bounds)
+        above = known > _CLEAR * _largest_relative_distance(bounds, sizes)
+        small = coarse & jnp.all((above | ~reached)[1:])
+        return jnp.where(number == 0, small, clear), (changes, shown)
 
     rng = np.random.default_rng(0)
     near = jax.tree.map(
@@ -334,16 +299,16 @@ def _error_with_round_off(
     inputs = jnp.arange(_NEIGHBOURS), near, later
     # The neighbours (runs with changed inputs) are run one after another: a batch of them would
     # take no less time, and the first neighbour may show that the others are not needed.
-    clear, (changes, bounds) = lax.scan(neighbour, jnp.asarray(False), inputs)
+    clear, (changes, shown) = lax.scan(neighbour, jnp.asarray(False), inputs)
     off = _lengths_of_changes_by_name(
         start, _DEVIATIONS * jnp.sqrt(_variance_over_neighbours(changes))
     )
-    off = {name: jnp.where(clear, bounds[name][0], off[name]) for name in off}
+    off = {name: jnp.where(clear, shown[name][0], off[name]) for name in off}
 
-    def known(part: Array) -> Array:
-        return jnp.where(reached, jnp.where(jnp.isnan(part), jnp.inf, part), jnp.nan)
-
-    step_errors, off = jax.tree.map(known, (step_errors, off))
+    step_errors, off = jax.tree.map(
+        lambda part: jnp.where(reached, jnp.where(jnp.isnan(part), jnp.inf, part), jnp.nan),
+        (step_errors, off),
+    )
     return Error(ts, step_errors, off, sizes)
 
 
@@ -355,43 +320,23 @@ def _run_at_larger_tolerance(
     num_steps: Array,
     search: tuple[TriedRun, TriedRun] | None,
 ) -> tuple[Any, PyTree, float | Array]:
-    """Return a run at a larger tolerance, by which the round-off of a given run can be measured.
+    """Return a run by which the round-off of a given run is measured, its states, and a factor.
 
-    **Returns** three things: the set-up of the run at the larger tolerance, which takes fewer
-    steps; its states; and a factor. The round-off of the given run is about the round-off of the
-    new run times the factor.
+    The run has a larger tolerance, and takes fewer steps. The round-off of the given run is about
+    that of the new run times the factor: with k times as many steps it would be √k if all round-off
+    came from the steps, 1 if all came from the last digits of the inputs; the fourth root of k is
+    between the two. Both grow along the motion in the same way while the states stay near `ys`.
 
-    The factor depends on k, the number of steps of the given run divided by that of the new run. If
-    all round-off came from the steps, the factor would be √k, since the round-off of n steps adds
-    up to about √n times that of one step. If all came from the last digits of the inputs, the
-    factor would be 1. The returned factor is the fourth root of k, which is between the two. Both
-    kinds of round-off grow along the motion in the same way at any tolerance at which the states
-    stay near `ys`.
-
-    No new run is made in three cases: if the given run is in float32, where it takes few steps
-    anyway; if it is in closed form; and if it does not record its steps for derivatives, as a run
-    with a `ReplayAdjoint` does. The given set-up and states are then returned, with the factor 1.
-
-    **Arguments:**
-
-    - `setup`: the body, the torque, the solver and the tolerances of the given run.
-    - `start`: the state at the start of the run.
-    - `ts`, `ys`: the saved times (T,), s, and the states of the given run at these times.
-    - `num_steps`: the number of steps of the given run.
-    - `search`: two finished runs at larger tolerances: the first is returned if its states are near
-      `ys`, else the second. With `None` a new run is made.
+    The given run itself is returned in float32, where it takes few steps anyway, in closed form,
+    and if it does not record its steps.
     """
     replayed = isinstance(setup, DiffraxRun) and setup.replays
     if not replayed or ts.dtype == jnp.float32:
         return setup, ys, 1.0
-    sizes = _error_scales_by_name(ys)
-    unreached = jnp.isnan(_largest_relative_distance(_distances_of_states(ys, ys), sizes))
 
     def is_near(run: TriedRun) -> Array:
-        return jnp.all(
-            (_largest_relative_distance(_distances_of_states(run.ys, ys), sizes) <= _NEAR)
-            | unreached
-        )
+        unreached = jnp.isnan(_relative_distance(ys, ys))
+        return jnp.all((_relative_distance(run.ys, ys) <= _NEAR) | unreached)
 
     def closer(run: TriedRun) -> TriedRun:
         return _run_at_tolerance(setup, start, ts, jnp.maximum(_FARTHEST * run.rtol, setup.rtol))
@@ -406,29 +351,21 @@ def _run_at_larger_tolerance(
     else:
         near = is_near(search[0])
         run = jax.tree.map(lambda first, last: jnp.where(near, first, last), *search)
+        if setup.cuts is not None:  # the first run was made before the peaks were known
+            setup = dataclasses.replace(setup, cuts=jnp.where(near, ts[0], setup.cuts))
     fewer = jnp.maximum(run.accepted_steps, 1)
     setup = _with_tolerance(setup, run.rtol)
     return setup, run.ys, (jnp.maximum(num_steps / fewer, 1.0) ** 0.25).astype(ts.dtype)
 
 
 def _run_at_tolerance(setup: DiffraxRun, state0: PyTree, ts: Array, rtol: Array) -> TriedRun:
-    """Run a set-up at the relative tolerance `rtol`, and return the run as a `TriedRun`.
-
-    `setup` holds the body, the torque and the solver, `state0` is the state at the time `ts[0]`,
-    and `ts` (T,), s, are the times at which states are saved.
-    """
+    """Return the run of a set-up at the relative tolerance `rtol`."""
     rtol = jnp.asarray(rtol, ts.dtype)
     return TriedRun(rtol, *solve(_with_tolerance(setup, rtol), state0, ts))
 
 
 def _placeholder_run(setup: DiffraxRun, state0: PyTree, ts: Array, rtol: Array) -> TriedRun:
-    """Return a `TriedRun` that stands for no run: no step was taken, and its states are NaN.
-
-    A loop that tries runs at smaller and smaller tolerances begins with this `TriedRun`. Its arrays
-    therefore have the shapes and dtypes of a true run: a run of `setup` (the body, the torque and
-    the solver) from the state `state0`, saved at the times `ts` (T,), s. `rtol` is stored as its
-    relative tolerance.
-    """
+    """Return a run of no steps with states NaN, with which a loop over runs begins."""
     run = eqx.filter_eval_shape(_run_at_tolerance, setup, state0, ts, rtol)
 
     def empty(leaf: Any) -> Array:
@@ -439,12 +376,9 @@ def _placeholder_run(setup: DiffraxRun, state0: PyTree, ts: Array, rtol: Array) 
 
 
 def _distances_of_states(others: PyTree, ys: PyTree) -> dict[str, Array]:
-    """Return how far the states of two runs are apart, at each of the T saved times.
+    """Return how far the states of two runs are apart, (T,) by the name of each array.
 
-    `others` and `ys` are the states of the two runs at equal times, with a leading time axis.
-    **Returns** a dict with one array (T,) for each array of a state, by its name (`q`, `omega`, …).
-    For a quaternion it is the angle, rad, of the turn from one state to the other; for any other
-    array it is the length of the difference.
+    For a quaternion it is the angle of the turn from one to the other, rad.
     """
     return _lengths_of_changes_by_name(
         jax.tree.map(lambda leaf: leaf[0], ys), jax.vmap(minus)(others, ys)
@@ -452,32 +386,23 @@ def _distances_of_states(others: PyTree, ys: PyTree) -> dict[str, Array]:
 
 
 def _lengths_of_changes_by_name(state: PyTree, changes: Array) -> dict[str, Array]:
-    """Return the length of the change of each array of a state, by the name of the array.
+    """Return the lengths (…,) of changes (…, n) of a state, by the name of each array.
 
-    `state` gives the names and the kinds of the arrays. `changes` (…, n) has the n numbers of each
-    change, joined from the changes of all arrays; the change of a quaternion has three numbers, a
-    rotation vector in radians. **Returns** a dict with an array (…,) for each name, such as `q` or
-    `omega`.
+    The change of a quaternion has three numbers, a rotation vector in radians.
     """
     named = parts_by_name(state, changes).items()
     return {name.removeprefix("motion."): jnp.linalg.norm(part, axis=-1) for name, part in named}
 
 
 def largest_length_in_run(array: Array) -> Array:
-    """Return the largest length that one array of the state has at the T saved times of a run.
-
-    `array` (T, …) has the values of this array at the saved times. They are NaN at times that the
-    run did not reach; these times are left out.
-    """
+    """Return the largest length of an array (T, …) of states, without times that are NaN."""
     return jnp.nanmax(jnp.linalg.norm(array.reshape(array.shape[0], -1), axis=-1))
 
 
 def _error_scales_by_name(ys: PyTree) -> dict[str, Array]:
-    """Return for each array of a state the scale by which its error is divided.
+    """Return the scale by which the error of each array is divided, by its name.
 
-    `ys` are the states of a run, with a leading time axis. **Returns** a dict by the names of the
-    arrays (`q`, `omega`, …): 1 rad for a quaternion, else the largest length of the array in the
-    run, but at least 1e-3.
+    It is 1 rad for a quaternion, else the largest length in the run, but at least 1e-3.
     """
     sizes = {}
     for name, leaf in zip(leaf_names(ys), jax.tree.leaves(ys), strict=True):
@@ -488,13 +413,13 @@ def _error_scales_by_name(ys: PyTree) -> dict[str, Array]:
 
 
 def _largest_relative_distance(distances: dict[str, Array], sizes: dict[str, Array]) -> Array:
-    """Return the largest relative distance of two states, at each of T times.
-
-    `distances` has one array (T,) for each array of a state, by its name (`q`, `omega`, …); `sizes`
-    has the scale by which the distances of this name are divided. **Returns** an array (T,): the
-    largest quotient over all names.
-    """
+    """Return the largest quotient of the distances (T,) and their scales over all names, (T,)."""
     return jnp.max(jnp.stack([distances[name] / sizes[name] for name in distances]), 0)
+
+
+def _relative_distance(others: PyTree, ys: PyTree) -> Array:
+    """Return the largest relative distance (T,) of the states of two runs; NaN if not reached."""
+    return _largest_relative_distance(_distances_of_states(others, ys), _error_scales_by_name(ys))
 
 
 @eqx.filter_jit
@@ -503,41 +428,32 @@ def solve_to_accuracy(
 ) -> tuple[DiffraxRun, PyTree, tuple[TriedRun, TriedRun]]:
     """Solve a run at a tolerance at which its global error is below `accuracy`, if there is one.
 
-    Runs are tried at smaller and smaller tolerances. The distance of each run from the run before
-    is about the error of the run before. The error of the new run is estimated from it, in
-    proportion to the two tolerances. If even the smallest tolerance is not enough, its run is
-    returned.
+    The distance of each run from the run before, at a larger tolerance, is about the error of the
+    run before; the error of the new run is estimated from it, in proportion to the two tolerances.
+    If even the smallest tolerance is not enough, its run is returned.
 
-    **Arguments:**
-
-    - `setup`: the body, the torque and the solver of the run; its tolerances are not used.
-    - `state0`: the state at the time `ts[0]`.
-    - `ts`: (T,) the times at which states are saved, s.
-    - `accuracy`: the largest allowed error: for a rotation an angle, rad, else a relative error,
-      the length of the error divided by the largest length in the run.
-
-    **Returns** three things: the set-up at the tolerance found; the results of the run at this
-    tolerance, which are its states at `ts`, its numbers of steps and a `diffrax.RESULTS`; and two
-    of the runs that were tried, the first one and the one before the last.
+    **Returns** the set-up at the tolerance found; what `solve` returns for it; and the first of the
+    runs and the one before the last.
     """
     still = _without_derivatives((setup, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
-    sudden = _times_of_sudden_torque(still[0], ts, jax.tree.map(lambda leaf: leaf[None], still[1]))
-    cut = dataclasses.replace(still[0], cuts=sudden)
+    quiet = dataclasses.replace(still[0], throw=False)
     first_rtol = jnp.asarray(max(_FIRST, 100 * floor), ts.dtype)
+    begun = _placeholder_run(quiet, still[1], ts, first_rtol)
+    peaks = lambda run: times_of_peaks(quiet, ts, run.ys, run.accepted_steps)  # noqa: E731
+    cuts = jnp.full(jax.eval_shape(peaks, begun).shape, ts[0])
 
     def closer(carry: Any) -> Any:
-        number, first, _, before, rtol, ended = carry
+        number, first, _, before, rtol, cuts, ended = carry
         # In a batch, the loop goes on until the searches of all bodies have ended. A body whose
         # search has ended is run with all times equal to the first time, and takes no step.
-        new = _run_at_tolerance(cut, still[1], jnp.where(ended, ts[0], ts), rtol)
+        run = dataclasses.replace(quiet, cuts=cuts)
+        new = _run_at_tolerance(run, still[1], jnp.where(ended, ts[0], ts), rtol)
         is_first = number == 0
+        if cuts.size:
+            cuts = lax.cond(is_first, peaks, lambda _: cuts, new)
         count, counted = new.accepted_steps.astype(ts.dtype), before.accepted_steps.astype(ts.dtype)
-        off = jnp.nanmax(
-            _largest_relative_distance(
-                _distances_of_states(before.ys, new.ys), _error_scales_by_name(new.ys)
-            )[1:]
-        )
+        off = jnp.nanmax(_relative_distance(before.ys, new.ys)[1:])
         foreseen = off < _FORESEEN
         off = _ALLOWED * off * rtol / before.rtol
         # In two cases the error of a run does not predict the error of the next run: if the error
@@ -546,38 +462,32 @@ def solve_to_accuracy(
         # full length.
         more = (before.rtol / rtol) ** (1 / setup.solver.tableau.order)
         sound = foreseen & (count >= _FEW) & (count >= _GROWTH * more * counted)
-        wanted = jnp.where(
-            sound, jnp.minimum(rtol * still[3] / (_AIM * off), rtol / 3), 0.01 * rtol
-        )
-        second = jnp.minimum(_SECOND * still[3] * 100 / count**2, rtol / 30)
+        # The first run may be so far off that its distance tells nothing of the second run.
+        less = jnp.where((number == 1) & ~foreseen, 0.1, 0.01)
+        wanted = jnp.minimum(rtol * still[3] / (_AIM * off), rtol / 3)
+        wanted = jnp.where(sound, wanted, less * rtol)
+        usual = count**1.5 / 35  # the error of a run, divided by its tolerance
+        share = jnp.where(usual * rtol < _FAR, _NEXT, _SECOND)
+        second = jnp.minimum(share * still[3] / usual, rtol / 30)
         following = jnp.maximum(jnp.where(is_first, second, wanted), floor)
         # A run that reached none of the times will reach none at a smaller tolerance either.
-        none_reached = ~jnp.any(
-            jnp.isfinite(
-                _largest_relative_distance(
-                    _distances_of_states(new.ys, new.ys), _error_scales_by_name(new.ys)
-                )
-            )[1:]
-        )
+        none_reached = ~jnp.any(jnp.isfinite(_relative_distance(new.ys, new.ys))[1:])
         found = ~is_first & ((sound & (off <= still[3])) | (rtol <= floor))
         first = jax.tree.map(lambda a, b: jnp.where(is_first, a, b), new, first)
-        return number + 1, first, before, new, following, found | none_reached
+        return number + 1, first, before, new, following, cuts, found | none_reached
 
-    begun = _placeholder_run(cut, still[1], ts, first_rtol)
-    carry = (0, begun, begun, begun, first_rtol, jnp.asarray(False))
-    _, first, before, new, *_ = lax.while_loop(lambda carry: ~carry[-1], closer, carry)
-    setup = dataclasses.replace(_with_tolerance(setup, lax.stop_gradient(new.rtol)), cuts=sudden)
+    carry = (0, begun, begun, begun, first_rtol, cuts, jnp.asarray(False))
+    _, first, before, new, _, cuts, _ = lax.while_loop(lambda carry: ~carry[-1], closer, carry)
+    setup = dataclasses.replace(_with_tolerance(setup, lax.stop_gradient(new.rtol)), cuts=cuts)
     run = _with_derivatives_of_solve(setup, state0, ts, new.ys), new.stats, new.result
     return setup, run, (first, before)
 
 
 @eqx.filter_custom_jvp
 def _with_derivatives_of_solve(setup: DiffraxRun, state0: PyTree, ts: Array, ys: PyTree) -> PyTree:
-    """Return the known states `ys` of a run, with the derivatives that `solve` would give them.
+    """Return the known states `ys`, with the derivatives that `solve` would give them.
 
-    `setup` (the body, the torque and the solver), `state0` (the state at the start) and `ts` (the
-    saved times, s) are the arguments with which `solve` computed `ys`. The motion is solved once
-    more only if a derivative is taken.
+    The motion is solved once more only if a derivative is taken.
     """
     return ys
 
@@ -590,101 +500,27 @@ def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
 
 
 def _with_tolerance(setup: DiffraxRun, rtol: Array) -> DiffraxRun:
-    """Return the set-up of a run with another relative tolerance `rtol`.
-
-    `setup` holds the body, the torque, the solver and the tolerances. The absolute tolerance
-    becomes 1e-3 times `rtol`. If a run of the new set-up fails, it raises no error: its states are
-    NaN at the times that it did not reach.
-    """
+    """Return the set-up of a run with another tolerance, which raises no error."""
     return dataclasses.replace(setup, rtol=rtol, atol=_SMALL * rtol, throw=False)
 
 
-def _times_of_sudden_torque(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: PyTree) -> Array:
-    """Return times at which the torque changes suddenly, so that a run may miss a short pulse.
+def _more_accurate_setup(setup: Any, ts: Array, peaks: Array) -> tuple[DiffraxRun, Array, float]:
+    """Return a more accurate run, the relative tolerance of the given run, and a factor.
 
-    A run evaluates the torque only at the stages of its steps, and does not notice a short pulse
-    between two stages. The time of the run is therefore divided into 32 equal parts, and in each
-    part the torque is sampled at 512 times. For all samples of a part the state is the last saved
-    state before the middle of the part. A sample is sudden if its distance from the chord between
-    its two neighbours is far greater than the distances of most other samples of the part.
-
-    **Arguments:**
-
-    - `setup`: the body, the torque and the solver of the run.
-    - `ts`, `ys`: the saved times, s, and the states at these times, with a leading time axis. If
-      there are fewer states than times, the last state stands for all later times.
-
-    **Returns** an array (32,): for each part the time, s, of its most sudden sample, or the first
-    of `ts` if no sample is sudden. The array has no times if the torque does not depend on the
-    time, or is constant between its jumps (`Held`, `Pulses`): steps end at these jumps, so that no
-    pulse is missed.
-    """
-    state0 = jax.tree.map(lambda leaf: leaf[0], ys)
-    # Steps end at each jump of a law that is constant between its jumps, so that no pulse of such a
-    # law is missed. These laws are therefore held fixed here, at their values at the first time.
-    field = equations_of_motion(setup.body, state0, setup.torque)
-    field = hold_piecewise_constant_laws_at(field, ts[0])
-    if not depends_on_time(lambda t: ravel_pytree(field(t, state0, None))[0], ts[0]):
-        return ts[:0]
-    # The samples are at uneven times: on an even grid, pulses that come once a second could all
-    # fall between the samples.
-    uneven = np.random.default_rng(1).uniform(-0.25, 0.25, (_PARTS, _SAMPLES_OF_PART + 2))
-    # The first and the last sample of a part serve only as neighbours of other samples. The last
-    # two times of a part are therefore also the first two times of the next part.
-    uneven[1:, :2] = uneven[:-1, -2:]
-    number = _SAMPLES_OF_PART * np.arange(_PARTS)[:, None] + np.arange(_SAMPLES_OF_PART + 2) - 0.5
-    share = np.clip((number + uneven) / (_PARTS * _SAMPLES_OF_PART), 0.0, 1.0)
-    times = ts[0] + (ts[-1] - ts[0]) * jnp.asarray(share, ts.dtype)
-    way = jnp.sign(ts[-1] - ts[0])
-    saved = jnp.searchsorted(way * ts, way * times[:, _SAMPLES_OF_PART // 2], side="right") - 1
-
-    def sudden(part: tuple[Array, Array]) -> Array:
-        t, index = part
-        y = jax.tree.map(lambda leaf: leaf[index], ys)
-        f = jax.vmap(lambda t: ravel_pytree(field(t, y, None))[0])(t)
-        left, here, right = t[:-2, None], t[1:-1, None], t[2:, None]
-        chord = (f[:-2] * (right - here) + f[2:] * (here - left)) / (right - left)
-        size = jnp.max(jnp.abs(f), 0)
-        missed = jnp.abs(f[1:-1] - chord) / jnp.where(size > 0, size, 1)[None]
-        missed = jnp.max(jnp.where(jnp.isfinite(missed), missed, 0), 1)
-        least = _ROUGH * float(jnp.finfo(t.dtype).eps)
-        usual = jnp.exp(jnp.mean(jnp.log(jnp.maximum(missed, least))))
-        most = jnp.argmax(missed)
-        return jnp.where(missed[most] > _SUDDEN * usual + least, t[1 + most], ts[0])
-
-    return lax.stop_gradient(lax.map(sudden, (times, saved)))
-
-
-def _more_accurate_setup(
-    setup: Any, ts: Array, sudden_times: Array
-) -> tuple[DiffraxRun, Array, float]:
-    """Return the set-up of a more accurate run, by which the error of a given run is measured.
-
-    **Arguments:**
-
-    - `setup`: the body, the torque, the solver and the tolerances (or the fixed step) of the given
-      run.
-    - `ts`: (T,) the times of its saved states, s.
-    - `sudden_times`: (m,) the times, s, at which the torque changes suddenly, so that steps of the
-      more accurate run are to end there. Under fixed steps they are not used.
-
-    **Returns** three things: the set-up of the more accurate run, whose steps are half as long if
-    the given run has fixed steps; the relative tolerance of the given run, 0 under fixed steps; and
-    a factor, 4/3 under fixed steps, else 1. The error of the given run is its distance to the more
-    accurate run times the factor.
+    The error of the given run is its distance to the more accurate run times the factor. Under
+    fixed steps the tolerance is 0, and steps do not end at the `peaks` (m,), s, of the torque.
     """
     eps = float(jnp.finfo(ts.dtype).eps)
     most = None if setup.max_steps is None else 4 * setup.max_steps
+    cuts = peaks if peaks.size else None
     setup = dataclasses.replace(setup, max_steps=most, throw=False)
     if setup.controller is None:
         rtol = jnp.asarray(setup.rtol, ts.dtype)
         less = jnp.maximum(_CLOSER * rtol, _DEEPEST * eps)
-        cuts = sudden_times
-        if setup.stops_at_jumps:
-            parts = jnp.arange(1, _CUTS).astype(ts.dtype) / _CUTS
-            cuts = jnp.concatenate([ts[0] + (ts[-1] - ts[0]) * parts, sudden_times])
-        new = dict(rtol=less, atol=setup.atol * (less / rtol), cuts=cuts if cuts.size else None)
-        return dataclasses.replace(setup, **new), rtol, 1.0
+        longest = jnp.abs(ts[-1] - ts[0]) / _PARTS
+        longest = longest if setup.max_step is None else jnp.minimum(longest, setup.max_step)
+        new = dict(rtol=less, atol=setup.atol * (less / rtol), max_step=longest)
+        return dataclasses.replace(setup, cuts=cuts, **new), rtol, 1.0
     pid = lambda node: isinstance(node, dfx.PIDController)  # noqa: E731
     inside: Any = lambda c: [n for n in jax.tree.leaves(c, is_leaf=pid) if pid(n)]  # noqa: E731
     if found := inside(setup.controller):
@@ -692,8 +528,7 @@ def _more_accurate_setup(
         both = less, found[0].atol * (less / found[0].rtol)
         where = lambda s: (inside(s.controller)[0].rtol, inside(s.controller)[0].atol)  # noqa: E731
         setup = eqx.tree_at(where, setup, both)
-        setup = dataclasses.replace(setup, cuts=sudden_times) if sudden_times.size else setup
-        return setup, jnp.asarray(found[0].rtol, ts.dtype), 1.0
+        return dataclasses.replace(setup, cuts=cuts), jnp.asarray(found[0].rtol, ts.dtype), 1.0
     if not isinstance(setup.controller, dfx.ConstantStepSize):
         raise TypeError(
             "error: a second run needs a diffrax.PIDController or ConstantStepSize, got "
@@ -847,31 +682,19 @@ def error_of(
 
 
 def _variance_over_neighbours(changes: Array) -> Array:
-    """Return the variance of each number over a run and its neighbouring runs.
+    """Return the variance over a run and m neighbours, whose differences are `changes` (m, …).
 
-    The neighbours are m runs with slightly changed inputs. `changes` (m, …) are the differences of
-    their results from the result of the run. The variance is that of m + 1 results, because the run
-    itself is one of them, with the difference 0. **Returns** an array (…) without the first axis.
+    It is the variance of m + 1 results, because the run itself is one, with the difference 0.
     """
     mean = jnp.sum(changes, 0, keepdims=True) / (_NEIGHBOURS + 1)
     return (jnp.sum((changes - mean) ** 2, 0) + mean[0] ** 2) / _NEIGHBOURS
 
 
 def _copies_changed_in_last_digit(leaf: Array, rng: np.random.Generator, size: Array) -> Array:
-    """Return three copies of an array, each changed at random by about a unit in the last digit.
+    """Return three copies (3, …) of an array, each changed at random in the last digit of `size`.
 
-    A run from each copy shows how far rounding errors grow. Each number is changed, up or down, by
-    half to one unit in the last digit of its size. The change of a square matrix is symmetric, so
-    that a symmetric matrix stays symmetric.
-
-    **Arguments:**
-
-    - `leaf`: (…) the array.
-    - `rng`: the generator of the random changes.
-    - `size`: (…) the size of each number of `leaf`, not negative; the last digit of the size is the
-      digit that is changed.
-
-    **Returns** an array (3, …): the copies along a new first axis.
+    Each number is changed, up or down, by half to one unit. The change of a square matrix is
+    symmetric, so that a symmetric matrix stays symmetric.
     """
     shape = (_NEIGHBOURS + 1) // 2, *leaf.shape
     # The change is at least half a unit, because a smaller change would often be rounded away. As a

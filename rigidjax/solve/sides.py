@@ -23,8 +23,6 @@ from rigidjax.solve.switching import DECLARED
 # These laws of this package have jumps of their own. All other laws of this package only pass on
 # the jumps of the laws inside them.
 _OWN = (Held, Linear, Pulses, Tabulated, Delayed, Lagged)
-# A `Held` or `Pulses` law is constant between its jumps.
-_CONSTANT_PIECES = (Held, Pulses)
 
 
 class Sided(eqx.Module):
@@ -94,36 +92,6 @@ class Sided(eqx.Module):
             now = jnp.maximum(now, jnp.max(jnp.where(new, after, -jnp.inf)))
             now = jnp.minimum(now, jnp.min(jnp.where(new, jnp.inf, before)))
         return t + (now - still)
-
-
-class Constant(eqx.Module):
-    """Evaluate a law, or a function of time, at one fixed `time`, s, whenever it is called."""
-
-    law: Any
-    time: Array
-
-    def __getattr__(self, name: str) -> Any:
-        # Attributes that a `Constant` does not have, such as `feels` or `rate_free`, are those of
-        # the law that it wraps.
-        if name.startswith("__") or name in ("law", "time"):
-            raise AttributeError(name)
-        return getattr(self.law, name)
-
-    def __call__(self, t: Any, *args: Any) -> Any:
-        return self.law(self.time, *args)
-
-
-def hold_piecewise_constant_laws_at(field: Any, time: Array) -> Any:
-    """Return a vector field in which each law of constant pieces keeps its value at `time`, s.
-
-    Laws of constant pieces are `Held` and `Pulses`, which are constant between their jumps. The
-    returned field depends on time only through laws that change between their jumps. `Linear`,
-    whose pieces are straight lines, stays as it is: another law may read the value of a `Linear`,
-    and may give a short pulse while this value passes through a small range.
-    """
-    has_pieces = lambda node: isinstance(node, _CONSTANT_PIECES)  # noqa: E731
-    constant = lambda node: Constant(node, time) if has_pieces(node) else node  # noqa: E731
-    return jax.tree.map(constant, field, is_leaf=has_pieces)
 
 
 def _declares_jumps(node: Any) -> bool:

@@ -294,6 +294,8 @@ def _solve_to_accuracy(
     setup = dataclasses.replace(setup, torque=torque)
     found, run, search = solve_to_accuracy(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
+    if setup.throw and _checks.is_known((run[2], state0, times)) and not dfx.is_successful(run[2]):
+        _solve_run(setup, event, state0, times)  # fails with the words of a run without accuracy
     sol = _solve_run(found, event, state0, times, None if event is not None else run)
     error = estimate_error_of_run(found, times, sol._states, sol.stats["num_steps"], search)
     return with_error(sol, error, accuracy)

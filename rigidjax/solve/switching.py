@@ -63,10 +63,16 @@ _SMOOTH = {"expm"}  # functions of JAX that compare only to choose between equal
 _ELEMENTWISE = {
     "add", "sub", "add_any", "neg", "copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze",
     "slice", "transpose", "rev", "concatenate", "expand_dims", "convert_element_type",
-    "stop_gradient", "optimization_barrier", "gather", "dynamic_slice", "select_n",
+    "stop_gradient", "optimization_barrier", "gather", "dynamic_slice", "select_n", "stack",
+    "unstack",
 }  # fmt: skip
 _SUMS = {"reduce_sum", "cumsum"}
 _PRODUCTS = {"mul", "div", "dot_general"}
+# Operations whose result has no narrow peak in the time if their operands have none.
+PLAIN = (_ELEMENTWISE - {"gather", "dynamic_slice"}) | _SUMS | _FOUND | {
+    "mul", "dot_general", "sin", "cos", "sqrt", "cbrt", "square", "reduce_max", "reduce_min", "pad",
+    "split", "real", "imag", "complex", "conj",
+}  # fmt: skip
 _RISING = {
     "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "tanh", "logistic", "erf", "sinh",
     "asinh", "atan", "max", "min", "clamp",
@@ -207,6 +213,7 @@ class Interpreter(NamedTuple):
     whole: bool
     hidden: Callable[[tuple[Any, ...]], Any] = lambda path: None  # told what cannot be searched
     around: tuple[Any, ...] = ()  # the equations of the calls around, the outermost first
+    see: Callable[..., Any] = lambda path, inputs, kinds, out: None  # told what is evaluated
 
     def run(self, jaxpr: Any, consts: Any, args: Any, asked: Any = None) -> list[tuple[Any, int]]:
         """Return the results, of which only those that are `asked` for are computed."""
@@ -247,6 +254,7 @@ class Interpreter(NamedTuple):
             return [(None, STATEFUL)] * len(eqn.outvars)
         out = eqn.primitive.bind(*inputs, **eqn.primitive.get_bind_params(eqn.params))
         out = list(out) if eqn.primitive.multiple_results else [out]
+        self.see(inside.around, inputs, kinds, out)
         timed = moves and kind < STATEFUL
         if timed and name in _FOUND and _may_switch(eqn):
             height = BENT if name in ("clamp", "atan2") else _kind("sub", kinds)

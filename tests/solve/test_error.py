@@ -254,6 +254,18 @@ def test_second_derivatives_go_through_an_accuracy():
     np.testing.assert_allclose(bend, (sum(ends) - 2 * middle) / 0.02**2, rtol=1e-3)
 
 
+def test_a_law_that_holds_the_state_says_the_same_with_an_accuracy():
+    def stop(t, state, body):
+        return jnp.where(state.omega > 0, -0.6, 0.4)
+
+    said = []
+    for how in ({}, dict(accuracy=1e-6)):
+        with pytest.raises(RuntimeError, match="all at one place") as error:
+            rj.simulate(BODY, rj.Spin(OMEGA), [0.0, 9.0], stop, max_steps=3000, **how)
+        said.append(str(error.value))
+    assert said[0] == said[1]
+
+
 def test_an_accuracy_of_the_closed_form_and_what_is_refused():
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -52,22 +52,75 @@ def test_an_accuracy_holds_for_a_pulse_between_steps():
         assert float(sol.error.relative[-1]) <= accuracy
 
 
-def test_smooth_laws_of_time_have_no_sudden_times():
-    from rigidjax.solve.error import _times_of_sudden_torque
+def times_of_peaks(sol):
+    from rigidjax.solve import peaks
 
-    ts = jnp.linspace(0.0, 30.0, 7)
+    return peaks.times_of_peaks(sol._setup, sol.ts, sol._states, sol.stats["num_steps"])
+
+
+def peaks_of(law, ts, **how):
+    sol = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), ts, law, **how)
+    return np.asarray(times_of_peaks(sol))
+
+
+def test_smooth_laws_of_time_have_no_peaks():
     smooth = {
         "swing": lambda t, state, body: jnp.cos(3.0 * t + 1.0) * state.omega,
         "fast": lambda t, state, body: jnp.sin(40.0 * t) * Z,
-        "decay": lambda t, state, body: jnp.exp(-0.1 * t) * Z,
         "line": lambda t, state, body: (1.0 + 0.3 * t) * Z,
+        "switch": lambda t, state, body: jnp.where(t < 4.1, 1.0, 0.2) * Z,
+        "still": rj.torques.Damping([0.1, 0.1, 0.1]),
     }
     for name, law in smooth.items():
-        sol = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), ts, law)
-        times = _times_of_sudden_torque(sol._setup, sol.ts, sol._states)
-        assert not np.any(times), name
-    still = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), ts, rj.torques.Damping([0.1, 0.1, 0.1]))
-    assert _times_of_sudden_torque(still._setup, still.ts, still._states).size == 0
+        assert peaks_of(law, [0.0, 30.0]).size == 0, name
+    slow = {
+        "decay": lambda t, state, body: jnp.exp(-0.1 * t) * Z,
+        "orbit": lambda t, state, body: Z / (2.0 + jnp.cos(0.3 * t)),
+        "square": lambda t, state, body: Z * (1.0 + 0.1 * t) ** 6,
+    }
+    for name, law in slow.items():
+        assert not np.any(peaks_of(law, [0.0, 30.0])), name
+
+
+# Shapes of width 1 about 0, by their narrow operations.
+SHAPES = {
+    "exp": lambda u: jnp.exp(-(u**2)),
+    "flat": lambda u: jnp.exp(-(u**4)),
+    "quotient": lambda u: 1 / (1 + u**2),
+    "power": lambda u: (1 + u**2) ** -1.5,
+    "tanh": lambda u: 1 - jnp.tanh(u) ** 2,
+    "window": lambda u: jax.nn.sigmoid(9 * (u + 1)) - jax.nn.sigmoid(9 * (u - 1)),
+    "cond": lambda u: jax.lax.cond(u > 1e9, jnp.sin, lambda u: jnp.exp(-(u**2)), u),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_peak_of_any_width_is_found(name):
+    @jax.jit
+    def found(centre, width):
+        def law(t, state, body):
+            return Z * (jnp.cos(t) + SHAPES[name]((t - centre) / width) / width)
+
+        sol = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), [0.0, 30.0], law, throw=False)
+        return times_of_peaks(sol)
+
+    rng = np.random.default_rng(len(name))
+    for width in (1e-6, 1e-4, 1e-2):
+        centre = rng.uniform(0.5, 29.5)
+        assert np.min(np.abs(found(centre, width) - centre)) < 1.5 * width, width
+
+
+def test_peaks_that_come_once_a_second_and_peaks_of_tables_are_found():
+    train = peaks_of(
+        lambda t, state, body: Z * jnp.exp(3e4 * (jnp.cos(2 * jnp.pi * t) - 1)), [0.0, 512.0]
+    )
+    found = train[train > 0]
+    assert found.size > 3 and np.max(np.abs(found - np.round(found))) < 1e-3
+    rows = jnp.zeros(2000).at[1234].set(5.0)
+    times = jnp.linspace(0.0, 20.0, 2000)
+    for table in (rj.torques.Series(times, rows), lambda t: jnp.interp(t, times, rows)):
+        at = peaks_of(lambda t, state, body, table=table: Z * table(t), [0.0, 20.0], max_step=0.2)
+        assert np.min(np.abs(at - times[1234])) < 0.02
 
 
 class PulseOfAngle(eqx.Module):
@@ -79,21 +132,15 @@ class PulseOfAngle(eqx.Module):
         return 50.0 * Z * jnp.exp(-0.5 * ((self.angle(t) - 2.3) / 1e-3) ** 2)
 
 
-def test_constant_pieces_are_not_searched_for_sudden_times():
-    from rigidjax.solve.error import _times_of_sudden_torque
-
+def test_laws_that_declare_their_jumps_have_no_peaks():
     edges, rng = jnp.linspace(0.0, 9.0, 31), np.random.default_rng(3)
-
-    def sudden(law):
-        sol = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), [0.0, 8.0], law)
-        return np.asarray(_times_of_sudden_torque(sol._setup, sol.ts, sol._states))
-
     pulses = rj.torques.Pulses(edges, jnp.asarray(rng.normal(size=(30, 3))))
-    assert sudden(pulses).size == 0
-    assert np.min(np.abs(sudden(rj.torques.Sum(pulses, gaussian)) - 7.3131)) < 0.05
+    assert peaks_of(pulses, [0.0, 8.0]).size == 0
+    both = peaks_of(rj.torques.Sum(pulses, gaussian), [0.0, 8.0])
+    assert np.min(np.abs(both - 7.3131)) < 1e-4
     # A law may be a pulse as a function of a straight line: 0.5 rad/s, 2.3 rad at 4.6 s.
     angle = rj.torques.Linear(jnp.array([0.0, 9.0]), jnp.array([0.0, 4.5]))
-    assert np.min(np.abs(sudden(PulseOfAngle(angle)) - 4.6)) < 0.05
+    assert np.min(np.abs(peaks_of(PulseOfAngle(angle), [0.0, 8.0]) - 4.6)) < 1e-4
 
 
 class Until(eqx.Module):
