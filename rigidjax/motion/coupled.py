@@ -20,10 +20,16 @@ from rigidjax.motion.torques.states import (
 
 class Coupled(eqx.Module):
     """Hold the state of a body together with the states that its torques have of their own, such as
-    the speed of a wheel: a tuple `own`, in the order of these torques.
+    the speed of a wheel.
 
-    `simulate` makes a `Coupled` itself and returns its parts apart, as `sol.ys` and `sol.own`;
-    `rigidjax.batch.rollout` returns one; `rigidjax.conserved` and `rigidjax.energy` take one.
+    `simulate` makes a `Coupled` itself and returns its two parts separately, as `sol.ys` and
+    `sol.own`; `rigidjax.batch.rollout` returns a `Coupled`; `rigidjax.conserved` and
+    `rigidjax.energy` take one. **Arguments:** `motion` a `Spin`, `Attitude` or `Rigid`; `own` a
+    tuple with the states of each torque that has states, in the order of these torques.
+
+    >>> wheel = rj.torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0])
+    >>> Coupled.start(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0, 2.0]), wheel).own
+    (Array([3.2], dtype=float64),)
     """
 
     motion: Any

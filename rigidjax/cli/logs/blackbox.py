@@ -208,9 +208,8 @@ class _Flight:
         """Return whether a frame (or a P frame whose letter is damaged), erased memory or the end
         of the data begins at a byte: else the frame before this byte is probably damaged.
         """
-        if index == len(self.data) or self.data[index] in self.kinds:
-            return True
-        if _ERASED.match(self.data, index):
+        # Erased memory matches at the end of the data, too.
+        if _ERASED.match(self.data, index) or self.data[index] in self.kinds:
             return True
         stream = _Bytes(self.data, index + 1)
         try:
