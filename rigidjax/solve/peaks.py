@@ -70,7 +70,7 @@ def times_of_peaks(setup: DiffraxRun, ts: Array, ys: PyTree, num_steps: Array) -
     state0 = jax.tree.map(lambda leaf: leaf[0], ys)
     tree, numbers = ravel_pytree(state0)[1], jax.vmap(lambda y: ravel_pytree(y)[0])(ys)
     field = equations_of_motion(setup.body, state0, setup.torque)
-    sided = evaluate_on_correct_sides(field, setup.sign, None)
+    sided = evaluate_on_correct_sides(field, setup.sign, None, ts[-1])
     flat = lambda t, y: ravel_pytree(sided(t, tree(y), None))[0]  # noqa: E731
     program = trace_program(flat, begin, numbers[0]).closed
     itself: list[bool] = []  # of each operand

@@ -401,15 +401,3 @@ def find_switches(traced: ClosedJaxpr) -> Switches:
     timed, _ = _live_equations(jaxpr, (), [id(s.path[0]) for s in switches])
     lean = jaxpr.replace(eqns=timed, outvars=[v for eqn in timed for v in eqn.outvars])
     return Switches(traced, lean, switches, list(dict.fromkeys(unfound)))
-
-
-def depends_on_time(function: Callable[[Array], Array], t: Array) -> bool:
-    """Return whether the result of a function of the time alone depends on the time."""
-    traced, kinds = jax.make_jaxpr(function)(t), []
-
-    def look(t: Array) -> None:
-        keep = Interpreter(lambda path, inputs, result, kind: result, True)
-        kinds.extend(k for _, k in keep.run(traced.jaxpr, traced.consts, [(t, STRAIGHT)]))
-
-    jax.eval_shape(look, t)
-    return max(kinds) > FIXED
