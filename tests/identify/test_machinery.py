@@ -283,7 +283,7 @@ def test_a_checkpoint_of_other_options_is_refused(short_record, tmp_path):
 
 def test_sensors_and_wheels_of_one_kind_have_names_of_their_own(tmp_path):
     path, rng = tmp_path / "log.csv", np.random.default_rng(0)
-    table = np.column_stack([np.arange(20.0), rng.normal(size=(20, 8))])
+    table = np.column_stack([np.arange(20.0) / 8, rng.normal(size=(20, 8))])
     np.savetxt(path, table, delimiter=",", header="t,a,b,c,d,e,f,s,r")
     channels = [spec.parse_channel(text) for text in ("gyro=a,b,c", "gyro=d,e,f")]
     wheels = [spec.parse_wheel(text) for text in ("s:1e-6:x", "r:1e-6:y")]
