@@ -80,8 +80,9 @@ class Batch(eqx.Module, Generic[State]):
     - `own`: a tuple of the states that torques have of their own, such as the speed of a wheel,
       with the leading axes (N, T); `None` if no torque has a state.
 
-    >>> bodies, omega = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0]))), jnp.ones((5, 3)) >>>
-    rj.batch.simulate(bodies, rj.Spin(omega), [0.0, 1.0]).ys.omega.shape (5, 2, 3)
+    >>> bodies, omega = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0]))), jnp.ones((5, 3))
+    >>> rj.batch.simulate(bodies, rj.Spin(omega), [0.0, 1.0]).ys.omega.shape
+    (5, 2, 3)
     """
 
     ts: Float[Array, " times"]

@@ -47,12 +47,20 @@ class Coordinates(eqx.Module):
 
 
 class LagrangeEquations(eqx.Module):
-    """Evaluate Lagrange's equations as a vector field `f(t, y, args)`, whose state is a
-    `Coordinates`; `equations_of_motion` makes this Module.
+    """Evaluate Lagrange's equations of a Lagrangian and of forces as a vector field.
+
+    The vector field is called as `f(t, y, args)`. `lagrangian` is a function `(q, q̇) → L`, J, of
+    the coordinates and their time derivatives; `force` is a function `(t, q, q̇) → Q` of the
+    generalised forces, or `None`. The state y is a `Coordinates`. `equations_of_motion` makes this
+    Module.
+
+    >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
+    >>> round(float(pendulum.energy(Coordinates([0.0], [2.0]))), 6)  # ½ v² − 9.81 cos q
+    -7.81
     """
 
-    lagrangian: Callable[[Any, Any], Any]  # (q, q̇) → L, J
-    force: Callable[[Any, Any, Any], Any] | None  # (t, q, q̇) → Q, the generalised forces
+    lagrangian: Callable[[Any, Any], Any]
+    force: Callable[[Any, Any, Any], Any] | None
 
     def __call__(self, t: ScalarLike, y: Coordinates, args: object = None) -> Coordinates:
         q, rate = y.q, y.rate
@@ -64,8 +72,10 @@ class LagrangeEquations(eqx.Module):
         return Coordinates(rate, _acceleration(jax.jacfwd(lambda v: momentum(q, v))(rate), push))
 
     def energy(self, y: Coordinates) -> Scalar:
-        """Return Jacobi's integral `q̇·∂L/∂q̇ − L`, J, which is conserved if there is no
-        `force`.
+        """Return Jacobi's integral `q̇·∂L/∂q̇ − L` of the Lagrangian L in the state `y`, J, a
+        scalar; q̇ are the rates of the coordinates.
+
+        The integral is conserved if there is no `force`.
         """
         momentum = jax.grad(self._value, argnums=1)(y.q, y.rate)
         return jnp.sum(y.rate * momentum) - self._value(y.q, y.rate)

@@ -35,12 +35,21 @@ class Momentum(eqx.Module):
 
 
 class MomentumAndDirection(eqx.Module):
-    """Hold the state of a heavy top, both in body axes: the angular momentum Π, N m s, and the
-    vector γ = Rᵀ d for the attitude R and a vector d fixed in the world, of any unit; for
-    `HeavyTopHamiltonian` d is the acceleration of gravity, m/s².
+    """Hold the state of a heavy top: the angular momentum, and a vector fixed in the world (such as
+    the acceleration of gravity), both in body axes.
 
     The attitude itself is not needed, because the equations do not change if the body is turned
     about this vector.
+
+    **Arguments:**
+
+    - `pi`: (3,) the angular momentum Π, N m s, body frame.
+    - `gamma`: (3,) the vector γ = Rᵀ d, body frame, where d is a vector fixed in the world and R
+      the attitude, body → world. d has any length and unit; for `HeavyTopHamiltonian` it is the
+      acceleration of gravity g, m/s².
+
+    >>> MomentumAndDirection([1.0, 0.0, 0.0], [0.0, 0.0, -9.81]).gamma.shape
+    (3,)
     """
 
     pi: Float[Array, "*batch 3"]
@@ -53,8 +62,10 @@ class MomentumAndDirection(eqx.Module):
 
 
 class LiePoisson(eqx.Module):
-    """Evaluate `dΠ/dt = Π × ∇H(Π)` as a vector field `f(t, y, args)`, whose state is a `Momentum`;
-    `lie_poisson` makes this Module.
+    """Evaluate `dΠ/dt = Π × ∇H(Π)` as a vector field `f(t, y, args)`, whose state is a `Momentum`.
+
+    Π (3,) is the angular momentum in body axes, N m s, and H is the `hamiltonian`, a function
+    `Π → H`, J. `lie_poisson` makes this Module.
     """
 
     hamiltonian: Callable[[Any], Any]
@@ -64,8 +75,12 @@ class LiePoisson(eqx.Module):
 
 
 class LiePoissonWithDirection(eqx.Module):
-    """Evaluate the Lie–Poisson equations of a Hamiltonian H(Π, γ) as a vector field, whose state is
-    a `MomentumAndDirection`; `lie_poisson_with_direction` makes this Module.
+    """Evaluate the Lie–Poisson equations of a Hamiltonian H(Π, γ) as a vector field.
+
+    Π (3,) is the angular momentum, N m s, and γ (3,) a vector fixed in the world, both in body
+    axes; `hamiltonian` is the function `(Π, γ) → H`, J. The state is a `MomentumAndDirection`. The
+    equations are dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ and dγ/dt = γ × ∂H/∂Π. `lie_poisson_with_direction`
+    makes this Module.
     """
 
     hamiltonian: Callable[[Any, Any], Any]

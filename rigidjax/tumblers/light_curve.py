@@ -62,15 +62,27 @@ LEAST, ABOVE = 12, 40.0
 
 
 class Alias(eqx.Module):
-    """Hold a motion that a search found."""
+    """Hold a motion that a search found.
 
-    x: Float[Array, " n"]  # the parameters
-    cost: float  # half of χ²
-    rotation: float  # s, of `rigidjax.exact.body_period`
-    precession: float  # s, of `rigidjax.exact.precession_period`
-    mode: str  # "long" or "short": the momentum circulates about the smallest or largest moment
-    ratios: Float[np.ndarray, "2"]  # the two smaller moments of inertia divided by the largest
-    explains: bool  # whether the motion explains the data nearly as well as the best motion
+    **Fields:**
+
+    - `x`: (n,) the parameters.
+    - `cost`: half of χ², the sum over the readings of the squares of error divided by noise.
+    - `rotation`: the body period, s (`rigidjax.exact.body_period`).
+    - `precession`: the mean precession period, s (`rigidjax.exact.precession_period`).
+    - `mode`: `"long"` or `"short"`, for a momentum that circulates in the body about the axis of
+      the smallest or of the largest moment.
+    - `ratios`: (2,) the two smaller moments of inertia divided by the largest.
+    - `explains`: whether this motion explains the data nearly as well as the best motion.
+    """
+
+    x: Float[Array, " n"]
+    cost: float
+    rotation: float
+    precession: float
+    mode: str
+    ratios: np.ndarray
+    explains: bool
 
     def __str__(self) -> str:
         return (

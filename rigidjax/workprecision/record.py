@@ -25,37 +25,50 @@ BASE = "diffrax Dopri8"
 
 @dataclasses.dataclass(frozen=True)
 class Measurement:
-    """Hold the errors and the cost of one method at one setting on one scene; a field that does not
-    apply is NaN.
+    """Hold the errors and the cost of one method at one setting on one scene.
+
+    **Fields:** `scene`, `method` names; `group` `ours`, `jax` or `peer`; `kind` `value` or
+    `gradient`; `adjoint` the way a gradient is computed; `setting` the tolerance, the number of
+    equal steps, or the length of a step in s; `error` of the attitude, an angle in rad (for a point
+    the relative error of its position), and for a gradient g the relative error |g − g*|/|g*|,
+    where g* is the correct gradient; `error_rate` the error of the body rate Ω, divided by the
+    length of the initial rate Ω0 (for a point the relative error of the velocity); `energy` the
+    relative drift of the energy; `momentum` the largest drift of the conserved momenta;
+    `by_inertia`, `by_rate`, `by_attitude` the relative errors of the gradient with respect to the
+    inertia, the initial rate and the initial attitude (for a point `by_rate` is for the velocity
+    and `by_attitude` for the position); `steps` the number of steps; `time` the median time of a
+    run, and `time_low`, `time_high` the quartiles, s; `compile` the time of compilation, s;
+    `memory` the bytes of temporary arrays in the compiled run. A field that does not apply is NaN.
+
+    >>> Measurement("free-top", "closed form", "ours", "value", "", 0.0, error=1e-15).time
+    nan
     """
 
     scene: str
     method: str
-    group: str  # ours, jax or peer
-    kind: str  # value or gradient
-    adjoint: str  # the way a gradient is computed
-    setting: float  # the tolerance, the number of equal steps, or the length of a step, s
-    # The error of the attitude, rad (of a point the relative error of its position), or the
-    # relative error |g − g*|/|g*| of a gradient.
+    group: str
+    kind: str
+    adjoint: str
+    setting: float
     error: float = float("nan")
-    error_rate: float = float("nan")  # of the body rate by |Ω0| (of a point: of the velocity)
-    energy: float = float("nan")  # the relative drift
-    momentum: float = float("nan")  # the largest drift of the conserved momenta
-    # The relative errors of a gradient by the inertia, the initial rate and the initial attitude
-    # (for a point by the velocity and the position).
+    error_rate: float = float("nan")
+    energy: float = float("nan")
+    momentum: float = float("nan")
     by_inertia: float = float("nan")
     by_rate: float = float("nan")
     by_attitude: float = float("nan")
     steps: float = float("nan")
-    time: float = float("nan")  # the median time of a run, s
-    time_low: float = float("nan")  # the quartiles
+    time: float = float("nan")
+    time_low: float = float("nan")
     time_high: float = float("nan")
-    compile: float = float("nan")  # s
-    memory: float = float("nan")  # the bytes of temporary arrays in the compiled run
+    compile: float = float("nan")
+    memory: float = float("nan")
 
     @property
     def label(self) -> str:
-        """Return the method and the adjoint, if there is one."""
+        """Return one name for the method and the adjoint (the way in which a gradient is computed)
+        of this measurement; for a value, which has no adjoint, the name of the method alone.
+        """
         return f"{self.method}, {self.adjoint}" if self.adjoint else self.method
 
 

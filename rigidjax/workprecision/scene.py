@@ -27,13 +27,24 @@ A, B, C = (0.6, -0.48, 0.64), (0.36, 0.8, -0.48), (0.28, -0.5, 0.82)
 
 
 class Reference(NamedTuple):
-    """Hold the correct last state of a scene, and the correct gradient of its `loss`."""
+    """Hold the correct last state of a scene (a motion to run), and the correct gradient of the
+    scalar function `loss` of this state.
+
+    **Fields:** `end` the last state as one tuple; `error` the estimated error of its entries;
+    `gradient` the gradient of the scalar with respect to the scene's `numbers`, or empty;
+    `gradient_error` the estimated error of the entries of the gradient; `source` a sentence about
+    the method by which both were computed.
+
+    >>> top = stored_reference("heavy top")
+    >>> top is None or top.error < 1e-12
+    True
+    """
 
     end: tuple[float, ...]
-    error: float  # the estimated error of the entries of `end`
-    gradient: tuple[float, ...]  # with respect to the scene's `numbers`, or empty
+    error: float
+    gradient: tuple[float, ...]
     gradient_error: float
-    source: str  # a sentence about the method by which both were computed
+    source: str
 
 
 @functools.cache
@@ -192,16 +203,19 @@ def state_errors(
 class PreparedMethod(NamedTuple):
     """Hold a method that is prepared (compiled) for one scene, a motion to run.
 
-    >>> prepared = PreparedMethod(lambda setting: ([0.0, 1.0], 1 / setting)) >>>
-    prepared.run(1e-2)[1], prepared.compile (100.0, nan)
+    **Fields:** `run` a function of the setting (a tolerance, a number of steps, or the length of a
+    step) that returns, only when the computation is complete, the last state, or the gradient, as
+    one vector, and the number of steps; `compile` the time of preparation, s, and
+    `memory` the bytes of temporary arrays, both NaN if unknown.
+
+    >>> prepared = PreparedMethod(lambda setting: ([0.0, 1.0], 1 / setting))
+    >>> prepared.run(1e-2)[1], prepared.compile
+    (100.0, nan)
     """
 
-    # A function of the setting (a tolerance, a number of steps, or the length of a step) that
-    # returns, when the computation is complete, the last state, or the gradient, as one vector, and
-    # the number of steps.
     run: Callable[[float], tuple[Any, Any]]
-    compile: float = float("nan")  # the time of preparation, s
-    memory: float = float("nan")  # the bytes of temporary arrays
+    compile: float = float("nan")
+    memory: float = float("nan")
 
 
 class TimedMethod(NamedTuple):
