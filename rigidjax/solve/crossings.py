@@ -72,7 +72,8 @@ from rigidjax.solve.run import (
     solve,
     time_direction,
 )
-from rigidjax.solve.stops import extract_constants, program_with_stops
+from rigidjax.solve.stops import program_with_stops
+from rigidjax.solve.traced import extract_constants
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 

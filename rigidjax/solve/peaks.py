@@ -16,7 +16,6 @@ from jaxtyping import Array, PyTree
 
 from rigidjax.solve.run import DiffraxRun, equations_of_motion
 from rigidjax.solve.sides import evaluate_on_correct_sides
-from rigidjax.solve.stops import trace_program
 from rigidjax.solve.switching import (
     BENT,
     DECLARED,
@@ -26,6 +25,7 @@ from rigidjax.solve.switching import (
     STRAIGHT,
     Interpreter,
 )
+from rigidjax.solve.traced import trace_program
 
 # The operands are sampled `_A_STEP` times in a mean step of the run, in blocks of `_WINDOWS` times
 # `_SAMPLES` times, of which at most `_BLOCKS` are taken. A block gives one peak of each window.

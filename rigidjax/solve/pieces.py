@@ -23,7 +23,7 @@ from jaxtyping import Array, PyTree
 
 from rigidjax.solve.batching import Arrays, replaced
 from rigidjax.solve.linear_map import linear_map
-from rigidjax.solve.stops import trace_program
+from rigidjax.solve.traced import trace_program
 
 # The loop over the steps takes several steps in each iteration, which is one kernel on a GPU. An
 # iteration has about `_LONG` operations, and at most `_MOST` steps. Measured: a kernel twice as

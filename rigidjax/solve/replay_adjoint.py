@@ -23,7 +23,7 @@ from rigidjax.solve.batching import Arrays
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.recorded_run import run_replayed
 from rigidjax.solve.step_control import NORM, StandardController, Stopping, Watched
-from rigidjax.solve.stops import trace_program
+from rigidjax.solve.traced import trace_program
 
 # These controllers do not read `args`. They get `None`, because `args` may be large, and a batch
 # would need a copy of `args` for each body.

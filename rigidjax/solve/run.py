@@ -44,8 +44,8 @@ from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.sides import declared_jumps, evaluate_on_correct_sides
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.step_control import StandardController, Watched
-from rigidjax.solve.stops import trace_program
 from rigidjax.solve.switching import MOST, find_switches
+from rigidjax.solve.traced import trace_program
 
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 

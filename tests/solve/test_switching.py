@@ -18,8 +18,8 @@ from once import once
 import rigidjax as rj
 from rigidjax import torques
 from rigidjax.solve.run import equations_of_motion
-from rigidjax.solve.stops import trace_program
 from rigidjax.solve.switching import find_switches
+from rigidjax.solve.traced import trace_program
 
 AXIS = np.array([0.0, 0.0, 1.0])
 BODY = rj.Inertia.from_principal(1.0, 1.0, 2.0)
