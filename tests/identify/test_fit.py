@@ -340,7 +340,7 @@ def test_a_record_of_another_length_is_the_same_program(caplog):
     named = {
         "marquardt",
         "_errors_without_derivatives",
-        "_weighted_errors_and_derivatives",
+        "_linearised",
         "_compiled_quantities_and_derivatives",
     }
     assert not programs & named

@@ -75,7 +75,7 @@ def test_i2_rank_of_degenerate_motions(name):
     truth = problem.start(body, list(omega))
     noise = (jnp.full((1, 3), 0.01),)
     linear = linear_at(problem, truth, noise)
-    spread = uncertainty.white_or_sandwich_covariance(linear, uncertainty.correlation_times(linear))
+    spread = uncertainty.robust_covariance(linear, uncertainty.correlation_times(linear))
     assert 6 - len(spread.null_directions) == rank
 
 
@@ -85,7 +85,7 @@ def test_i2_nearly_a_pure_spin_is_seen_but_weakly():
     truth = problem.start(BODY, list(omega))
     noise = (jnp.full((1, 3), 1e-6),)
     linear = linear_at(problem, truth, noise)
-    spread = uncertainty.white_or_sandwich_covariance(linear, uncertainty.correlation_times(linear))
+    spread = uncertainty.robust_covariance(linear, uncertainty.correlation_times(linear))
     assert 6 - len(spread.null_directions) == 5
 
 

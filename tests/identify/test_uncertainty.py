@@ -15,7 +15,7 @@ from rigidjax.identify.uncertainty.covariance import (
     correlation_times,
     covariance_root,
     linearise,
-    white_or_sandwich_covariance,
+    robust_covariance,
 )
 
 TOSSES = Path(__file__).parents[3] / "shared" / "data" / "tennis_racket" / "tosses.csv"
@@ -52,7 +52,7 @@ def test_the_sandwich_is_that_of_its_definition(toss):
     blocks = blocks_at(found.model, found.x)
     linear = linearise(found.model, found.x, found.noises, blocks)
     times = correlation_times(linear)
-    got = white_or_sandwich_covariance(linear, times)
+    got = robust_covariance(linear, times)
     slopes = linear.slopes[0][0] * np.sqrt(linear.weights[0][0])[:, None, None]
     inverse = np.linalg.inv(np.einsum("tki,tkj->ij", slopes, slopes))
     apart = np.abs(np.subtract.outer(np.arange(60), np.arange(60)))

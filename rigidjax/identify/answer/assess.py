@@ -415,7 +415,7 @@ def assess(
     )
     hidden = np.zeros((0, linear.free_count))
     if stretches is None:
-        covariance = uncertainty.white_or_sandwich_covariance(linear, times, white)
+        covariance = uncertainty.robust_covariance(linear, times, white)
     else:
         covariance, hidden = (
             jackknife_covariance(stretches, white),
