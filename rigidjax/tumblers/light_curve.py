@@ -26,7 +26,7 @@ from rigidjax.identify.model.model import Model, require_single
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.identify.uncertainty import covariance as uncertainty
 from rigidjax.identify.uncertainty.quantities import (
-    quantities_and_derivatives_in_numpy,
+    quantities_on_host,
     reported_quantities,
     standard_deviations,
 )
@@ -329,7 +329,7 @@ def _widened(best: Fit) -> Fit:
         np.asarray(c) + shift @ shift.T for c in (best.covariance, best.determined_covariance)
     )
     null = np.asarray(best.null_directions)
-    numbers = quantities_and_derivatives_in_numpy(best.model, best.x, best.near)
+    numbers = quantities_on_host(best.model, best.x, best.near)
     freedom = best.degrees_of_freedom(numbers[1])
     return dataclasses.replace(
         best,

@@ -8,7 +8,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.uncertainty.quantities import (
-    quantities_and_derivatives_in_numpy,
+    quantities_on_host,
     reported_quantities,
 )
 
@@ -94,7 +94,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(scene):
         omega = [0.4, 1.2, 1.5] if scene is two_directions_of_a_top else OMEGA
         plan = problem.start(BODY, omega)
         if truth is None:
-            found = quantities_and_derivatives_in_numpy(problem, plan, None)
+            found = quantities_on_host(problem, plan, None)
             named = reported_quantities(problem, found, np.eye(plan.size), np.zeros((0, plan.size)))
             truth = {q.name: q.value for q in named if not q.name.startswith(("drag", "bias"))}
         found = identify.fit(problem, starts=1, initial=plan)

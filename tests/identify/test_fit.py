@@ -341,7 +341,7 @@ def test_a_record_of_another_length_is_the_same_program(caplog):
         "marquardt",
         "_errors_without_derivatives",
         "_linearised",
-        "_compiled_quantities_and_derivatives",
+        "_quantities_at",
     }
     assert not programs & named
     assert short.residuals[0].shape == (92, 3) and short.model.recording.t.shape == (92,)

@@ -56,7 +56,7 @@ def test_ends_are_those_of_the_likelihood_ratio(rho, away):
 
     best = distance(0.0)
     assert best <= min(distance(y) for y in np.linspace(-3, 3, 601)) + 1e-6
-    low, high = flat_limit.interval_ends_at_flat_body(1.96, rho, away)
+    low, high = flat_limit.cut_interval(1.96, rho, away)
     for side, end in ((-1.0, low), (1.0, high)):
         if abs(rho) < 1.0:
             found = brentq(lambda x, s=side: distance(s * x) - best - 1.96**2, 0.0, 10.0)
@@ -66,7 +66,7 @@ def test_ends_are_those_of_the_likelihood_ratio(rho, away):
 
 
 def test_far_from_flat_nothing_is_cut():
-    low, high = flat_limit.interval_ends_at_flat_body(1.96, np.linspace(-1, 1, 21), 5.0)
+    low, high = flat_limit.cut_interval(1.96, np.linspace(-1, 1, 21), 5.0)
     np.testing.assert_allclose(low, -1.96)
     np.testing.assert_allclose(high, 1.96)
 

@@ -7,7 +7,7 @@ import scipy.stats
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
+from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 
 SPHERE = rj.Inertia.from_principal(1.0, 1.0, 1.0)
 
@@ -101,7 +101,7 @@ def test_a_number_that_a_prior_knows_takes_nothing_from_the_errors():
 def test_quantiles():
     degrees = np.array([1.0, 2.0, 5.0, 300.0, np.inf])
     wanted = [*scipy.stats.t.ppf(0.95, degrees[:-1]), scipy.stats.norm.ppf(0.95)]
-    np.testing.assert_allclose(two_sided_student_quantile(0.9, degrees), wanted, rtol=1e-12)
+    np.testing.assert_allclose(student_quantile(0.9, degrees), wanted, rtol=1e-12)
     with pytest.raises(ValueError, match=r"level: wanted a level between 0 and 1, got 1\.96"):
         identify.fit(rj.datasets.toutatis.model()).quantities[0].interval(1.96)
 

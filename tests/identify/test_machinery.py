@@ -548,7 +548,7 @@ def test_free_numbers_are_reported_with_their_units():
         rj.identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", unit="N m s"),
     ]
     problem = rj.identify.Model(record, rj.identify.Principal(1e-3), torque=law, free=free)
-    units = {name.split()[0]: unit for name, unit, _ in quantities.names_units_and_signs(problem)}
+    units = {name.split()[0]: unit for name, unit, _ in quantities.labels(problem)}
     wanted = {"bias": "rad/s", "scale": "", "offset": "s", "tilt": "rad", "drag": "N m s"}
     assert {name: units[name] for name in wanted} == wanted
 

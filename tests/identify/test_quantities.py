@@ -15,7 +15,7 @@ from rigidjax import identify
 from rigidjax.identify import report
 from rigidjax.identify.answer.result import value_and_interval_of
 from rigidjax.identify.uncertainty.quantities import (
-    quantities_and_derivatives_in_numpy,
+    quantities_on_host,
     reported_quantities,
     standard_deviations,
 )
@@ -68,7 +68,7 @@ def test_an_indefinite_information_is_told():
     seen[0, 0] = -seen[0, 0]
     numbers = reported_quantities(
         found.model,
-        quantities_and_derivatives_in_numpy(found.model, found.x, None),
+        quantities_on_host(found.model, found.x, None),
         seen,
         np.asarray(found.null_directions),
     )
@@ -91,7 +91,7 @@ def test_a_fitted_number_has_a_width():
     found = fitted()
     exact = reported_quantities(
         found.model,
-        quantities_and_derivatives_in_numpy(found.model, found.x, None),
+        quantities_on_host(found.model, found.x, None),
         1e-40 * np.asarray(found.determined_covariance),
         np.zeros((0, 5)),
     )
@@ -100,7 +100,7 @@ def test_a_fitted_number_has_a_width():
         assert low < number.value < high
     still = reported_quantities(
         found.model,
-        quantities_and_derivatives_in_numpy(found.model, found.x, None),
+        quantities_on_host(found.model, found.x, None),
         np.zeros((5, 5)),
         np.zeros((0, 5)),
     )

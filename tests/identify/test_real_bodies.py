@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.uncertainty.flat_limit import describe_unreal_bodies, why_unreal
+from rigidjax.identify.uncertainty.flat_limit import describe_unreal, why_unreal
 
 T = np.linspace(0.0, 3.0, 61)
 TORQUE = np.array([0.1, -0.2, 0.15])
@@ -43,12 +43,12 @@ def test_numbers_of_no_body_are_named():
     assert why_unreal(rj.Inertia.from_principal(1.0, 1.0, 1.9)) is None
     wrong = why_unreal(Bare(1.0, 1.0, 3.0))
     assert wrong.startswith("no real body has these numbers: ")
-    found = describe_unreal_bodies(
+    found = describe_unreal(
         [(" [a]", Moments()), (" [b]", Moments())], [Bare(1.0, 1, 1), Bare(1.0, 1, 3)]
     )
     assert found == [wrong + " [b]"]
     # Every point of a chart of ours is a real body: it is not looked at.
-    assert describe_unreal_bodies([("", identify.Principal(1.0))], [Bare(1.0, 1.0, 3.0)]) == []
+    assert describe_unreal([("", identify.Principal(1.0))], [Bare(1.0, 1.0, 3.0)]) == []
 
 
 @pytest.mark.parametrize("moments", [(1.0, 1.2, 3.0), (1.0, 1.2, 1.9)])

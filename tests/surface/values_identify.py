@@ -697,7 +697,7 @@ leave_out(
     "errors that are considered, against refits of readings that are off: "
     "tests/identify/uncertainty/test_considered.py",
     "identify.Consideration",
-    "identify.Freedom.degrees_of_freedom_of_estimated_variance",
+    "identify.Freedom.of_estimated_variance",
 )
 leave_out(
     "the errors and derivatives of a fit, from which its covariance follows: "
@@ -711,7 +711,7 @@ leave_out(
 )  # fmt: skip
 leave_out(
     "compared with the intervals of Welch and Student: tests/identify/test_freedom.py",
-    "identify.Fit.degrees_of_freedom", "identify.Freedom", "identify.Freedom.degrees_of_freedom_of_variance",
+    "identify.Fit.degrees_of_freedom", "identify.Freedom", "identify.Freedom.of_variance",
 )  # fmt: skip
 leave_out(
     "abstract: made by subclassing",

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.uncertainty.considered import (
     Consideration,
-    describe_considered_errors,
-    slots_of_sensor,
+    describe,
+    sensor_slots,
 )
-from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
+from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 from rigidjax.identify.uncertainty.quantities import Quantity
 
 # One sentence names at most this number of quantities.
@@ -49,14 +49,14 @@ def describe_allowed_sensor_errors(
     - `usual_shifts`: for each sensor without a tolerance two things: the index of the sensor; and a
       dict of kind of error → shifts (q,), where a shift is the change of one of the q `quantities`
       that the error would cause. The kinds are "scale" (an error of 1 %) and "cross_axis" (an error
-      of 1° between axes). The function `considered.quantity_shifts_by_usual_errors` computes these
+      of 1° between axes). The function `considered.usual_shifts` computes these
       shifts.
     - `quantities`: the q reported quantities that the sentences name.
     """
     out = []
     sensors = model.records.sensors
     if considered_errors:
-        out.append(f"They allow for {describe_considered_errors(considered_errors, sensors)}.")
+        out.append(f"They allow for {describe(considered_errors, sensors)}.")
     for index, by_kind in usual_shifts:
         clauses = [
             f"{_WAYS[kind]} would move {_describe_quantity_shifts(quantities, shifts)}"
@@ -85,7 +85,7 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
     slots = [
         (slot, reading)
         for index, reading in enumerate(model.records.readings)
-        for slot in slots_of_sensor(model, index, "bias")
+        for slot in sensor_slots(model, index, "bias")
         if slot.prior is None
     ]
     for slot, reading in slots:
@@ -124,7 +124,7 @@ def _describe_quantity_shifts(
     words = []
     for quantity, shift in list(zip(quantities, shifts, strict=True))[:MOST]:
         unit = quantity.value if quantity.positive else 1.0
-        half = float(two_sided_student_quantile(0.95, quantity.freedom)) * quantity.deviation
+        half = float(student_quantile(0.95, quantity.freedom)) * quantity.deviation
         shown = f"{quantity.name} by {abs(unit) * shift:.2g}"
         words.append(f"{shown} (interval ±{half:.2g})" if np.isfinite(half) else shown)
     return ", ".join(words)

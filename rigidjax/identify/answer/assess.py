@@ -40,18 +40,18 @@ from rigidjax.identify.uncertainty.covariance import (
     Linearisation,
     white_noise_variance,
 )
-from rigidjax.identify.uncertainty.degrees_of_freedom import prepare_degrees_of_freedom
-from rigidjax.identify.uncertainty.flat_limit import describe_unreal_bodies
+from rigidjax.identify.uncertainty.degrees_of_freedom import prepare_freedom
+from rigidjax.identify.uncertainty.flat_limit import describe_unreal
 from rigidjax.identify.uncertainty.quantities import (
     Quantity,
-    name_suffixes_and_charts,
-    quantities_and_derivatives_in_numpy,
+    named_charts,
+    quantities_on_host,
     reported_quantities,
 )
 from rigidjax.identify.uncertainty.stretches import (
-    jackknife_covariance,
-    leave_out_each_stretch,
-    remarks_on_dependence_on_one_stretch,
+    jackknife,
+    leave_one_out,
+    stretch_remarks,
 )
 
 # The test for autocorrelated errors has this rate of false alarms. The rate is low because one fit
@@ -403,34 +403,34 @@ def assess(
     - `interrupted`, `remarks`: reasons for the answer on the search, in words.
     """
     x = best.x
-    near = flat_limit.thicken_flat_bodies(model, x)
-    thickened = None if near is None else (near, blocks_at(model, near))
+    near = flat_limit.thicken(model, x)
+    thickened = None if near is None else (near, errors_and_slopes(model, near))
     linear = uncertainty.linearise(model, x, noise, best.blocks, thickened)
     times = uncertainty.correlation_times(linear)
     white = uncertainty.white_covariance(linear)
-    stretches = leave_out_each_stretch(model, linear)
+    stretches = leave_one_out(model, linear)
     numbers, of = (
-        quantities_and_derivatives_in_numpy(model, x, near),
-        name_suffixes_and_charts(model),
+        quantities_on_host(model, x, near),
+        named_charts(model),
     )
     hidden = np.zeros((0, linear.free_count))
     if stretches is None:
         covariance = uncertainty.robust_covariance(linear, times, white)
     else:
         covariance, hidden = (
-            jackknife_covariance(stretches, white),
-            stretches.directions_shown_by_one_stretch,
+            jackknife(stretches, white),
+            stretches.hidden_directions,
         )
         remarks = (
             *remarks,
-            *remarks_on_dependence_on_one_stretch(stretches, model, numbers, white),
+            *stretch_remarks(stretches, model, numbers, white),
         )
-    remarks = (*remarks, *late_delays(model, x))
-    considered_errors = considered.compute_considered_errors(model, linear, noise, white.determined)
+    remarks = (*remarks, *describe_delays_outside_windows(model, x))
+    considered_errors = considered.considerations(model, linear, noise, white.determined)
     covariance = _covariance_with_considered_errors(covariance, considered_errors, model)
     shifts = considered.shift_matrix(considered_errors, linear.free_count)
-    freedom = prepare_degrees_of_freedom(model, linear, times, white.determined, shifts)
-    limits = flat_limit.distances_from_flat_bodies(
+    freedom = prepare_freedom(model, linear, times, white.determined, shifts)
+    limits = flat_limit.limits(
         model, numbers, -white.determined @ linear.misfit_gradient, [n for n, _ in of]
     )
     # A search has ended if it converged, or if the minimum of the linearised problem is near: in a
@@ -459,7 +459,7 @@ def assess(
     rival = f"{rivals} of {len(starts)} starts fit as well elsewhere" if rivals else ""
     if believable and not any(start.fits for start in starts):
         remarks = ("no single start came near the best point", *remarks)
-    unreal = describe_unreal_bodies(of, flat_limit.bodies_at(model, x))
+    unreal = describe_unreal(of, flat_limit.bodies_at(model, x))
     reasons = (*unreal, *explanation.reasons)
     explanation = Answer(explanation.word, reasons) if best_cost < np.inf else Answer(FAILS)
     quantities = reported_quantities(
@@ -468,7 +468,7 @@ def assess(
         covariance.determined,
         np.concatenate([covariance.null_directions, hidden]),
         limits,
-        freedom.degrees_of_freedom_of_variance(numbers[1]),
+        freedom.of_variance(numbers[1]),
     )
     words = _describe_constant_sensor_errors(
         model, linear, noise, white.determined, considered_errors, quantities, numbers[1]
@@ -530,9 +530,7 @@ def _describe_constant_sensor_errors(
     - `slopes`: the derivatives (q, n) of the quantities with respect to the n free numbers. Further
       rows at the end, for the flatness of bodies, are not used.
     """
-    bodies = {
-        log + name for name, chart in name_suffixes_and_charts(model) for log in chart.log_names
-    }
+    bodies = {log + name for name, chart in named_charts(model) for log in chart.log_names}
     free = {slot.name for slot in model.slots}
     rows = [i for i, one in enumerate(quantities) if one.name in bodies and one.name != "mass"]
     rows = rows or [i for i, one in enumerate(quantities) if one.name.split(" ")[0] in free]
@@ -543,9 +541,7 @@ def _describe_constant_sensor_errors(
         else []
     )
     usual_shifts = (
-        considered.quantity_shifts_by_usual_errors(model, linear, noise, covariance, slopes[known])
-        if known
-        else []
+        considered.usual_shifts(model, linear, noise, covariance, slopes[known]) if known else []
     )
     return describe_allowed_sensor_errors(
         model, considered_errors, usual_shifts, [quantities[i] for i in known]
@@ -576,7 +572,7 @@ def _covariance_with_considered_errors(
     root = considered.shift_matrix(considered_errors, len(covariance.determined))
     added, words = (
         root @ root.T,
-        considered.describe_considered_errors(considered_errors, model.records.sensors),
+        considered.describe(considered_errors, model.records.sensors),
     )
     return dataclasses.replace(
         covariance,

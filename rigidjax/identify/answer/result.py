@@ -19,7 +19,7 @@ from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jac
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.uncertainty.considered import Consideration
 from rigidjax.identify.uncertainty.covariance import Linearisation
-from rigidjax.identify.uncertainty.degrees_of_freedom import Freedom, two_sided_student_quantile
+from rigidjax.identify.uncertainty.degrees_of_freedom import Freedom, student_quantile
 from rigidjax.identify.uncertainty.flat_limit import Limit
 from rigidjax.identify.uncertainty.quantities import Quantity, interval_about
 
@@ -330,7 +330,7 @@ class Fit(eqx.Module):
         return (
             np.full(slope.shape[:-1], np.inf)
             if self.freedom is None
-            else self.freedom.degrees_of_freedom_of_variance(slope)
+            else self.freedom.of_variance(slope)
         )
 
     @property
@@ -381,7 +381,7 @@ def value_and_interval_of(
     determined, null = np.asarray(fit.determined_covariance), np.asarray(fit.null_directions)
     if fit.hidden_directions is not None:
         null = np.concatenate([null, np.asarray(fit.hidden_directions)])
-    reach = two_sided_student_quantile(level, fit.degrees_of_freedom(slope))
+    reach = student_quantile(level, fit.degrees_of_freedom(slope))
     return middle, *interval_about(middle, slope, determined, null, reach, fit.limits)
 
 

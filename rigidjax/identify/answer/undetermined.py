@@ -1,14 +1,13 @@
 """Describe in words which numbers a fit determines, and which numbers it leaves undetermined."""
 
 import dataclasses
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.answer.answers import FAILS, NOT_ENDED
@@ -19,17 +18,19 @@ from rigidjax.identify.model.model import Model, shortened
 from rigidjax.identify.model.terms import value_and_jacfwd
 from rigidjax.identify.search.stages import blocks_at
 from rigidjax.identify.sensors import Gyro
-from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
+from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 from rigidjax.identify.uncertainty.flat_limit import bodies_at
 from rigidjax.identify.uncertainty.quantities import (
+    Label,
+    Linear,
     Quantity,
-    deviation_of_value_or_logarithm,
-    name_suffixes_and_charts,
-    names_units_and_signs,
-    quantities_and_derivatives,
+    labels,
+    log_deviation,
+    named_charts,
+    quantities_at,
     quantity_vector,
     recording_suffixes,
-    reports_initial_states,
+    reports_starts,
 )
 from rigidjax.motion.manifold import minus, parts_by_name
 from rigidjax.rotation import quaternion
@@ -122,23 +123,15 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
     """Return the combinations of numbers that the data of a fit do not determine at all.
 
     Each combination is made of few numbers, and it has one number that no other combination has,
-    because the combinations are the rows of a reduced row echelon form. A change of the initial
-    attitude is described by turns about the axes of the world or about the axes of the body. Those
-    axes are chosen with which the combinations contain fewer numbers.
+    because the combinations are the rows of a reduced row echelon form.
     """
     null = np.asarray(fit.null_directions)
     if not null.size:
         return ()
     best = basis = None
-    slopes, values = map(
-        np.asarray,
-        _slopes_and_values_for_report(shortened(fit.model), fit.derivative_point),
-    )
-    names, many = (
-        _names_units_and_relative_flags(fit.model),
-        len(name_suffixes_and_charts(fit.model)),
-    )
-    first, turns = len(names_units_and_signs(fit.model)), 3 * fit.model.count
+    values, slopes = _numbers_on_host(fit)
+    names, many = _labels(fit.model), len(named_charts(fit.model))
+    first, turns = len(labels(fit.model)), 3 * fit.model.count
     for other in (1, 0):
         # Compute the combinations twice, with changes of attitude about the axes of the world and
         # about the axes of the body: first leave out the rows of the body's axes, then the rows of
@@ -146,18 +139,16 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
         begin = first + 6 * many + other * turns
         rows = np.delete(np.arange(len(names)), slice(begin, begin + turns))
         here, slope = [names[row] for row in rows], slopes[rows]
-        # The free numbers are of order one, so that the largest derivative of a reported number
-        # with respect to them measures its size.
+        # The parameters are of order one, so that the largest derivative of a reported number with
+        # respect to them measures its size.
         size = np.abs(slope).max(axis=1)
         tensors = size[first : first + 6 * many].reshape(many, 6)
         tensors[:] = tensors.max(axis=1, keepdims=True)
-        relative = np.array([one[2] for one in here])
+        relative = np.array([one.positive for one in here])
         size = np.where(relative | (size == 0), 1.0, size)
         changes = null @ slope.T / size
-        changes = np.where(
-            _mask_of_reported_numbers(fit, [one[0] for one in here], changes), changes, 0.0
-        )
-        echelon = _reduced_echelon_form(changes)
+        changes = np.where(_mask(fit, [one.name for one in here], changes), changes, 0.0)
+        echelon = _echelon(changes)
         if best is None or np.count_nonzero(echelon) < np.count_nonzero(best[0]):
             best, basis = (echelon, here, size, values[rows], slope), changes
     assert best is not None and basis is not None
@@ -167,32 +158,32 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
     out = []
     for row in rows:
         direction = np.linalg.lstsq(basis.T, row)[0] @ null
-        switch = _readings_change_along(fit, direction)
-        one = _combination_from_echelon_row(row, *best[1:3], switch)
-        out.append(_by_one_factor_if_so(fit, one, row, *best[2:], direction))
+        # The derivatives of the readings along `direction` are zero, but the readings may change all
+        # the same: where a torque switches at a time or a state that moves. Half the difference of
+        # a step forwards and a step backwards shows it; readings that depend on the square of a
+        # number change by the same in both.
+        step, switch = 0.01 * direction / np.abs(direction).max(), False
+        if fit.model.torque is not None:
+            switch = 0.5 * _change_of_readings(fit, (step, -step)) > CHANGED
+        echelon, here, size, value, slope = best
+        order = np.flatnonzero(row)
+        # The largest entry becomes a hundredth, and the first number rises.
+        changes = 0.01 * np.sign(row[order[0]]) * row / np.abs(row).max() * size
+        mine = [here[i] for i in order]
+        one = Combination(
+            tuple(label.name for label in mine),
+            tuple(float(changes[i]) for i in order),
+            tuple("" if label.positive else label.unit for label in mine),
+            tuple(label.positive for label in mine),
+            switch,
+        )
+        out.append(_by_one_factor(fit, one, row, size, value, slope, direction))
     return tuple(out)
-
-
-def _readings_change_along(fit: "Fit", direction: np.ndarray) -> bool:
-    """Return whether the predicted readings of a `fit` change along a `direction` (n,) of the n
-    free numbers although their derivatives along it are zero.
-
-    This happens if a torque switches at a certain time or state, and this time or state moves along
-    the direction. Without a torque the result is false. The change of the readings is half the
-    difference of the predictions after a step forwards and after a step backwards. The result is
-    true if the length of this change, over all readings together, is more than a hundredth of the
-    noise. Readings that depend only on the square of a number have zero derivatives with respect to
-    it, too; but the two predictions are then equal, so that the result is false.
-    """
-    if fit.model.torque is None:
-        return False
-    step = 0.01 * direction / np.abs(direction).max()
-    return 0.5 * _change_of_readings(fit, (step, -step)) > CHANGED
 
 
 def _change_of_readings(fit: "Fit", steps: tuple[np.ndarray, np.ndarray]) -> float:
     """Return the length, in standard deviations, of the difference of all predicted readings after
-    two steps (n,) from the best point of a `fit`.
+    two steps (n,) from the best point.
     """
     x = fit.derivative_point
     after, before = (blocks_at(fit.model, x + jnp.asarray(step, x.dtype))[0] for step in steps)
@@ -202,41 +193,7 @@ def _change_of_readings(fit: "Fit", steps: tuple[np.ndarray, np.ndarray]) -> flo
     )
 
 
-def _combination_from_echelon_row(
-    row: np.ndarray,
-    names: list[tuple[str, str, bool]],
-    size: np.ndarray,
-    switch: bool,
-) -> Combination:
-    """Return the undetermined combination of numbers that one row describes.
-
-    A combination is undetermined if no reading changes along it. The row is a row of the reduced
-    row echelon form of a matrix. Each row of this matrix holds the changes of the numbers along one
-    direction of the free numbers that the data do not determine.
-
-    **Arguments:**
-
-    - `row`: (M,) for each of M numbers, its change divided by the size of the number.
-    - `names`: the name and unit of each number, and whether its change is given as a relative
-      change.
-    - `size`: (M,) the size of each number.
-    - `switch`: whether the readings change along the combination although their derivative is zero,
-      because the combination moves a time or a state at which a torque switches.
-    """
-    order = np.flatnonzero(row)
-    # Scale the row so that its largest entry is a hundredth, and so that the first number rises.
-    # Multiply each entry by the size of its number.
-    changes = 0.01 * np.sign(row[order[0]]) * row / np.abs(row).max() * size
-    return Combination(
-        tuple(names[i][0] for i in order),
-        tuple(float(changes[i]) for i in order),
-        tuple("" if names[i][2] else names[i][1] for i in order),
-        tuple(names[i][2] for i in order),
-        switch,
-    )
-
-
-def _by_one_factor_if_so(
+def _by_one_factor(
     fit: "Fit",
     one: Combination,
     row: np.ndarray,
@@ -275,45 +232,40 @@ def _by_one_factor_if_so(
     )
 
 
-def _names_units_and_relative_flags(model: Model) -> list[tuple[str, str, bool]]:
-    """Return three things for each number that a report may name: its name; its unit; and whether
-    its changes are given as relative changes.
+def _labels(model: Model) -> list[Label]:
+    """Return what each number that a report may name is called.
 
-    The numbers are, in this order:
-
-    - the reported quantities of the `model`;
-    - the components of its inertia tensors;
-    - the initial attitudes, as turns about the world's axes;
-    - the initial attitudes once more, as turns about the body's axes;
-    - the initial positions;
-    - the initial velocities.
-
-    Attitudes, positions and velocities are listed only if the initial state has them. They are not
-    listed for a model of windows (short parts of a record), which has too many initial states.
+    The reported quantities come first; then the components of the inertia tensors; and, without
+    windows, initial attitudes (turns about the world's, then about the body's axes), positions and
+    velocities. Changes of positive numbers are given as relative changes.
     """
-    out = names_units_and_signs(model)
-    for name, chart in name_suffixes_and_charts(model):
-        out += [(f"{part}{name}", chart.unit, False) for part in TENSOR]
+    out = labels(model)
+    for name, chart in named_charts(model):
+        out += [Label(f"{part}{name}", chart.unit, False) for part in TENSOR]
     for part, name, unit in (
         ("q", "attitude about the world's", "rad"),
         ("q", "attitude about the body's", "rad"),
         ("x", "position", "m"),
         ("v", "velocity", "m/s"),
     ):
-        if hasattr(model.reference.state, part) and reports_initial_states(model):
+        if hasattr(model.reference.state, part) and reports_starts(model):
             for where in recording_suffixes(model):
-                out += [(f"the initial {name} {k}{where}", unit, False) for k in "xyz"]
+                out += [Label(f"the initial {name} {k}{where}", unit, False) for k in "xyz"]
     return out
 
 
-@eqx.filter_jit
-def _slopes_and_values_for_report(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Return the derivatives (M, n) and the values (M,) of all M numbers that a report may name.
+def _numbers_on_host(fit: "Fit") -> Linear:
+    """Return all numbers that a report may name, in the order of `_labels`."""
+    slopes, values = _numbers(with_first_times_only(fit.model), fit.derivative_point)
+    return Linear(np.asarray(values), np.asarray(slopes))
 
-    The numbers of the `model` are in the order of `_names_units_and_relative_flags`. A positive
-    reported quantity is given by its logarithm. The derivatives are taken with respect to the n
-    free numbers, at `point` (n,). An initial attitude is a turn from the attitude at `point`; an
-    initial position or velocity is the difference from its value in the reference state.
+
+@eqx.filter_jit
+def _numbers(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Return the derivatives (M, n) and the values (M,) of all numbers that a report may name.
+
+    An initial attitude is a turn from that at `point`; an initial position or velocity is the
+    difference from that of the reference state.
     """
     reference = model.reference
     start = jax.vmap(ReferenceStates.initial)(reference, point[model.index.start])
@@ -332,60 +284,45 @@ def _slopes_and_values_for_report(model: Model, point: Float[Array, " n"]) -> tu
         for body in body_list(model.bodies(x)):
             tensor = tensor_of(body)
             numbers.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
-        if reports_initial_states(model):
+        if reports_starts(model):
             numbers += initial_states(x)
         return jnp.concatenate([part.reshape(-1) for part in numbers])
 
     return value_and_jacfwd(value, point)[::-1]
 
 
-def _mask_of_reported_numbers(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
-    """Return a mask (M,), true for each number that a report may name as undetermined.
+def _mask(
+    fit: "Fit", names: list[str], changes: Float[np.ndarray, "k M"]
+) -> Bool[np.ndarray, " M"]:
+    """Return a mask, true for each number that a report may name as undetermined.
 
-    The moments and the tensor components of a body describe the same changes, so that only one of
-    these two kinds is named: the components if some undetermined change turns the principal axes,
-    else the moments. All other numbers may be named.
-
-    **Arguments:**
-
-    - `fit`: the fit.
-    - `names`: the names of the M numbers.
-    - `changes`: (k, M) the changes of the numbers along k directions that the data do not
-      determine.
+    The moments and the tensor components of a body describe the same changes: the components are
+    named if one of the undetermined `changes` turns the principal axes, else the moments.
     """
     rows = bodies_at(fit.model, fit.derivative_point)
     mask = np.ones(len(names), bool)
-    for (where, chart), body in zip(name_suffixes_and_charts(fit.model), rows, strict=True):
+    for (where, chart), body in zip(named_charts(fit.model), rows, strict=True):
         # A name of a tensor component may occur twice in `names`: a chart, which maps free numbers
-        # to a body, may report the components, and `_slopes_and_values_for_report` adds them in any
-        # case. The last entry with the name is the one that this function adds.
+        # to a body, may report the components, and `_labels` adds them in any case. The last entry
+        # with the name is the one added.
         every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]
         places = [some[-1] for some in every]
         mask[[i for some in every for i in some]] = False
         moments = [names.index(f"{log}{where}") for log in chart.log_names if log != "mass"]
-        if moments and _turns_principal_axes(np.asarray(tensor_of(body)), changes[:, places]):
-            mask[moments], mask[places] = False, True
+        if moments:
+            _, axes = np.linalg.eigh(np.asarray(tensor_of(body)))
+            steps = np.einsum("mk,kij->mij", changes[:, places], BASIS)
+            along = np.einsum("ia,kij,jb->kab", axes, steps, axes)
+            across = np.abs(along - along * np.eye(3)).max()
+            if across > PART * max(np.abs(along).max(), 1e-6):
+                mask[moments], mask[places] = False, True
     return mask
 
 
-def _turns_principal_axes(tensor: np.ndarray, changes: np.ndarray) -> bool:
-    """Return whether any of k changes of an inertia `tensor` (3, 3) turns its principal axes.
+def _echelon(rows: Float[np.ndarray, "k M"]) -> Float[np.ndarray, "_ M"]:
+    """Return the reduced row echelon form of a matrix, by elimination with complete pivoting.
 
-    Each row of `changes` (k, 6) changes the components xx, yy, zz, yz, xz and xy of the tensor.
-    """
-    steps = np.einsum("mk,kij->mij", changes, BASIS)
-    _, axes = np.linalg.eigh(tensor)
-    along = np.einsum("ia,kij,jb->kab", axes, steps, axes)
-    across = along - along * np.eye(3)
-    return bool(np.abs(across).max() > PART * max(np.abs(along).max(), 1e-6))
-
-
-def _reduced_echelon_form(rows: np.ndarray) -> np.ndarray:
-    """Return the reduced row echelon form of the matrix `rows` (k, M), by elimination with complete
-    pivoting.
-
-    Rows that are zero up to round-off are left out. An entry is set to zero if it is small compared
-    with the largest entry of its row.
+    Rows that are zero up to round-off are left out, and so are small entries of a row.
     """
     rows = np.array(rows)
     size, done = np.abs(rows).max(), 0
@@ -412,15 +349,15 @@ def describe_identifiability(fit: "Fit") -> tuple[str, ...]:
             "best point found, and say nothing about the body."
         ]
         # Undetermined directions are the likely reason why a search did not end: name them.
-        out += [] if lost else _describe_undetermined_combinations(fit)
+        out += [] if lost else _describe_combinations(fit)
         return (*out, *describe_full_scale(fit.model.records.readings))
     out = []
     moments, first = [], 0
-    for _, chart in name_suffixes_and_charts(fit.model):
+    for _, chart in named_charts(fit.model):
         moments += fit.quantities[first : first + len(chart.log_names)]
         first += len(chart.log_names) + len(chart.plain_names)
     for quantity in moments:
-        wide = _half_width_of_interval(quantity)
+        wide = _half_width(quantity)
         # `wide` is half the width of the interval of the logarithm. If it is small, it is the
         # relative half-width; if it is large, the ends of the interval are exp(±wide) times the
         # value.
@@ -440,14 +377,26 @@ def describe_identifiability(fit: "Fit") -> tuple[str, ...]:
         "bodies."
         for limit in fit.limits
         if limit.is_flat_within(
-            determined, float(two_sided_student_quantile(0.95, fit.degrees_of_freedom(limit.slope)))
+            determined, float(student_quantile(0.95, fit.degrees_of_freedom(limit.slope)))
         )
     ]
-    count = fit.model.count
-    if reports_initial_states(fit.model):
-        out.append(_describe_initial_rates(fit.quantities[first : first + 3 * count], count))
-    out += _describe_undetermined_combinations(fit)
-    out += describe_strong_correlations(fit)
+    if reports_starts(fit.model):
+        # Each recording has three components of its initial body rate.
+        shares, count = [], fit.model.count
+        for index in range(first, first + 3 * count, 3):
+            rate = fit.quantities[index : index + 3]
+            length = np.linalg.norm([q.value for q in rate])
+            shares.append(np.max([_half_width(q) for q in rate]) / max(length, 1e-300))
+        wide = np.max(shares)
+        many = "The initial body rate is" if count == 1 else "The initial body rates are"
+        if wide < 1.0:
+            grade = "well" if wide < 0.1 else "weakly"
+            its = "its length" if count == 1 else "their lengths"
+            out.append(f"{many} {grade} determined, to ±{wide:.2g} of {its}.")
+        else:
+            out.append(f"{many} not determined by these data.")
+    out += _describe_combinations(fit)
+    out += _describe_correlations(fit)
     if fit.model.torque is None:
         out.append(
             "Free motion cannot show the absolute inertia, only ratios of moments; nor the mass or "
@@ -462,51 +411,18 @@ def describe_identifiability(fit: "Fit") -> tuple[str, ...]:
     return tuple(out)
 
 
-def _half_width_of_interval(quantity: Quantity) -> float:
-    """Return half the width of the 95 % interval of a reported `quantity`.
-
-    For a positive quantity it is half the width of the interval of its logarithm.
-    """
-    return float(
-        two_sided_student_quantile(0.95, quantity.freedom)
-    ) * deviation_of_value_or_logarithm(quantity)
+def _half_width(quantity: Quantity) -> float:
+    """Return half the width of the 95 % interval of a quantity, or of its logarithm if positive."""
+    return float(student_quantile(0.95, quantity.freedom)) * log_deviation(quantity)
 
 
-def _describe_initial_rates(rates: Sequence[Quantity], count: int) -> str:
-    """Describe in a sentence how well the data determine the initial body rates of all recordings.
-
-    **Arguments:**
-
-    - `rates`: the three components of each initial body rate, with their standard deviations, one
-      recording after another.
-    - `count`: the number of recordings.
-    """
-    shares = []
-    for index in range(count):
-        three = rates[3 * index : 3 * index + 3]
-        length = np.linalg.norm([q.value for q in three])
-        shares.append(np.max([_half_width_of_interval(q) for q in three]) / max(length, 1e-300))
-    wide = np.max(shares)
-    what = "The initial body rate is" if count == 1 else "The initial body rates are"
-    if not wide < 1.0:
-        return f"{what} not determined by these data."
-    grade = "well" if wide < 0.1 else "weakly"
-    its = "its length" if count == 1 else "their lengths"
-    return f"{what} {grade} determined, to ±{wide:.2g} of {its}."
-
-
-def _describe_undetermined_combinations(fit: "Fit") -> list[str]:
-    """Describe, each in a sentence, the combinations of numbers that the data of a `fit` do not
-    determine.
-
-    At most `SEVERAL` combinations are described; one more sentence says how many further
-    combinations there are. The list is empty if the data determine all numbers.
-    """
+def _describe_combinations(fit: "Fit") -> list[str]:
+    """Describe, each in a sentence, at most `SEVERAL` combinations that are not determined."""
     combinations = undetermined_combinations(fit)
     if not combinations:
         return []
     out = []
-    if inertia_scale_is_undetermined(fit):
+    if _scale_is_free(fit):
         out.append("The data determine the inertia only up to scale.")
     out += [one.in_words for one in combinations[:SEVERAL]]
     if len(combinations) > SEVERAL:
@@ -516,43 +432,30 @@ def _describe_undetermined_combinations(fit: "Fit") -> list[str]:
     return out
 
 
-def inertia_scale_is_undetermined(fit: "Fit") -> bool:
-    """Return whether the data leave the scale of the inertia tensor undetermined.
-
-    This is the case if a change of the free numbers along undetermined directions multiplies all
-    components of the tensor by one factor. For a model of several bodies the result is false.
+def _scale_is_free(fit: "Fit") -> bool:
+    """Return whether a change along undetermined directions multiplies all components of the tensor
+    by one factor; false for several bodies.
     """
     null = np.asarray(fit.null_directions)
     if not len(null) or isinstance(fit.model.chart, Bodies):
         return False
-    first = len(names_units_and_signs(fit.model))
-    slopes, values = (
-        np.asarray(a)
-        for a in _slopes_and_values_for_report(shortened(fit.model), fit.derivative_point)
-    )
+    first = len(labels(fit.model))
+    values, slopes = _numbers_on_host(fit)
     here, moved = values[first : first + 6], slopes[first : first + 6] @ null.T
     wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)
     return bool(np.linalg.norm(moved @ wanted - here) < 1e-3 * np.linalg.norm(here))
 
 
-def describe_strong_correlations(fit: "Fit") -> list[str]:
-    """Describe the pairs of reported quantities of a `fit` whose errors are strongly correlated.
+def _describe_correlations(fit: "Fit") -> list[str]:
+    """Describe at most five pairs of quantities whose correlation ρ has |ρ| > 0.95.
 
-    There is one sentence for each of at most five pairs with |ρ| > 0.95, where ρ is the correlation
-    coefficient. Components of the inertia tensor are left out, because they follow from the moments
-    and axes.
+    Components of the inertia tensor are left out, because they follow from the moments and axes.
     """
-    slope = np.asarray(quantities_and_derivatives(fit.model, fit.derivative_point)[1])[
-        : len(fit.quantities)
-    ]
+    slope = np.asarray(quantities_at(fit.model, fit.derivative_point).slopes)[: len(fit.quantities)]
     covariance = slope @ np.asarray(fit.determined_covariance) @ slope.T
-    deviation = np.array([deviation_of_value_or_logarithm(quantity) for quantity in fit.quantities])
+    deviation = np.array([log_deviation(quantity) for quantity in fit.quantities])
     good = np.isfinite(deviation) & (deviation > 0)
-    follow = {
-        f"{plain}{name}"
-        for name, c in name_suffixes_and_charts(fit.model)
-        for plain in c.plain_names
-    }
+    follow = {f"{plain}{name}" for name, c in named_charts(fit.model) for plain in c.plain_names}
     names = [quantity.name for quantity in fit.quantities]
     good &= np.array([name not in follow or name.startswith("com") for name in names])
     scaled = np.where(good, deviation, 1.0)

@@ -23,7 +23,7 @@ from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.covariance import covariance_root
 from rigidjax.identify.uncertainty.quantities import (
     Quantity,
-    quantities_and_derivatives_in_numpy,
+    quantities_on_host,
     reported_quantities,
 )
 
@@ -50,7 +50,7 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
     """
     _require_not_traced(model, x)
     _require_known_noise(model, x)
-    near = flat_limit.thicken_flat_bodies(model, x)
+    near = flat_limit.thicken(model, x)
     information = np.asarray(_fisher(model, x if near is None else near))
     if not np.isfinite(information).all():
         raise ValueError(
@@ -58,9 +58,7 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
             "recordings of model hold NaN, or the motion of x overflows"
         )
     half, null = covariance_root(information)
-    return reported_quantities(
-        model, quantities_and_derivatives_in_numpy(model, x, near), half @ half.T, null
-    )
+    return reported_quantities(model, quantities_on_host(model, x, near), half @ half.T, null)
 
 
 def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:

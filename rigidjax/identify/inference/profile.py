@@ -14,7 +14,7 @@ from rigidjax.identify.data import stacking
 from rigidjax.identify.model.model import AbstractPull, Model
 from rigidjax.identify.search.stages import Attempt, Task, cost_of, search_whole
 from rigidjax.identify.uncertainty import quantities
-from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
+from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 
 # The residual of a `Pull` has this standard deviation, in units of the standard deviation of the
 # quantity. A smaller standard deviation would slow the search down.
@@ -74,9 +74,9 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
         raise ValueError(f"profile: wanted one of {', '.join(names)}, got {name!r}")
     index = names.index(name)
     quantity = fit.quantities[index]
-    reach = float(two_sided_student_quantile(level, quantity.freedom))
+    reach = float(student_quantile(level, quantity.freedom))
     middle = np.log(quantity.value) if quantity.positive else quantity.value
-    deviation = quantities.deviation_of_value_or_logarithm(quantity)
+    deviation = quantities.log_deviation(quantity)
     wide = np.log(1e3) if quantity.positive else 1e3 * max(abs(middle), 1e-12)
     if not np.isfinite(deviation) or deviation <= 0:
         deviation = wide / 10

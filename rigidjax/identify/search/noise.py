@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Blocks, Noise, delay_slopes, reading_weights
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
-from rigidjax.identify.uncertainty.degrees_of_freedom import counts_of_determined_numbers
+from rigidjax.identify.uncertainty.degrees_of_freedom import effective_parameters
 
 # The joint estimate of the noise and the jitter of a sensor takes at most this many iterations.
 ROUNDS = 500
@@ -141,7 +141,7 @@ def _shares(
         taken = [np.array([x.size])]
     else:
         linear = linearise(model, x, noise, blocks)
-        taken = counts_of_determined_numbers(
+        taken = effective_parameters(
             linear, linear.information_by_sensor, white_covariance(linear).determined
         )
         taken = [np.bincount(groups, each) for each in taken]

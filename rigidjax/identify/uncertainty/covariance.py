@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import (
@@ -120,7 +120,7 @@ class Linearisation(eqx.Module):
         return float(sum(np.sum(part**2) for part in (readings, *rest)))
 
     def rows_for_all_numbers(self, rows: np.ndarray) -> np.ndarray:
-        """Return rows (R, n) for all n parameters from `rows` (R, m) for those of each recording."""
+        """Return rows (R, n) for all n parameters from `rows` (R, m) of recordings."""
         wide = np.zeros((len(rows), self.free_count + 1))
         np.add.at(wide, (np.arange(len(rows))[:, None], self.places), rows)
         return wide[:, :-1]
@@ -590,7 +590,7 @@ def _autocorrelation(
     return _Autocorrelation(1.0 + 2.0 * float(rho[:last].sum()), float(first))
 
 
-def _lagged_sums(rows: Float[np.ndarray, "records T"]) -> Float[np.ndarray, " T"]:
+def _lagged_sums(rows: Shaped[np.ndarray, "records T"]) -> Float[np.ndarray, " T"]:
     """Return the sums of `x[r, i] x[r, i + l]` over r and i for each lag l, by FFT."""
     size = rows.shape[1]
     return np.fft.irfft(np.sum(np.abs(np.fft.rfft(rows, 2 * size)) ** 2, axis=0), 2 * size)[:size]

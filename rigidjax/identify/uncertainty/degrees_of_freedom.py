@@ -1,9 +1,10 @@
 """Compute the degrees of freedom of the variances of a fit that estimates noise or spreads."""
 
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Float, Int
 
 from rigidjax import _checks
 from rigidjax.identify.model.model import Model
@@ -14,27 +15,29 @@ from rigidjax.identify.uncertainty.covariance import CorrelationTimes, Linearisa
 PLENTY = 100.0
 
 
-class Freedom(eqx.Module):
-    """Hold the numbers from which the degrees of freedom of the variance of any function of the
-    free numbers are computed.
+class _Width(NamedTuple):
+    """Hold an estimated `spread` of a `Free`: the deviation of its values in single recordings."""
 
-    A `Free` is a number that the fit may move. A width is the estimated `spread` of a `Free`: the
-    standard deviation of its values in single recordings about the value that the recordings share.
+    places: Int[np.ndarray, " k"]  # of the recordings' deviations from the shared value
+    square: float
+    freedom: float
+
+
+class Freedom(eqx.Module):
+    """Hold what gives the degrees of freedom of the variance of any function of the parameters.
 
     **Fields:**
 
-    - `covariance`: (n, n) the covariance of the n free numbers, for white errors.
-    - `places`: (R, m) the indices, among the free numbers, of the m numbers of each of R
-      recordings.
+    - `covariance`: (n, n) the covariance of the n parameters, for white errors.
+    - `places`: (R, m) the indices, among the n, of the m parameters of each of R recordings.
     - `groups`: (R,) the index of the group of each recording. In the recordings of one group a
       sensor has the same standard deviation of its noise.
     - `blocks`: for each sensor the information matrices (R, m, m) of its readings.
     - `left`: for each sensor the degrees of freedom (G,) of its noise in each of G groups: the
-      number of its independent errors minus the number of free numbers that these errors determine.
+      number of its independent errors minus the number of parameters that these errors determine.
       They are infinite if the noise is given.
-    - `widths`: for each width three things: the indices, among the free numbers, of the deviations
-      of recordings from the shared value; the square of the width; and its degrees of freedom.
-    - `considered`: (n, c) the changes of the free numbers by one standard deviation of each error
+    - `widths`: each estimated `spread` of a `Free`, with its degrees of freedom.
+    - `considered`: (n, c) the changes of the parameters by one standard deviation of each error
       that a sensor may have and that the fit does not estimate (`Consideration.shifts`).
     """
 
@@ -43,35 +46,28 @@ class Freedom(eqx.Module):
     groups: np.ndarray
     blocks: tuple[np.ndarray, ...]
     left: tuple[np.ndarray, ...]
-    widths: tuple[tuple[np.ndarray, float, float], ...]
+    widths: tuple[_Width, ...]
     considered: np.ndarray
 
-    def degrees_of_freedom_of_variance(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom (…,) of the variance of each of several functions of the
-        free numbers.
+    def of_variance(self, slope: np.ndarray) -> np.ndarray:
+        """Return the degrees of freedom (…,) of the variance of functions with the derivatives
+        `slope` (…, n).
 
-        The argument `slope` (…, n) holds the derivative of each function with respect to the n free
-        numbers. Considered errors of sensors add a known variance to the estimated variance. The
-        degrees of freedom of the estimated variance are therefore multiplied by the square of a
-        ratio: the sum of both variances, divided by the estimated variance.
+        Considered errors add a known variance to the estimated one: the degrees of freedom of the
+        estimated variance are multiplied by the square of the ratio of the sum to it.
         """
         estimated = np.sum((slope @ self.covariance) * slope, axis=-1)
         known = np.sum((slope @ self.considered) ** 2, axis=-1)
         grown = (1.0 + known / np.maximum(estimated, 1e-300)) ** 2
-        return np.asarray(self.degrees_of_freedom_of_estimated_variance(slope) * grown)
+        return np.asarray(self.of_estimated_variance(slope) * grown)
 
-    def degrees_of_freedom_of_estimated_variance(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom (…,) of the estimated part of the variance of each of
-        several functions.
+    def of_estimated_variance(self, slope: np.ndarray) -> np.ndarray:
+        """Return the degrees of freedom (…,) of the estimated part of the variance of functions
+        with the derivatives `slope` (…, n).
 
-        The variance of a function is a sum of parts: one for the noise of each sensor in each group
-        of recordings, and one for each estimated `spread` of a `Free` (the scatter, between
-        recordings, of a number that the fit may move). The degrees of freedom of the sum follow
-        from the fraction of each part and from its degrees of freedom (Satterthwaite 1946,
-        doi:10.2307/3002019). If every noise has more than `PLENTY` degrees of freedom, the
-        fractions of single noises are not computed: the smallest number of degrees is used for all
-        noises. The argument `slope` (…, n) holds the derivative of each function with respect to
-        the n free numbers.
+        The variance is a sum of parts: one for the noise of each sensor in each group of
+        recordings, and one for each width (Satterthwaite 1946, doi:10.2307/3002019). If every noise
+        has more than `PLENTY` degrees of freedom, the smallest number is used for all noises.
         """
         along = slope @ self.covariance
         variance = np.maximum(np.sum(along * slope, axis=-1), 1e-300)
@@ -93,25 +89,14 @@ class Freedom(eqx.Module):
         return np.asarray(1.0 / np.maximum(inverse, 1e-300))
 
 
-def prepare_degrees_of_freedom(
+def prepare_freedom(
     model: Model,
     linear: Linearisation,
     times: CorrelationTimes,
-    covariance: np.ndarray,
-    considered: np.ndarray,
+    covariance: Float[np.ndarray, "n n"],
+    considered: Float[np.ndarray, "n ways"],
 ) -> Freedom:
-    """Return the numbers from which the degrees of freedom of the variances of a fit are computed.
-
-    **Arguments:**
-
-    - `model`: the fitted model.
-    - `linear`: the errors at the best point, with their derivatives and weights.
-    - `times`: the correlation times of the errors. Correlated errors count as fewer independent
-      ones.
-    - `covariance`: (n, n) the covariance of the n free numbers, for white errors.
-    - `considered`: (n, c) the changes of the free numbers by one standard deviation of each error
-      that a sensor may have and that the fit does not estimate.
-    """
+    """Return the `Freedom` of a fit, where correlated errors count as fewer independent ones."""
     groups, left, blocks = np.asarray(model.noise_groups), [], linear.information_by_sensor
     if model.clusters is not None:
         # The variances of a fit of windows come only from the scatter between C stretches (runs of
@@ -119,7 +104,7 @@ def prepare_degrees_of_freedom(
         degrees = np.array([max(float(np.max(np.asarray(model.clusters))), 1.0)])
         none = np.zeros_like(groups)
         return Freedom(covariance, linear.places, none, blocks[:1], (degrees,), (), considered)
-    taken = counts_of_determined_numbers(linear, blocks, covariance)
+    taken = effective_parameters(linear, blocks, covariance)
     for sensor, mask, spans, lost in zip(
         model.records.sensors, linear.mask, times.spans, taken, strict=True
     ):
@@ -131,39 +116,27 @@ def prepare_degrees_of_freedom(
         if slot.estimated:
             mine, size = np.ravel(slot.own).astype(int), float(cast(Any, slot.spread)) ** 2
             shown = np.eye(mine.size) - covariance[np.ix_(mine, mine)] / size
-            widths.append((mine, size, max(float(np.sum(shown**2)), 1e-12)))
+            widths.append(_Width(mine, size, max(float(np.sum(shown**2)), 1e-12)))
     return Freedom(
         covariance, linear.places, groups, blocks, tuple(left), tuple(widths), considered
     )
 
 
-def counts_of_determined_numbers(
+def effective_parameters(
     linear: Linearisation, information: tuple[np.ndarray, ...], covariance: np.ndarray
-) -> list[np.ndarray]:
-    """Return, for each sensor, the number (R,) of free numbers that its readings determine in each
-    of R recordings.
+) -> list[Float[np.ndarray, " records"]]:
+    """Return for each sensor how many parameters its readings determine in each recording.
 
-    It is the sum of the leverages of the readings. A number that the readings determine together
-    with priors, other sensors or other recordings counts as a fraction.
-
-    **Arguments:**
-
-    - `linear`: the errors of the readings with their derivatives.
-    - `information`: for each sensor the information matrices (R, m, m) of its readings, for the m
-      numbers of each recording.
-    - `covariance`: (n, n) the covariance of all n free numbers.
+    This is the sum of the leverages of the readings: a parameter that they determine together with
+    priors, other sensors or other recordings counts as a fraction.
     """
     known = linear.covariance_by_recording(covariance)
     return [np.sum(block * known, axis=(1, 2)) for block in information]
 
 
-def two_sided_student_quantile(level: float, degrees_of_freedom: np.ndarray | float) -> np.ndarray:
-    """Return the half-width, in standard deviations, of an interval that holds the true value with
-    the probability `level`.
-
-    It is a quantile of Student's distribution with `degrees_of_freedom`, or of the normal
-    distribution if `degrees_of_freedom` is infinite. **Raises** `ValueError` for a `level` outside
-    (0, 1).
+def student_quantile(level: float, degrees_of_freedom: np.ndarray | float) -> np.ndarray:
+    """Return the half-width, in standard deviations, of a two-sided interval of the probability
+    `level`; `ValueError` for a level outside (0, 1).
     """
     level = _checks.fraction(level, "level", "a level between 0 and 1")
     from scipy.special import ndtri, stdtrit

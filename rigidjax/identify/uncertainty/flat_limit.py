@@ -3,6 +3,7 @@
 The principal moments of a flat body are I1 + I2 = I3.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -38,7 +39,7 @@ class Limit(eqx.Module):
     - `flatness`: the flatness at the best point of the fit.
     - `free`: the flatness at the minimum of the linearised model, or `flatness` if that is smaller.
       It is negative if the minimum lies beyond the limit of real bodies.
-    - `slope`: (n,) the derivative of the flatness with respect to the n free numbers.
+    - `slope`: (n,) the derivative of the flatness with respect to the n parameters.
     """
 
     where: str
@@ -47,53 +48,37 @@ class Limit(eqx.Module):
     slope: np.ndarray
 
     def flatness_deviation(self, covariance: np.ndarray) -> float:
-        """Return the standard deviation of the flatness `(I1 + I2 − I3) / I3` of this body, or NaN
-        if the variance of the flatness is negative.
-
-        The argument `covariance` (n, n) is the covariance of the n free numbers.
+        """Return the standard deviation of the flatness, NaN if its variance is negative, for a
+        `covariance` (n, n) of the parameters.
         """
         with np.errstate(invalid="ignore"):
             return float(np.sqrt(self.slope @ covariance @ self.slope))
 
     def flatness_upper_bound(self, covariance: np.ndarray) -> float:
-        """Return the one-sided 95 % upper bound of the flatness `(I1 + I2 − I3) / I3` of this body.
-
-        The bound is `z + √((1.645 σ)² + min(z, 0)²)`, where z is the field `free` (the flatness at
-        the minimum of the linearised model, or at the best point if it is smaller there), and σ is
-        the standard deviation of the flatness. The argument `covariance` (n, n) is the covariance
-        of the n free numbers.
+        """Return the one-sided 95 % upper bound of the flatness, `z + √((1.645 σ)² + min(z, 0)²)`,
+        where z is the field `free`, and σ the deviation for the `covariance` (n, n).
         """
         wide = self.flatness_deviation(covariance)
         return self.free + float(np.hypot(ONE_SIDED * wide, min(self.free, 0.0)))
 
     def is_flat_within(self, covariance: np.ndarray, deviations: float) -> bool:
-        """Return whether the data allow that this body is flat (I1 + I2 = I3).
-
-        They do if the field `free` (the flatness at the minimum of the linearised model, or at the
-        best point if it is smaller there) is less than `deviations` standard deviations of the
-        flatness. The argument `covariance` (n, n) is the covariance of the n free numbers.
+        """Return whether the field `free` is less than `deviations` standard deviations of the
+        flatness, for a `covariance` (n, n): the data then allow that this body is flat.
         """
         return bool(self.free < deviations * self.flatness_deviation(covariance))
 
 
-def interval_ends_at_flat_body(
+def cut_interval(
     half_width: np.ndarray | float, correlation: np.ndarray | float, flatness: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends (low, high) of an interval that stops at a flat body, in standard deviations.
+    """Return the ends (low, high) of the interval of a number y, cut at a flat body, as differences
+    from the best value in standard deviations of y.
 
-    The interval is for a number y that is correlated with the flatness z of a body. An end is the
-    difference from the best value of y, divided by the standard deviation of y.
-
-    The ends follow from a likelihood ratio. Both y and z are taken as normally distributed, and
+    The ends follow from a likelihood ratio. Both y and the flatness z are taken as normal, and
     m²(y, z) is their squared Mahalanobis distance from the minimum of the linearised model. Since a
-    real body has z ≥ 0, the distance for one number y is `m²(y) = min over z ≥ 0 of m²(y, z)`.
-
-    **Arguments:**
-
-    - `half_width`: the half-width of the interval without the limit z ≥ 0, in standard deviations.
-    - `correlation`: the correlation of y with z.
-    - `flatness`: the value of z at the minimum of the linearised model, divided by the standard
-      deviation of z.
+    real body has z ≥ 0, the distance for one number y is `m²(y) = min over z ≥ 0 of m²(y, z)`. The
+    `half_width` is that without the limit, `correlation` is that of y with z, and `flatness` is z
+    at the minimum, divided by its deviation.
     """
     rho = np.clip(np.asarray(correlation), -1.0, 1.0)
     past = min(flatness, 0.0)
@@ -108,16 +93,14 @@ def interval_ends_at_flat_body(
     return end(-1.0), end(1.0)
 
 
-def thicken_flat_bodies(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
-    """Return the free numbers x (n,) with each flat body made thicker; `None` if no body is flat.
+def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
+    """Return the parameters x with each flat body made thicker; `None` if no body is flat.
 
-    A flat body has the principal moments I1 + I2 = I3, or nearly so. The numbers x describe a
-    square root of the second moments of the body, so that the derivative of its thickness with
-    respect to x is zero at a flat body. Therefore derivatives are computed at a slightly thicker
-    body. The information on the inertia tensor itself is hardly different there. The `model` gives
-    the chart of each body, which is its parametrisation by free numbers.
+    The parameters describe a square root of the second moments of the body, so that the derivative
+    of its thickness with respect to x is zero at a flat body: derivatives are computed at a
+    slightly thicker one. The information on the inertia tensor itself is hardly different there.
     """
-    thick = list(map(_numbers_of_thicker_body, chart_list(model.chart), bodies_at(model, x)))
+    thick = list(map(_thicker, chart_list(model.chart), bodies_at(model, x)))
     if all(one is None for one in thick):
         return None
     pairs = zip(split_numbers(model.chart, x[: model.index.bodies]), thick, strict=True)
@@ -126,28 +109,14 @@ def thicken_flat_bodies(model: Model, x: Float[Array, " n"]) -> Float[Array, " n
 
 
 def bodies_at(model: Model, x: Float[Array, " n"]) -> list[Any]:
-    """Return the bodies of a `model` at its free numbers x (n,), in the order of the model's
-    charts.
-
-    A chart is the parametrisation of one body by free numbers.
-    """
-    return body_list(model.unpack(x).body)
+    """Return the bodies of a `model` in the order of its charts."""
+    return bodies_as_list(model.unpack(x).body)
 
 
-def _numbers_of_thicker_body(
-    chart: AbstractBodyChart, body: Inertia | MassProperties
-) -> Array | None:
-    """Return the free numbers of a slightly thicker body, or `None` for a body that is not flat.
+def _thicker(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
+    """Return the parameters of a slightly thicker body, or `None` if `body` is not flat.
 
-    A flat body has the principal moments I1 + I2 = I3, or nearly so. The result is also `None` for
-    a `body` with NaN, for a `chart` that leaves the moments fixed, and for a chart that a user
-    wrote, since it is not known how such a chart describes flat bodies.
-
-    **Arguments:**
-
-    - `chart`: the chart, a map from free numbers to a possible body. The free numbers are those of
-      this chart.
-    - `body`: the body that may be flat.
+    The result is `None` as well for NaN, and for a `chart` without a limit at flat bodies.
     """
     # Use NumPy: single operations of JAX are slow outside of a compiled program.
     if isinstance(body, MassProperties):
@@ -155,7 +124,7 @@ def _numbers_of_thicker_body(
     else:
         tensor = np.asarray(body.tensor)
         second = 0.5 * np.trace(tensor) * np.eye(3) - tensor
-    if not _is_bounded_by_flat_bodies(chart) or not np.isfinite(second).all():
+    if not _has_limit(chart) or not np.isfinite(second).all():
         return None
     values, axes = np.linalg.eigh(second)
     least = THIN * values.sum()
@@ -167,12 +136,9 @@ def _numbers_of_thicker_body(
     return chart.vector(Inertia(to_inertia(second)))
 
 
-def _is_bounded_by_flat_bodies(chart: AbstractBodyChart) -> bool:
-    """Return whether flat bodies are the limit of the bodies that a `chart` can describe.
-
-    A chart is a map from free numbers to a possible body. A flat body has the principal moments
-    `I1 + I2 = I3`. The result is true if the chart is one of rigidjax, not of a user, and
-    changes moments of inertia, not the mass alone.
+def _has_limit(chart: AbstractBodyChart) -> bool:
+    """Return whether flat bodies are the limit of the bodies that a `chart` can describe: one of
+    rigidjax, not of a user, that changes moments of inertia.
     """
     return type(chart).__module__ == AbstractBodyChart.__module__ and any(
         name != "mass" for name in chart.log_names
@@ -180,15 +146,13 @@ def _is_bounded_by_flat_bodies(chart: AbstractBodyChart) -> bool:
 
 
 def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
-    """Return the flatness (I1 + I2 − I3) / I3 of each body of a `model` at the free numbers x (n,).
-
-    Here I1 ≤ I2 ≤ I3 are the principal moments of the body. A flat body has the flatness 0. For a
-    body whose moments are not free the result is 1.
+    """Return the flatness (I1 + I2 − I3) / I3 of each body at the parameters x; 1 for a body whose
+    moments are known.
     """
     out = []
     bodies = body_list(model.bodies(x))
     for chart, body in zip(chart_list(model.chart), bodies, strict=True):
-        if not _is_bounded_by_flat_bodies(chart):
+        if not _has_limit(chart):
             out.append(jnp.ones((), x.dtype))
             continue
         # `chart.logs` returns the logarithms of the positive numbers that a fit reports. The last
@@ -202,41 +166,28 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
     return jnp.stack(out)
 
 
-def distances_from_flat_bodies(
+def limits(
     model: Model,
-    values_and_slopes: tuple[np.ndarray, np.ndarray],
-    step_to_minimum: np.ndarray,
+    quantities: tuple[np.ndarray, np.ndarray],
+    step_to_minimum: Float[np.ndarray, " n"],
     body_suffixes: list[str],
 ) -> tuple[Limit, ...]:
     """Return how far each body with free moments is from a flat body.
 
-    A flat body has the principal moments I1 + I2 = I3.
-
-    **Arguments:**
-
-    - `model`: the fitted model.
-    - `values_and_slopes`: two arrays, as `quantities_and_derivatives_in_numpy` returns them: the
-      reported numbers, with the flatness of each body at the end; and their derivatives with
-      respect to the n free numbers.
-    - `step_to_minimum`: (n,) the step of the free numbers from the best point to the minimum of the
-      linearised model.
-    - `body_suffixes`: for each body the suffix of the names of its quantities.
+    The rows of `quantities`, as `quantities_on_host` returns them, end with the flatness of each
+    body; `step_to_minimum` leads from the best point to the minimum of the linearised model.
     """
-    rows = zip(
-        body_suffixes, *(part[-len(body_suffixes) :] for part in values_and_slopes), strict=True
-    )
-    have_limits = [_is_bounded_by_flat_bodies(chart) for chart in chart_list(model.chart)]
+    last = (part[-len(body_suffixes) :] for part in quantities)
+    rows = zip(chart_list(model.chart), body_suffixes, *last, strict=True)
     return tuple(
         Limit(name, float(value), float(value + min(slope @ step_to_minimum, 0.0)), slope)
-        for (name, value, slope), has_limit in zip(rows, have_limits, strict=True)
-        if has_limit
+        for chart, name, value, slope in rows
+        if _has_limit(chart)
     )
 
 
 def why_unreal(body: PyTree) -> str | None:
-    """Return in words why the numbers of `body`, an `Inertia` or a `MassProperties`, are physically
-    impossible; `None` if they are possible.
-    """
+    """Return in words why no real body has the numbers of an `Inertia` or a `MassProperties`."""
     try:
         if isinstance(body, MassProperties):
             MassProperties(body.mass, body.com, body.second_moment)
@@ -247,14 +198,12 @@ def why_unreal(body: PyTree) -> str | None:
     return None
 
 
-def describe_unreal_bodies(
-    charts: list[tuple[str, AbstractBodyChart]], bodies: list[Any]
+def describe_unreal(
+    charts: Sequence[tuple[str, AbstractBodyChart]], bodies: list[Any]
 ) -> list[str]:
     """Return one line of text for each body that is physically impossible, with the reason.
 
-    Only bodies of charts that a user wrote are checked, since all points of the charts of rigidjax
-    are possible bodies. **Arguments:** `charts` the name and the chart of each body;
-    `bodies` the bodies in the same order.
+    Only bodies of charts that a user wrote are checked: those of rigidjax are always possible.
     """
     ours = AbstractBodyChart.__module__
     theirs = [

@@ -1,7 +1,7 @@
 """Compute the values, standard deviations and intervals of the quantities that a fit reports."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from rigidjax.identify.model.charts import AbstractBodyChart, Bodies, Ratios, bo
 from rigidjax.identify.model.model import Model, shortened, values_of
 from rigidjax.identify.model.terms import value_and_jacfwd
 from rigidjax.identify.uncertainty import flat_limit
-from rigidjax.identify.uncertainty.degrees_of_freedom import two_sided_student_quantile
+from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 
 # If one end of the interval of a positive number differs from the value of the number by more than
 # this factor, the interval goes from 0 to the largest possible value (often infinity).
@@ -31,9 +31,9 @@ class Quantity(eqx.Module):
     - `positive`: whether the number is always positive. If it is, the errors of its logarithm are
       taken as normal: `deviation` is the value times the standard deviation of the logarithm, and
       an interval reaches farther up than down.
-    - `cuts`: for each body two things: the correlation of the number with the flatness of the body,
-      which is (I1 + I2 − I3) / I3; and the flatness divided by its standard deviation. Intervals
-      end where a body would be flat.
+    - `cuts`: for each body the correlation of the number with the flatness of the body, which is
+      (I1 + I2 − I3) / I3, and the flatness divided by its standard deviation. Intervals end where a
+      body would be flat.
     - `most`: the largest value of the number that a real body can have.
     - `freedom`: the degrees of freedom of the variance of the number; infinite if all noise is
       given.
@@ -64,9 +64,9 @@ class Quantity(eqx.Module):
         **Arguments:** `level` the probability that the interval holds the true value. **Raises**
         `ValueError` for a level outside (0, 1).
         """
-        reach = float(two_sided_student_quantile(level, self.freedom))
-        wide = deviation_of_value_or_logarithm(self)
-        low, high = (float(side) * wide for side in interval_cut_at_flat_bodies(reach, self.cuts))
+        reach = float(student_quantile(level, self.freedom))
+        wide = log_deviation(self)
+        low, high = (float(side) * wide for side in interval_ends(reach, self.cuts))
         if not self.positive:
             return self.value + low, self.value + high
         if max(-low, high) > np.log(FARTHEST):
@@ -74,33 +74,23 @@ class Quantity(eqx.Module):
         return float(self.value * np.exp(low)), min(float(self.value * np.exp(high)), self.most)
 
 
-def deviation_of_value_or_logarithm(quantity: Quantity) -> float:
-    """Return the standard deviation of a reported `quantity`, or the standard deviation of its
-    logarithm if the quantity is always positive.
-    """
+def log_deviation(quantity: Quantity) -> float:
+    """Return the standard deviation of the logarithm of a positive quantity, else of its value."""
     if not quantity.positive:
         return quantity.deviation
     return quantity.deviation / quantity.value if quantity.value else np.inf
 
 
-def interval_cut_at_flat_bodies(
+def interval_ends(
     half_width: np.ndarray | float, cuts: Sequence[tuple[np.ndarray | float, float]]
 ) -> tuple[np.ndarray | float, np.ndarray | float]:
-    """Return the ends (low, high) of the interval of a quantity, cut where a body would be flat.
-
-    The ends are differences from the best value, in standard deviations of the quantity. A body is
-    flat if its principal moments are I1 + I2 = I3.
-
-    **Arguments:**
-
-    - `half_width`: the half-width of the interval if it is not cut, in standard deviations.
-    - `cuts`: for each body two numbers: the correlation of the quantity with the flatness of the
-      body, which is `(I1 + I2 − I3) / I3`; and the flatness divided by its standard deviation.
+    """Return the ends (low, high) of an interval as differences from the best value, in standard
+    deviations; `half_width` is that without the `cuts` of `Quantity`.
     """
     low: Any = -half_width
     high: Any = half_width
     for correlation, away in cuts:
-        least, most = flat_limit.interval_ends_at_flat_body(half_width, correlation, away)
+        least, most = flat_limit.cut_interval(half_width, correlation, away)
         low, high = np.maximum(low, least), np.minimum(high, most)
     return low, high
 
@@ -109,55 +99,56 @@ def interval_cut_at_flat_bodies(
 _UNITS = {"mass": "kg", "com x": "m", "com y": "m", "com z": "m"}
 
 
-def names_units_and_signs(model: Model) -> list[tuple[str, str, bool]]:
-    """Return three things for each quantity that a fit of the `model` reports: its name; its unit;
-    and whether it is always positive.
+class Label(NamedTuple):
+    name: str
+    unit: str
+    positive: bool  # whether the quantity is always positive
 
-    The quantities are in the order of `quantity_vector`.
-    """
+
+def labels(model: Model) -> list[Label]:
+    """Return what each reported quantity is called, in the order of `quantity_vector`."""
     out = []
-    for name, chart in name_suffixes_and_charts(model):
+    for name, chart in named_charts(model):
         for names, positive in ((chart.log_names, True), (chart.plain_names, False)):
-            out += [(f"{n}{name}", _UNITS.get(n, chart.unit), positive) for n in names]
+            out += [Label(f"{n}{name}", _UNITS.get(n, chart.unit), positive) for n in names]
     names = recording_suffixes(model)
-    for where in names if reports_initial_states(model) else ():
-        out += [(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]
+    for where in names if reports_starts(model) else ():
+        out += [Label(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]
     for slot in model.slots:
-        shape = slot.shape
-        parts = [""] if not shape else [f" {_component_name(i)}" for i in np.ndindex(shape)]
+        parts = [""]
+        if slot.shape:
+            axes = dict(enumerate("xyz")) if len(slot.shape) == 1 else {}
+            parts = [f" {axes.get(i[0], i)}" for i in np.ndindex(slot.shape)]
         ends = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
         ends = ends if slot.spread is None else [*ends, *(f", own{where}" for where in names)]
         called = [f"{slot.name}{part}{end}" for end in ends for part in parts]
-        out += [(name, slot.unit, slot.positive) for name in called]
+        out += [Label(name, slot.unit, slot.positive) for name in called]
     return out
 
 
-def reports_initial_states(model: Model) -> bool:
-    """Return whether a fit of the `model` reports the initial states of its recordings.
-
-    The initial states are not reported for a model of windows (short parts of a record), which has
-    too many of them.
-    """
+def reports_starts(model: Model) -> bool:
+    """Return whether a fit reports initial states, of which windows have too many."""
     return model.clusters is None
 
 
-def name_suffixes_and_charts(model: Model) -> list[tuple[str, AbstractBodyChart]]:
-    """Return two things for each body of a `model`: the suffix of the names of its quantities; and
-    its chart.
+class NamedChart(NamedTuple):
+    suffix: str  # of the names of the body's quantities; empty for a single body
+    chart: AbstractBodyChart
 
-    A chart is the parametrisation of a body by free numbers. The suffix is empty for a single body;
-    otherwise it is the name of the body in brackets.
-    """
+
+def named_charts(model: Model) -> list[NamedChart]:
+    """Return the chart of each body of a `model`."""
     if not isinstance(model.chart, Bodies):
-        return [("", model.chart)]
-    return [(f" [{n}]", c) for n, c in zip(model.chart.names, model.chart.charts, strict=True)]
+        return [NamedChart("", model.chart)]
+    named = zip(model.chart.names, model.chart.charts, strict=True)
+    return [NamedChart(f" [{name}]", chart) for name, chart in named]
 
 
 def recording_suffixes(model: Model) -> list[str]:
     """Return for each recording the suffix of the names of its quantities.
 
-    The suffix is empty for a single recording. Otherwise it has, in brackets, the name of the body,
-    if it has one, and the number of the recording among the recordings of this body.
+    It has, in brackets, the name of the body, if it has one, and the number of the recording among
+    those of this body; it is empty for a single recording.
     """
     if model.count == 1:
         return [""]
@@ -168,22 +159,14 @@ def recording_suffixes(model: Model) -> list[str]:
     return out
 
 
-def _component_name(index: tuple[int, ...]) -> str:
-    """Return the name of one component of an array: x, y or z for a vector, else its `index`."""
-    return "xyz"[index[0]] if len(index) == 1 and index[0] < 3 else str(index)
-
-
 def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
-    """Return the quantities (q,) that a fit reports, at the free numbers x (n,) of a `model`.
-
-    They are, in the order of `names_units_and_signs`, the moments and other numbers of each body,
-    the initial body rates (rad/s), and the values of each `Free` (a number of a torque or sensor
-    that the fit may move). A positive quantity is given by its logarithm.
+    """Return the quantities that a fit reports, in the order of `labels`: numbers of each body,
+    initial body rates (rad/s), and the values of each `Free`; positive ones as logarithms.
     """
-    parts, bodies = [jnp.zeros(0, x.dtype)], body_list(model.bodies(x))
-    for (_, chart), body in zip(name_suffixes_and_charts(model), bodies, strict=True):
+    parts, bodies = [jnp.zeros(0, x.dtype)], bodies_as_list(model.bodies(x))
+    for (_, chart), body in zip(named_charts(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
-    if reports_initial_states(model):
+    if reports_starts(model):
         rates = x[model.index.start[:, -3:]] * model.reference.rate[:, None]
         parts.append(rates.reshape(-1))
     values = values_of(model, x)
@@ -194,77 +177,60 @@ def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
     return jnp.concatenate([part.astype(x.dtype) for part in parts])
 
 
-def quantities_and_derivatives(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Return the reported quantities (q,) of a `model` at the free numbers x (n,), and their
-    derivatives (q, n).
+class Linear(NamedTuple):
+    """Hold reported quantities, positive ones as logarithms, and their derivatives.
 
-    Both arrays have further entries at the end for the flatness (I1 + I2 − I3) / I3 of each body. A
-    positive quantity is given by its logarithm.
+    The last entries are the flatness (I1 + I2 − I3) / I3 of each body.
     """
-    return _compiled_quantities_and_derivatives(shortened(model), x)
+
+    values: Any  # (q,)
+    slopes: Any  # (q, n)
+
+
+def quantities_at(model: Model, x: Float[Array, " n"]) -> Linear:
+    """Return the reported quantities of a `model` at the parameters x."""
+    return _quantities_at(with_first_times_only(model), x)
 
 
 @eqx.filter_jit
-def _compiled_quantities_and_derivatives(
-    model: Model, x: Float[Array, " n"]
-) -> tuple[Array, Array]:
-    """Return the reported quantities (q,) of a `model` at the free numbers x (n,), and their
-    derivatives (q, n).
-
-    Both arrays, computed in one compiled program, have further entries at the end for the flatness
-    (I1 + I2 − I3) / I3 of each body. A positive quantity is given by its logarithm.
-    """
-
+def _quantities_at(model: Model, x: Float[Array, " n"]) -> Linear:
     def value(x: Array) -> Array:
         return jnp.concatenate([quantity_vector(model, x), flat_limit.flatness(model, x)])
 
-    values, slope = value_and_jacfwd(value, x)
-    return values, slope
+    slope, values = jacobian_and_value(value, x)
+    return Linear(values, slope)
 
 
-def quantities_and_derivatives_in_numpy(
+def quantities_on_host(
     model: Model, x: Float[Array, " n"], derivative_point: Float[Array, " n"] | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the reported quantities (q,) of a `model` at the free numbers x (n,), and their
-    derivatives (q, n), in NumPy.
-
-    Both arrays have further entries at the end for the flatness (I1 + I2 − I3) / I3 of each body.
-    The derivatives are computed at x or, if a body is flat at x, at `derivative_point` (n,), the
-    free numbers with a thicker body.
+) -> Linear:
+    """Return the reported quantities at the parameters x in NumPy, with the derivatives at a
+    thicker body, the `derivative_point`, if a body is flat at x.
     """
-    values, slopes = (np.asarray(part) for part in quantities_and_derivatives(model, x))
+    values, slopes = map(np.asarray, quantities_at(model, x))
     if derivative_point is not None:
-        slopes = np.asarray(quantities_and_derivatives(model, derivative_point)[1])
-    return values, slopes
+        slopes = np.asarray(quantities_at(model, derivative_point).slopes)
+    return Linear(values, slopes)
 
 
 def reported_quantities(
     model: Model,
-    values_and_slopes: tuple[np.ndarray, np.ndarray],
+    quantities: tuple[np.ndarray, np.ndarray],
     covariance: np.ndarray,
     null_directions: np.ndarray,
     limits: tuple[flat_limit.Limit, ...] = (),
     degrees_of_freedom: np.ndarray | float = np.inf,
 ) -> tuple[Quantity, ...]:
-    """Return every reported quantity with its standard deviation.
+    """Return every reported quantity of `quantities_on_host` with its standard deviation.
 
-    **Arguments:**
-
-    - `model`: the model.
-    - `values_and_slopes`: the two arrays that `quantities_and_derivatives_in_numpy` returns: the
-      values; and their derivatives.
-    - `covariance`: (n, n) the covariance of the free numbers within the directions that the data
-      determine.
-    - `null_directions`: (k, n) the directions of the free numbers that the data do not determine.
-    - `limits`: for each body with free moments its distance from a flat body; intervals end where
-      the body would be flat.
-    - `degrees_of_freedom`: the degrees of freedom of the variance of each quantity.
+    The `covariance` (n, n) is that within the directions that the data determine, and
+    `null_directions` (k, n) are the others. Intervals end at the `limits`.
     """
-    names = names_units_and_signs(model)
-    values, slope = (part[: len(names)] for part in values_and_slopes)
+    names = labels(model)
+    values, slope = (part[: len(names)] for part in quantities)
     deviations = standard_deviations(slope, covariance, null_directions)
-    cuts = correlations_with_flatness(slope, covariance, deviations, limits)
-    freedom = np.broadcast_to(degrees_of_freedom, values_and_slopes[0].shape)
+    cuts = flatness_cuts(slope, covariance, deviations, limits)
+    freedom = np.broadcast_to(degrees_of_freedom, quantities[0].shape)
     # A quantity that does not depend on any free number, such as a known quantity, gets no
     # deviation (NaN).
     deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
@@ -290,47 +256,24 @@ def interval_about(
     half_width: np.ndarray | float,
     limits: tuple[flat_limit.Limit, ...] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the low and the high end of the interval of functions of the n free numbers of a fit.
+    """Return the low and the high end of the interval of functions of the parameters.
 
-    **Arguments:**
-
-    - `value`: (…) the best values of the functions.
-    - `slope`: (…, n) the derivatives of the functions with respect to the free numbers.
-    - `covariance`: (n, n) the covariance of the free numbers within the directions that the data
-      determine.
-    - `null_directions`: (k, n) the directions that the data do not determine.
-    - `half_width`: the half-width of the interval, in standard deviations, if no flat body cuts it.
-    - `limits`: for each body with free moments its distance from a flat body; intervals end where
-      the body would be flat.
+    They have the best values `value` (…) and the derivatives `slope` (…, n). The `half_width` is in
+    standard deviations, and without the `limits`, where a body would be flat.
     """
     wide = standard_deviations(slope, covariance, null_directions)
-    low, high = interval_cut_at_flat_bodies(
-        half_width, correlations_with_flatness(slope, covariance, wide, limits)
-    )
+    low, high = interval_ends(half_width, flatness_cuts(slope, covariance, wide, limits))
     return np.asarray(value + low * wide), np.asarray(value + high * wide)
 
 
-def correlations_with_flatness(
+def flatness_cuts(
     slope: np.ndarray,
     covariance: np.ndarray,
     deviations: np.ndarray,
     limits: tuple[flat_limit.Limit, ...],
 ) -> list[tuple[np.ndarray, float]]:
-    """Return the correlations of functions of the free numbers with the flatness of each body.
-
-    The flatness (I1 + I2 − I3) / I3 of a body cannot be negative. This cuts the intervals of
-    functions that are correlated with it.
-
-    **Arguments:**
-
-    - `slope`: (…, n) the derivatives of the functions with respect to the n free numbers.
-    - `covariance`: (n, n) the covariance of the free numbers.
-    - `deviations`: (…) the standard deviations of the functions.
-    - `limits`: the distance of each body from a flat body.
-
-    **Returns** two things for each body whose flatness has a finite standard deviation: the
-    correlations (…) of the functions with the flatness; and the flatness divided by its standard
-    deviation.
+    """Return the `cuts` of `Quantity` for functions with the derivatives `slope` (…, n), for each
+    body whose flatness has a finite standard deviation.
     """
     out = []
     for limit in limits:
@@ -348,19 +291,11 @@ def correlations_with_flatness(
 def standard_deviations(
     slope: np.ndarray, covariance: np.ndarray, null_directions: np.ndarray
 ) -> np.ndarray:
-    """Return the standard deviations (…) of functions of the n free numbers of a fit.
+    """Return the standard deviations (…) of functions with the derivatives `slope` (…, n).
 
-    **Arguments:**
-
-    - `slope`: (…, n) the derivatives of the functions with respect to the free numbers.
-    - `covariance`: (n, n) the covariance of the free numbers within the directions that the data
-      determine.
-    - `null_directions`: (k, n) the directions that the data do not determine.
-
-    A standard deviation is infinite if the function changes along a null direction. It is NaN if
-    the variance is negative or no larger than round-off. It is NaN as well if the function depends
-    on a free number whose correlation with another free number is larger than one in magnitude. All
-    intervals use these standard deviations.
+    A standard deviation is infinite if the function changes along a null direction (k, n). It is
+    NaN if the variance is negative or no larger than round-off, or if the function depends on a
+    parameter whose correlation with another one is larger than one in magnitude.
     """
     if not np.isfinite(covariance).all():
         return np.full(slope.shape[:-1], np.nan)
@@ -378,23 +313,13 @@ def standard_deviations(
         alike.setdefault((row != 0).tobytes(), []).append(index)
     for key, mine in alike.items():
         used = np.frombuffer(key, bool)
-        deviations = _deviations_by_eigenvalues(rows[mine][:, used], scaled[np.ix_(used, used)])
+        values, axes = np.linalg.eigh(scaled[np.ix_(used, used)])
+        along = rows[mine][:, used] @ axes
+        length = np.linalg.norm(along, axis=-1)
+        least = 10 * values.size * np.finfo(float).eps * np.abs(values).max(initial=0.0)
+        unreal = np.linalg.norm(along[..., values < -least], axis=-1) > 1e-6 * length
+        variance = along**2 @ np.maximum(values, 0.0)
+        lost = (length > 0) & (unreal | (variance <= least * length**2))
+        deviations = np.where(lost, np.nan, np.sqrt(variance))
         out[mine] = np.nan if beyond[used].any() else deviations
     return np.where(undetermined, np.inf, out.reshape(slope.shape[:-1]))
-
-
-def _deviations_by_eigenvalues(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (m,) of m linear functions of n numbers with the `covariance`
-    (n, n).
-
-    The argument `slope` (m, n) holds the derivatives of the functions. A deviation is NaN if its
-    variance is negative or no larger than round-off.
-    """
-    values, axes = np.linalg.eigh(covariance)
-    along = slope @ axes
-    length = np.linalg.norm(along, axis=-1)
-    least = 10 * values.size * np.finfo(float).eps * np.abs(values).max(initial=0.0)
-    unreal = np.linalg.norm(along[..., values < -least], axis=-1) > 1e-6 * length
-    variance = along**2 @ np.maximum(values, 0.0)
-    lost = (length > 0) & (unreal | (variance <= least * length**2))
-    return np.where(lost, np.nan, np.sqrt(variance))

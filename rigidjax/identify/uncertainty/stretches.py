@@ -20,7 +20,7 @@ from rigidjax.identify.uncertainty.covariance import (
     covariance_root,
     with_infinite_variance,
 )
-from rigidjax.identify.uncertainty.quantities import names_units_and_signs
+from rigidjax.identify.uncertainty.quantities import Linear, labels
 
 # A quantity depends on one stretch of windows if this stretch causes more than the fraction HANGS
 # of the variance of the quantity. This is not tested if there are fewer than FEWEST stretches.
@@ -28,27 +28,19 @@ HANGS, FEWEST = 0.85, 6
 
 
 class Stretches(eqx.Module):
-    """Hold the changes of a fit if one of its C stretches of windows is left out.
+    """Hold the changes of a fit if one of its stretches (runs of neighbouring windows) is left out.
 
-    A window is a short part of a record, and a stretch is a run of neighbouring windows. A shared
-    number is a free number on which several windows depend.
-
-    **Fields:**
-
-    - `steps`: (C, s) the changes of the s shared numbers, in row c if stretch c is left out.
-    - `places`: (s,) the indices of the shared numbers among all n free numbers.
-    - `null`: for each stretch the directions (k, n) of the shared numbers that all other stretches
-      and the priors together do not determine.
+    A shared parameter is one on which several windows depend; there are s.
     """
 
     steps: Float[np.ndarray, "stretches s"]
-    places: Int[np.ndarray, " s"]
+    places: Int[np.ndarray, " s"]  # of the shared parameters among all n
+    # For each stretch the directions that all others and the priors together do not determine.
     null: tuple[Float[np.ndarray, "_ n"], ...]
 
     @property
-    def directions_shown_by_one_stretch(self) -> Float[np.ndarray, "k n"]:
-        """Return the directions (k, n) of the n free numbers that only one stretch (a run of
-        neighbouring windows) determines.
+    def hidden_directions(self) -> Float[np.ndarray, "k n"]:
+        """Return the directions that only one stretch determines.
 
         The variance along these directions is not known: a fit of windows takes variances from the
         scatter between stretches, and one stretch alone has no scatter.
@@ -56,15 +48,11 @@ class Stretches(eqx.Module):
         return np.concatenate(self.null)
 
 
-def leave_out_each_stretch(model: Model, linear: Linearisation) -> Stretches | None:
-    """Return, for each stretch of windows, the changes of a fit if this stretch is left out.
+def leave_one_out(model: Model, linear: Linearisation) -> Stretches | None:
+    """Return the changes of a fit if a stretch of windows is left out, for each stretch.
 
-    A stretch is a run of neighbouring windows. The result is `None` if the model is not one of
-    windows, or if the motion is not finite. The numbers on which one window alone depends are
-    eliminated window by window (Schur complement).
-
-    **Arguments:** `model` the fitted model; `linear` the errors at the best point, with their
-    derivatives and weights.
+    The result is `None` without windows, or if the motion is not finite. The parameters of one
+    window alone are eliminated window by window (Schur complement).
     """
     if model.clusters is None:
         return None
@@ -88,8 +76,8 @@ def leave_out_each_stretch(model: Model, linear: Linearisation) -> Stretches | N
         both = np.linalg.solve(inner, np.concatenate([sides, pull[..., None]], axis=2))
         gram = gram - sides.swapaxes(1, 2) @ both[..., :-1]
         slope = slope - np.einsum("rks,rk->rs", sides, both[..., -1])
-    # A free number may have one value for each group of windows. One column of the derivatives then
-    # stands for another number in each group of windows: the indices in `linear.places` tell which.
+    # A parameter may have one value for each group of windows. One column of the derivatives then
+    # stands for another parameter in each group: the indices in `linear.places` tell which.
     places, columns = np.unique(linear.places[:, shared], return_inverse=True)
     columns = columns.reshape(len(gram), shared.size)
     grams, slopes = np.zeros((count, places.size, places.size)), np.zeros((count, places.size))
@@ -111,15 +99,11 @@ def leave_out_each_stretch(model: Model, linear: Linearisation) -> Stretches | N
     return Stretches(steps, places, tuple(null))
 
 
-def jackknife_covariance(stretches: Stretches, white: Covariance) -> Covariance:
-    """Return the covariance of a fit of windows, computed from the changes of the fit if one
-    stretch of windows is left out.
+def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
+    """Return the jackknife's covariance of a fit of windows.
 
-    The jackknife gives the covariance of the numbers that windows share. Numbers on which one
-    window alone depends, such as its initial state, keep their covariance for white errors.
-
-    **Arguments:** `stretches` for each stretch (a run of neighbouring windows) the changes of the
-    shared numbers if this stretch is left out; `white` the covariance for white errors.
+    Parameters on which one window alone depends, such as its initial state, keep their covariance
+    for `white` errors.
     """
     count, places = len(stretches.steps), stretches.places
     covariance = np.array(white.determined)
@@ -128,38 +112,25 @@ def jackknife_covariance(stretches: Stretches, white: Covariance) -> Covariance:
     covariance[places], covariance[:, places] = 0.0, 0.0
     square = (count - 1) / count * stretches.steps.T @ stretches.steps
     covariance[np.ix_(places, places)] = square
-    null = np.concatenate([white.null_directions, stretches.directions_shown_by_one_stretch])
+    null = np.concatenate([white.null_directions, stretches.hidden_directions])
     shown = with_infinite_variance(null, covariance)
     kind = f"jackknife: one of {count} stretches of windows left out"
     return dataclasses.replace(white, covariance=shown, determined=covariance, kind=kind)
 
 
-def remarks_on_dependence_on_one_stretch(
-    stretches: Stretches,
-    model: Model,
-    values_and_slopes: tuple[np.ndarray, np.ndarray],
-    white: Covariance,
+def stretch_remarks(
+    stretches: Stretches, model: Model, quantities: Linear, white: Covariance
 ) -> list[str]:
-    """Return a remark on each reported quantity whose value or standard deviation depends on a
-    single stretch (a run of neighbouring windows).
-
-    **Arguments:**
-
-    - `stretches`: for each stretch the changes of a fit if this stretch is left out.
-    - `model`: the fitted model.
-    - `values_and_slopes`: the reported quantities and their derivatives, as
-      `quantities.quantities_and_derivatives_in_numpy` returns them.
-    - `white`: the covariance for white errors.
-    """
-    count, names = len(stretches.steps), names_units_and_signs(model)
+    """Return a remark on each quantity whose value or deviation depends on a single stretch."""
+    count, names = len(stretches.steps), labels(model)
     if count == 1:
         return ["deviations come from the differences between windows, and there is one"]
-    values, slopes = (part[: len(names)] for part in values_and_slopes)
+    values, slopes = (part[: len(names)] for part in quantities)
     steps = stretches.steps @ slopes[:, stretches.places].T
     squares = steps**2
     hanging = squares.max(axis=0) > HANGS * np.maximum(squares.sum(axis=0), 1e-300)
-    unseen = _quantities_change_along(white.null_directions, slopes)
-    alone = np.stack([_quantities_change_along(null, slopes) & ~unseen for null in stretches.null])
+    unseen = _change_along(white.null_directions, slopes)
+    alone = np.stack([_change_along(null, slopes) & ~unseen for null in stretches.null])
     edges = -(-np.arange(count + 1) * model.count // count)
     out = []
     for index, (name, _, positive) in enumerate(names):
@@ -175,14 +146,9 @@ def remarks_on_dependence_on_one_stretch(
     return out
 
 
-def _quantities_change_along(
+def _change_along(
     directions: Float[np.ndarray, "k n"], slopes: Float[np.ndarray, "q n"]
 ) -> Bool[np.ndarray, " q"]:
-    """Return a mask (q,), true for each of q quantities that changes along one or more of the
-    `directions` (k, n).
-
-    A direction is a change of the n free numbers of a fit. The argument `slopes` (q, n) holds the
-    derivatives of the quantities with respect to these numbers.
-    """
+    """Return which quantities with the derivatives `slopes` change along any of the directions."""
     size = np.abs(slopes).max(axis=-1, initial=1e-300)
     return np.abs(slopes @ directions.T).max(axis=-1, initial=0.0) > 1e-6 * size
