@@ -338,8 +338,8 @@ def test_a_record_of_another_length_is_the_same_program(caplog):
     # `simulate` is another one, with what it does beside.
     programs = set(re.findall(r"Compiling jit\((\w+)\)", caplog.text))
     named = {
-        "marquardt",
-        "_errors_without_derivatives",
+        "least_squares_from",
+        "_only_errors",
         "_linearised",
         "_quantities_at",
     }

@@ -8,13 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.uncertainty.considered import (
-    Consideration,
-    describe,
-    sensor_slots,
-)
+from rigidjax.identify.model.terms import Noise
+from rigidjax.identify.uncertainty import considered
+from rigidjax.identify.uncertainty.considered import Consideration, sensor_slots
+from rigidjax.identify.uncertainty.covariance import Linearisation
 from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
-from rigidjax.identify.uncertainty.quantities import Quantity
+from rigidjax.identify.uncertainty.quantities import Quantity, named_charts
 
 # One sentence names at most this number of quantities.
 MOST = 3
@@ -29,57 +28,56 @@ _WAYS = {
     "cross_axis": "an axis that leans by 1°",
 }
 
-UsualShifts = Sequence[tuple[int, dict[str, Float[np.ndarray, " quantities"]]]]
 
-
-def describe_allowed_sensor_errors(
+def describe_allowed(
     model: Model,
+    linear: Linearisation,
+    noise: Noise,
+    covariance: Float[np.ndarray, "n n"],
     considered_errors: tuple[Consideration, ...],
-    usual_shifts: UsualShifts,
     quantities: Sequence[Quantity],
+    slopes: Float[np.ndarray, "_ n"],
 ) -> str:
-    """Return sentences on the sensor errors that the intervals of a fit allow for, and on the
-    sensor errors that the intervals do not allow for.
+    """Return sentences on the constant sensor errors that the intervals of a fit allow for.
 
-    **Arguments:**
-
-    - `model`: the fitted model.
-    - `considered_errors`: the errors that the intervals allow for. They are the errors of the
-      sensors with a `Tolerance`.
-    - `usual_shifts`: for each sensor without a tolerance two things: the index of the sensor; and a
-      dict of kind of error → shifts (q,), where a shift is the change of one of the q `quantities`
-      that the error would cause. The kinds are "scale" (an error of 1 %) and "cross_axis" (an error
-      of 1° between axes). The function `considered.usual_shifts` computes these
-      shifts.
-    - `quantities`: the q reported quantities that the sentences name.
+    For a sensor without a `Tolerance` they say how far a small error would move moments of bodies
+    or, without these, the values of `Free`s. The `covariance` is that for white errors; `slopes`
+    are the derivatives of the quantities, perhaps with more rows at the end.
     """
-    out = []
+    bodies = {log + name for name, chart in named_charts(model) for log in chart.log_names}
+    free, out, shifts = {slot.name for slot in model.slots}, [], []
+    rows = [i for i, one in enumerate(quantities) if one.name in bodies and one.name != "mass"]
+    rows = rows or [i for i, one in enumerate(quantities) if one.name.split(" ")[0] in free]
+    rows = [i for i in rows if np.isfinite(quantities[i].deviation)]
+    if rows and np.isfinite(linear.weighted_jacobian).all() and np.isfinite(covariance).all():
+        shifts = considered.usual_shifts(model, linear, noise, covariance, slopes[rows])
     sensors = model.records.sensors
     if considered_errors:
-        out.append(f"They allow for {describe(considered_errors, sensors)}.")
-    for index, by_kind in usual_shifts:
-        clauses = [
-            f"{_WAYS[kind]} would move {_describe_quantity_shifts(quantities, shifts)}"
-            for kind, shifts in by_kind.items()
-        ]
+        out.append(f"They allow for {considered.describe(considered_errors, sensors)}.")
+    for index, by_kind in shifts:
+        clauses = []
+        for kind, sizes in by_kind.items():
+            words = []
+            for quantity, shift in zip((quantities[i] for i in rows[:MOST]), sizes, strict=False):
+                # A shift of a positive quantity is relative to its value.
+                unit = quantity.value if quantity.positive else 1.0
+                half = float(student_quantile(0.95, quantity.freedom)) * quantity.deviation
+                shown = f"{quantity.name} by {abs(unit) * shift:.2g}"
+                words.append(f"{shown} (interval ±{half:.2g})" if np.isfinite(half) else shown)
+            clauses.append(f"{_WAYS[kind]} would move {', '.join(words)}")
         name = type(sensors[index]).__name__
         out.append(
             f"They do not allow for a {name} that is off: {'; '.join(clauses)}. Give its "
             f"tolerance, such as {name}(…, tolerance=Tolerance(scale=0.01, cross_axis=0.01))."
         )
-    if not out:
-        out.append("They do not allow for a sensor that is off.")
-    return " ".join(out)
+    return " ".join(out) or "They do not allow for a sensor that is off."
 
 
 def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
-    """Describe each sensor bias that has no prior and that is large compared with the readings.
+    """Describe each sensor bias without a prior that is large compared with the readings.
 
     Such a bias may stand for a part of the motion that the model lacks: in one fit the bias of a
-    pendulum's gyro came out as 1.6 rad/s. The text is empty if there is no such bias.
-
-    **Arguments:** `model` the fitted model; `quantities` the reported quantities of the fit, which
-    hold the fitted biases.
+    pendulum's gyro came out as 1.6 rad/s.
     """
     out = []
     slots = [
@@ -103,28 +101,3 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
                 "such as Free(…, prior=…)."
             )
     return " ".join(out)
-
-
-def _describe_quantity_shifts(
-    quantities: Sequence[Quantity], shifts: Float[np.ndarray, " quantities"]
-) -> str:
-    """Describe by how much each reported quantity would move if a sensor had a small constant
-    error, such as an error of 1 % in the scale of one axis.
-
-    The words are such as "I1 by 0.02 (interval ±0.1)". The number in brackets is half the width of
-    the 95 % interval of the quantity; it is left out if it is not finite. Only the first `MOST`
-    (three) quantities are named.
-
-    **Arguments:**
-
-    - `quantities`: the q reported quantities.
-    - `shifts`: (q,) by how much each quantity moves: relative to its value if the quantity is
-      positive (a moment, a mass), else in its unit.
-    """
-    words = []
-    for quantity, shift in list(zip(quantities, shifts, strict=True))[:MOST]:
-        unit = quantity.value if quantity.positive else 1.0
-        half = float(student_quantile(0.95, quantity.freedom)) * quantity.deviation
-        shown = f"{quantity.name} by {abs(unit) * shift:.2g}"
-        words.append(f"{shown} (interval ±{half:.2g})" if np.isfinite(half) else shown)
-    return ", ".join(words)

@@ -63,18 +63,13 @@ class Cause(eqx.Module):
 
 
 def joined_status(search: Answer, model: Answer) -> str:
-    """Return the two answers of a fit in one line of text.
-
-    The answer on the `search` says whether the search found the best point; the answer on the
-    `model` says whether the model explains the readings. The text is `ok` if the search found the
-    best point, the model explains the readings, and neither answer has a reason.
-    """
+    """Return both answers in one line, or `ok` if all is well and neither has a reason."""
     if search == Answer(FOUND) and model == Answer(EXPLAINS):
         return "ok"
     return f"search: {search}; model: {model}"
 
 
-def advice_on_intervals(
+def advice(
     search: Answer,
     model: Answer,
     causes: tuple[Cause, ...],
@@ -84,16 +79,8 @@ def advice_on_intervals(
 ) -> str:
     """Return words that say whether the intervals can be trusted, and what to try.
 
-    **Arguments:**
-
-    - `search`: the answer on the search, whose word says whether the search found the best point.
-    - `model`: the answer on the model, whose word says whether the model explains the readings.
-    - `causes`: the likely causes of the errors.
-    - `covariance_kind`: the method by which the covariance was computed, in words that begin with
-      the name of the method, such as "Gauss–Newton" or "jackknife".
-    - `error_ratio`: the size of the errors divided by the given noise of the sensors.
-    - `allowance`: sentences on the sensor errors that the intervals allow for, as
-      `describe_allowed_sensor_errors` returns them.
+    `error_ratio` is the size of the errors divided by the given noise; `allowance` are sentences on
+    the sensor errors that the intervals allow for.
     """
     remedies = list(dict.fromkeys(cause.remedy for cause in causes))
     tries = f" Try: {'; '.join(remedies)}." if remedies else ""

@@ -6,13 +6,14 @@ the number of searches that ended at another point but fit as well.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Bool, Float
 
 from rigidjax import _show
-from rigidjax.identify.answer.allowance import describe_allowed_sensor_errors, describe_large_biases
+from rigidjax.identify.answer.allowance import describe_allowed, describe_large_biases
 from rigidjax.identify.answer.answers import (
     EXPLAINS,
     FAILS,
@@ -43,7 +44,6 @@ from rigidjax.identify.uncertainty.covariance import (
 from rigidjax.identify.uncertainty.degrees_of_freedom import prepare_freedom
 from rigidjax.identify.uncertainty.flat_limit import describe_unreal
 from rigidjax.identify.uncertainty.quantities import (
-    Quantity,
     named_charts,
     quantities_on_host,
     reported_quantities,
@@ -67,102 +67,109 @@ LAGS = 10
 HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
+class _SensorGoodness(NamedTuple):
+    word: str
+    words: str = ""  # how large the errors are, and when
+    chi2: float = 0.0  # zero if the noise is estimated, and so is the number of errors
+    many: int = 0
+
+
+class Goodness(NamedTuple):
+    chi2: float  # over the sensors whose noise is given
+    dof: int
+    answer: Answer
+    left: tuple[int, ...]  # the sensors whose errors the model does not explain
+
+
 def goodness_of_fit(
     model: Model,
     noise: Noise,
     linear: Linearisation,
     times: CorrelationTimes,
-    covariance: np.ndarray,
-) -> tuple[float, int, Answer, tuple[int, ...]]:
-    """Return the χ² of a fit, and an answer that says whether its model explains the readings.
+    covariance: Float[np.ndarray, "n n"],
+) -> Goodness:
+    """Return the χ² of a fit, and whether its model explains the readings.
 
-    The errors of a sensor count as larger than its given noise if their χ² exceeds the expected χ²
-    by more than five standard deviations of χ². Under a robust loss the median of the squared
-    errors takes the place of χ². The errors are also compared with the variance of the readings.
-    Ljung and Box's test (1978, doi:10.1093/biomet/65.2.297) says whether the errors are white.
-    Readings at full scale are left out.
-
-    **Arguments:**
-
-    - `model`, `noise`: the fitted model, and the standard deviations of the errors of its sensors.
-    - `linear`: the errors and their derivatives at the best point.
-    - `times`: the autocorrelation times of the errors.
-    - `covariance`: (n, n) the covariance of the free numbers for white errors.
-
-    **Returns** four things:
-
-    - χ², summed over the sensors whose noise is given;
-    - the degrees of freedom of χ²;
-    - the answer on the model;
-    - the indices of the sensors whose errors the model does not explain.
+    The `covariance` is that for white errors.
     """
-    chi2, count, word, free = 0.0, 0, EXPLAINS, linear.free_count
-    words: list[str] = []
-    sensors: list[int] = []
-    own, readings = linear.covariance_by_recording(covariance), model.records.readings
-    parts = zip(readings, linear.raw, linear.errors, linear.weights, linear.mask, strict=True)
-    for index, (reading, error, e, weight, mask) in enumerate(parts):
-        has_noise = reading.sensor.noise is not None
-        left, varies, tiny = _sums_of_squares_of_errors_readings_round_off(reading, error, mask)
-        factor = 1.0
-        if has_noise:
-            total, many = float(np.sum((weight[..., None] * e**2)[mask])), int(mask.sum())
-            chi2, count = chi2 + total, count + many
-            dof = max(many - free, 1)
-            factor = float(np.sqrt(total / dof)) if total > dof + 5 * np.sqrt(2 * dof) else 1.0
-            if model.loss is not None and many:
-                squares = np.sum(e[mask.all(axis=-1)] ** 2, axis=-1)
-                factor = _noise_ratio_by_median(squares, e.shape[-1])
-        root = np.sqrt(weight)[..., None]
-        slope = linear.slopes[index] * root[..., None]
-        white = left <= tiny or _is_white(e * root, mask, slope, own, has_noise)
-        has_clock_error = left > tiny and time_stamp_cause(model, noise, linear, index) is not None
-        # Errors cannot hide a missing part of the model in two cases: a noise is given and they are
-        # no larger (`factor` is 1); or they are small beside the readings, with at most a QUARTER
-        # of the variance of the readings.
-        small = has_noise or left <= QUARTER * varies + tiny
-        if factor == 1.0 and white and small and not has_clock_error:
-            continue
-        lasting = max(times.closeness, 0.0) * left
-        missed = left > HALF * varies + tiny or lasting > TENTH * varies + tiny
-        if missed and (factor > 1.0 or not has_noise):
-            word = FAILS
-        word = LEAVES if word == EXPLAINS else word
-        sensors.append(index)
-        # An error has the unit of the reading only if both have the same number of components: an
-        # attitude is read as a quaternion, for example, but its error is a rotation vector.
-        alike = int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
-        share = left / varies if varies > tiny and alike else None
-        span = None if white else times.longest_span
-        words.append(_describe_errors(model, reading, error, mask, factor, share, span))
-    return chi2, max(count - free, 1), Answer(word, tuple(words)), tuple(sensors)
+    own = linear.covariance_by_recording(covariance)
+    each = [
+        _goodness_of_sensor(model, noise, linear, times, own, index)
+        for index in range(len(model.records.readings))
+    ]
+    left = tuple(index for index, one in enumerate(each) if one.word != EXPLAINS)
+    found = [one.word for one in each]
+    word = next((word for word in (FAILS, LEAVES) if word in found), EXPLAINS)
+    dof = max(sum(one.many for one in each) - linear.free_count, 1)
+    answer = Answer(word, tuple(each[index].words for index in left))
+    return Goodness(float(sum(one.chi2 for one in each)), dof, answer, left)
+
+
+def _goodness_of_sensor(
+    model: Model,
+    noise: Noise,
+    linear: Linearisation,
+    times: CorrelationTimes,
+    covariance: Float[np.ndarray, "records m m"],
+    index: int,
+) -> _SensorGoodness:
+    """Return whether the model explains the readings of one sensor, those at full scale left out.
+
+    Errors count as larger than a given noise if their χ² exceeds the expected χ² by more than five
+    standard deviations. Under a robust loss the median of the squared errors takes the place of χ².
+    The errors are also compared with the variance of the readings. Ljung and Box's test (1978,
+    doi:10.1093/biomet/65.2.297) says whether they are white.
+    """
+    reading, error, e = model.records.readings[index], linear.raw[index], linear.errors[index]
+    weight, mask = linear.weights[index], linear.mask[index]
+    values = np.asarray(reading.values)[reading.host_mask]
+    varies = float(np.sum((values - values.mean(axis=0)) ** 2))
+    # Sums of squares that are not larger than this bound of round-off count as zero.
+    tiny = 1e-12 * float(np.sum(values**2))
+    left, has_noise = float(np.sum(error[mask] ** 2)), reading.sensor.noise is not None
+    factor, total, many = 1.0, 0.0, 0
+    if has_noise:
+        total, many = float(np.sum((weight[..., None] * e**2)[mask])), int(mask.sum())
+        dof = max(many - linear.free_count, 1)
+        factor = float(np.sqrt(total / dof)) if total > dof + 5 * np.sqrt(2 * dof) else 1.0
+        if model.loss is not None and many:
+            factor = _noise_ratio(np.sum(e[mask.all(axis=-1)] ** 2, axis=-1), e.shape[-1])
+    root = np.sqrt(weight)[..., None]
+    slope = linear.slopes[index] * root[..., None]
+    white = left <= tiny or _is_white(e * root, mask, slope, covariance, has_noise)
+    has_clock_error = left > tiny and time_stamp_cause(model, noise, linear, index) is not None
+    # Errors cannot hide a missing part of the model in two cases: a noise is given and they are no
+    # larger (`factor` is 1); or they are small beside the readings, with at most a QUARTER of the
+    # variance of the readings.
+    small = has_noise or left <= QUARTER * varies + tiny
+    if factor == 1.0 and white and small and not has_clock_error:
+        return _SensorGoodness(EXPLAINS, "", total, many)
+    lasting = max(times.closeness, 0.0) * left
+    missed = left > HALF * varies + tiny or lasting > TENTH * varies + tiny
+    # An error has the unit of the reading only if both have the same number of components: an
+    # attitude is read as a quaternion, for example, but its error is a rotation vector.
+    alike = int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
+    share = left / varies if varies > tiny and alike else None
+    span = None if white else times.longest_span
+    words = _describe_errors(model, reading, error, mask, factor, share, span)
+    word = FAILS if missed and (factor > 1.0 or not has_noise) else LEAVES
+    return _SensorGoodness(word, words, total, many)
 
 
 def _describe_errors(
     model: Model,
     reading: Reading,
-    error: np.ndarray,
-    mask: np.ndarray,
+    error: Float[np.ndarray, "records times k"],
+    mask: Bool[np.ndarray, "records times k"],
     factor: float,
     share: float | None,
     span: float | None,
 ) -> str:
-    """Describe in words how large the errors of a sensor are, and at which times.
+    """Describe how large the errors of a sensor are (in its unit), and at which times.
 
-    **Arguments:**
-
-    - `model`, `reading`: the fitted model, and the readings of the sensor.
-    - `error`: (R, T, k) reading minus prediction in the unit of the sensor, for R recordings, T
-      times and k components.
-    - `mask`: (R, T, k) true for the errors to use: those of readings that are neither masked nor at
-      full scale.
-    - `factor`: the size of the errors divided by the known noise. It is written only if it is above
-      1.
-    - `share`: the sum of squared errors divided by the sum of squared differences of the readings
-      from their mean. It is `None` if the readings are constant, or if they have another unit than
-      the errors.
-    - `span`: the number of samples over which the errors are autocorrelated, or `None` for white
-      errors.
+    The `factor` is the size of the errors divided by the known noise, `share` their fraction of the
+    variance of the readings (`None` if units differ or readings are constant), and `span` the
+    number of samples over which they are autocorrelated (`None` for white errors).
     """
     sensor, many = reading.sensor, max(int(mask.any(axis=-1).sum()), 1)
     size = np.sqrt(np.sum(error[mask] ** 2) / many)
@@ -178,23 +185,15 @@ def _describe_errors(
         over = np.sqrt(np.mean(np.concatenate(rows) ** 2) / apart) if apart > 0 else np.inf
         words.append(f"{over:.3g} times their scatter between neighbours")
         words.append(f"autocorrelated over {span:.0f} samples")
-    return f"{', '.join(words)}, {_describe_time_of_largest_errors(model, error, mask)}"
+    return f"{', '.join(words)}, {_when_largest(model, error, mask)}"
 
 
-def _describe_time_of_largest_errors(model: Model, error: np.ndarray, mask: np.ndarray) -> str:
-    """Describe in words at which times the errors of a sensor are largest.
-
-    The words give the shortest interval of time that contains half of the sum of squared errors of
-    one recording: the recording in which this sum is largest. If the interval is longer than 40 %
-    of the recording, the words are "all along".
-
-    **Arguments:**
-
-    - `model`: the fitted model, which holds the times of R recordings.
-    - `error`: (R, T, k) the errors of the sensor at T times, in k components.
-    - `mask`: (R, T, k) true for the errors to use: those of readings that are neither masked nor at
-      full scale.
-    """
+def _when_largest(
+    model: Model,
+    error: Float[np.ndarray, "records times k"],
+    mask: Bool[np.ndarray, "records times k"],
+) -> str:
+    """Describe the shortest interval with half of the squared errors of the worst recording."""
     squares = np.sum(np.where(mask, error, 0.0) ** 2, axis=-1)
     row = int(np.argmax(squares.sum(axis=1)))
     count = int(model.counts[row])
@@ -209,40 +208,11 @@ def _describe_time_of_largest_errors(model: Model, error: np.ndarray, mask: np.n
     return f"half of the squared ones from {times} s{of_recording}"
 
 
-def _sums_of_squares_of_errors_readings_round_off(
-    reading: Reading, error: np.ndarray, mask: np.ndarray
-) -> tuple[float, float, float]:
-    """Return three sums of squares for one sensor, which are compared with each other.
+def _noise_ratio(squared_lengths: Float[np.ndarray, " count"], components: int) -> float:
+    """Return the factor by which errors are larger than their noise, 1 if that may be chance.
 
-    They are the sum of its squared errors; the sum of the squared differences of its readings from
-    their mean; and 1e-12 times the sum of its squared readings. The last one is a bound of
-    round-off: the other two sums count as zero if they are not larger.
-
-    **Arguments:**
-
-    - `reading`: the readings of the sensor, with their mask.
-    - `error`: (R, T, k) reading minus prediction, for R recordings, T times and k components.
-    - `mask`: (R, T, k) true for the errors to use: those of readings that are neither masked nor at
-      full scale.
-    """
-    values = np.asarray(reading.values)[reading.host_mask]
-    varies = float(np.sum((values - values.mean(axis=0)) ** 2))
-    return float(np.sum(error[mask] ** 2)), varies, 1e-12 * float(np.sum(values**2))
-
-
-def _noise_ratio_by_median(squared_lengths: np.ndarray, components: int) -> float:
-    """Return the factor by which errors are larger than their given noise.
-
-    The errors are given in standard deviations of the noise. The factor is √(m/m₁), where m is the
-    median of the squared lengths of the errors, and m₁ is the expected median for errors that are
-    as large as the noise. The factor is 1 if m − m₁ is at most five standard deviations of m, since
-    so small an excess may be chance. The median takes the place of χ² under a robust loss, because
-    a robust loss is chosen where outliers are expected, and outliers would dominate χ².
-
-    **Arguments:**
-
-    - `squared_lengths`: (N,) the squared length of each of N errors.
-    - `components`: the number of components of an error.
+    It is √(m/m₁), where m is the median of their squared lengths in deviations, and m₁ is the
+    expected one. Under a robust loss, which expects outliers, these would dominate χ².
     """
     if not squared_lengths.size:
         return 1.0
@@ -255,31 +225,18 @@ def _noise_ratio_by_median(squared_lengths: np.ndarray, components: int) -> floa
 
 
 def _is_white(
-    errors: np.ndarray,
-    mask_of_used: np.ndarray,
-    slope: np.ndarray,
-    covariance: np.ndarray,
+    errors: Float[np.ndarray, "records times k"],
+    mask_of_used: Bool[np.ndarray, "records times k"],
+    slope: Float[np.ndarray, "records times k m"],
+    covariance: Float[np.ndarray, "records m m"],
     has_noise: bool,
 ) -> bool:
-    """Return whether the errors of a sensor are white (not autocorrelated), by Ljung and Box's
-    test.
+    """Return whether the errors of a sensor, in deviations, are white, by Ljung and Box's test.
 
     A fit makes white errors correlated: it subtracts `slope covariance slopeᵀ` from the covariance
-    of the errors (Box and Pierce 1970, doi:10.1080/01621459.1970.10481180). This correlation is
-    noticeable if there are many short recordings. The test allows for it.
-
-    **Arguments:**
-
-    - `errors`: (R, T, k) the whitened errors (in standard deviations) in R recordings, at T times,
-      of k components.
-    - `mask_of_used`: (R, T, k) true for the errors to use: those of readings that are neither
-      masked nor at full scale.
-    - `slope`: (R, T, k, m) the derivatives of the errors with respect to the m free numbers of each
-      recording.
-    - `covariance`: (R, m, m) the covariance of the free numbers of each recording, computed as if
-      the errors were white.
-    - `has_noise`: whether the noise is known. If the noise is known, errors that are far smaller
-      than the noise are no evidence of autocorrelation.
+    of the errors (Box and Pierce 1970, doi:10.1080/01621459.1970.10481180). This is noticeable if
+    there are many short recordings, and the test allows for it. If the noise is known, errors that
+    are far smaller are no evidence of autocorrelation.
     """
     from scipy.special import chdtrc
 
@@ -287,8 +244,8 @@ def _is_white(
     for channel in range(errors.shape[-1]):
         long = mask_of_used[..., channel].sum(axis=1) >= 2 * LAGS
         mask = mask_of_used[long, :, channel]
-        x = _masked_entries_about_mean(errors[long, :, channel, None], mask)[..., 0]
-        j = _masked_entries_about_mean(slope[long, :, channel], mask)
+        x = _centred(errors[long, :, channel, None], mask)[..., 0]
+        j = _centred(slope[long, :, channel], mask)
         taken, count = j @ covariance[long], len(mask)
         size, own = int(mask.sum()), float(np.sum(x * x))
         squares = max(own, float(size)) if has_noise else own
@@ -303,14 +260,10 @@ def _is_white(
     return degrees == 0 or bool(chdtrc(degrees, total) > RARE)
 
 
-def _masked_entries_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return the selected entries of each row minus their mean, moved to the front of the row.
-
-    The argument `rows` (R, T, m) holds R rows of T entries, and each entry has m numbers. An entry
-    is selected where `mask` (R, T) is true. The mean is that of the selected entries of the row.
-    The selected entries keep their order, and zeros follow them, so that the result has the shape
-    (R, T, m), too.
-    """
+def _centred(
+    rows: Float[np.ndarray, "records times m"], mask: Bool[np.ndarray, "records times"]
+) -> Float[np.ndarray, "records times m"]:
+    """Return the entries in the `mask` minus their mean over time, moved to the front."""
     order = np.argsort(~mask, axis=1, kind="stable")
     valid = np.take_along_axis(mask, order, axis=1)[..., None]
     packed = np.where(valid, np.take_along_axis(rows, order[..., None], axis=1), 0.0)
@@ -321,63 +274,6 @@ def _masked_entries_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray
 # A search has ended if the distance to the minimum of the linearised problem, in standard
 # deviations, is below this number.
 AT_THE_END = 0.05
-
-
-def _answer_on_search(
-    best_cost: float, ended: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
-) -> Answer:
-    """Return an answer that says whether the search of a fit found the best point.
-
-    The word of the answer is `found`, `not alone` (another motion fits as well) or `not ended`.
-
-    **Arguments:**
-
-    - `best_cost`: the least cost (half the sum of squared residuals) of all starts.
-    - `ended`: whether the search reached a minimum.
-    - `rivals`: a sentence on the starts that ended at other points and fit as well, or "".
-    - `interrupted`: one text for each interrupt (Ctrl-C) of the search; empty if there was none.
-    - `remarks`: other reasons for the answer, in words.
-    """
-    if not np.isfinite(best_cost):
-        return Answer(NOT_ENDED, ("no start gave a finite misfit",))
-    if not ended:
-        why = interrupted or ("max_steps reached",)
-        return Answer(NOT_ENDED, (*why, *remarks, "this is the best point found"))
-    if rivals:
-        return Answer(NOT_ALONE, (rivals, *interrupted, *remarks))
-    return Answer(FOUND, (*interrupted, *remarks))
-
-
-def _count_rivals(
-    starts: Sequence[Start], best_cost: float, margin: float, linear: Linearisation, x: Array
-) -> int:
-    """Return how many searches converged to another point than the best one and fit the readings as
-    well.
-
-    An end of a search is counted as another point if two conditions hold:
-
-    - Its cost exceeds `best_cost` by more than a hundredth of `margin`. Two searches that reach the
-      same minimum end at slightly different costs.
-    - The step from the best point x to this end changes the errors, by the linearisation at x, by a
-      sum of squares of more than twice `margin`. Distant points of a flat valley predict the same
-      readings and are therefore not counted.
-
-    **Arguments:**
-
-    - `starts`: the ends of the searches that fit as well as the best one.
-    - `best_cost`: the least cost (half the sum of squared residuals) of all searches.
-    - `margin`: the largest difference of cost with which two points fit equally well.
-    - `linear`: the errors at the best point, with their derivatives.
-    - `x`: (n,) the free numbers at the best point.
-    """
-    count = 0
-    for item in starts:
-        if item.converged and item.cost > best_cost + 0.01 * margin:
-            away = item.x - x
-            # Two points of a flat valley differ, but predict the same readings: such points are not
-            # counted as different.
-            count += linear.squared_residual_change(np.asarray(away)) > 2 * margin
-    return count
 
 
 def assess(
@@ -392,15 +288,8 @@ def assess(
 ) -> Fit:
     """Return the `Fit` of the best point of all starts, whether or not the search converged there.
 
-    **Arguments:**
-
-    - `model`: the model that was fitted, whose recordings may be padded with masked readings.
-    - `best`: the best point, with the errors at this point and their derivatives.
-    - `noise`: the standard deviations of the errors of each sensor.
-    - `attempts`: the ends of the searches from all starts.
-    - `best_cost`: the least cost of the `attempts`.
-    - `original`: the model that the `Fit` holds, with the readings as the user gave them.
-    - `interrupted`, `remarks`: reasons for the answer on the search, in words.
+    The recordings of `model` may be padded; the `Fit` holds the `original`. The texts of
+    `interrupted` and `remarks` are reasons for the answer on the search.
     """
     x = best.x
     near = flat_limit.thicken(model, x)
@@ -409,29 +298,28 @@ def assess(
     times = uncertainty.correlation_times(linear)
     white = uncertainty.white_covariance(linear)
     stretches = leave_one_out(model, linear)
-    numbers, of = (
-        quantities_on_host(model, x, near),
-        named_charts(model),
-    )
+    numbers, charts = quantities_on_host(model, x, near), named_charts(model)
     hidden = np.zeros((0, linear.free_count))
     if stretches is None:
         covariance = uncertainty.robust_covariance(linear, times, white)
     else:
-        covariance, hidden = (
-            jackknife(stretches, white),
-            stretches.hidden_directions,
-        )
-        remarks = (
-            *remarks,
-            *stretch_remarks(stretches, model, numbers, white),
-        )
+        covariance, hidden = jackknife(stretches, white), stretches.hidden_directions
+        remarks = (*remarks, *stretch_remarks(stretches, model, numbers, white))
     remarks = (*remarks, *describe_delays_outside_windows(model, x))
     considered_errors = considered.considerations(model, linear, noise, white.determined)
-    covariance = _covariance_with_considered_errors(covariance, considered_errors, model)
     shifts = considered.shift_matrix(considered_errors, linear.free_count)
+    if considered_errors:
+        added = shifts @ shifts.T
+        words = considered.describe(considered_errors, model.records.sensors)
+        covariance = dataclasses.replace(
+            covariance,
+            covariance=covariance.covariance + added,
+            determined=covariance.determined + added,
+            kind=f"{covariance.kind}; considered: {words}",
+        )
     freedom = prepare_freedom(model, linear, times, white.determined, shifts)
     limits = flat_limit.limits(
-        model, numbers, -white.determined @ linear.misfit_gradient, [n for n, _ in of]
+        model, numbers, -white.determined @ linear.misfit_gradient, [one.suffix for one in charts]
     )
     # A search has ended if it converged, or if the minimum of the linearised problem is near: in a
     # long curved valley the steps of a search stay short, although the misfit can hardly fall any
@@ -455,11 +343,20 @@ def assess(
     level = best_cost + margin if believable else -np.inf
     ends = [(one.x, float(one.cost), bool(one.converged)) for one in attempts]
     starts = [Start(*end, end[1] <= level) for end in ends]
-    rivals = _count_rivals([s for s in starts if s.fits], best_cost, margin, linear, x)
-    rival = f"{rivals} of {len(starts)} starts fit as well elsewhere" if rivals else ""
+    # Another motion fits as well if a search converged to a higher cost, since two searches that
+    # reach the same minimum end at slightly different costs, and if the readings change on the way
+    # there: distant points of a flat valley predict the same readings.
+    rivals = sum(
+        one.fits
+        and one.converged
+        and one.cost > best_cost + 0.01 * margin
+        and linear.squared_residual_change(np.asarray(one.x - x)) > 2 * margin
+        for one in starts
+    )
+    rival = (f"{rivals} of {len(starts)} starts fit as well elsewhere",) if rivals else ()
     if believable and not any(start.fits for start in starts):
         remarks = ("no single start came near the best point", *remarks)
-    unreal = describe_unreal(of, flat_limit.bodies_at(model, x))
+    unreal = describe_unreal(charts, flat_limit.bodies_at(model, x))
     reasons = (*unreal, *explanation.reasons)
     explanation = Answer(explanation.word, reasons) if best_cost < np.inf else Answer(FAILS)
     quantities = reported_quantities(
@@ -468,12 +365,20 @@ def assess(
         covariance.determined,
         np.concatenate([covariance.null_directions, hidden]),
         limits,
-        freedom.of_variance(numbers[1]),
+        freedom.of_variance(numbers.slopes),
     )
-    words = _describe_constant_sensor_errors(
-        model, linear, noise, white.determined, considered_errors, quantities, numbers[1]
+    words = describe_allowed(
+        model, linear, noise, white.determined, considered_errors, quantities, numbers.slopes
     )
     words = f"{words} {describe_large_biases(model, quantities)}".rstrip()
+    if not np.isfinite(best_cost):
+        search = Answer(NOT_ENDED, ("no start gave a finite misfit",))
+    elif not done:
+        why = interrupted or ("max_steps reached",)
+        search = Answer(NOT_ENDED, (*why, *remarks, "this is the best point found"))
+    else:
+        word = NOT_ALONE if rivals else FOUND
+        search = Answer(word, (*rival, *interrupted, *remarks))
     return Fit(
         original,
         x,
@@ -489,7 +394,7 @@ def assess(
         jnp.asarray(covariance.singular_values),
         jnp.asarray(covariance.null_directions),
         quantities,
-        _answer_on_search(best_cost, done, rival, interrupted, remarks),
+        search,
         explanation,
         left,
         limits,
@@ -499,84 +404,4 @@ def assess(
         considered_errors,
         words,
         jnp.asarray(hidden),
-    )
-
-
-def _describe_constant_sensor_errors(
-    model: Model,
-    linear: Linearisation,
-    noise: Noise,
-    covariance: np.ndarray,
-    considered_errors: tuple[considered.Consideration, ...],
-    quantities: Sequence[Quantity],
-    slopes: np.ndarray,
-) -> str:
-    """Return sentences that say which constant errors of sensors, such as an error of scale, the
-    intervals of a fit allow for.
-
-    The intervals allow for the errors of a sensor that has a `Tolerance`. For a sensor without a
-    tolerance, the sentences say how far a small error of its scale or of its axes would move the
-    moments of the body or their ratios. If the fit reports none of these, the sentences say how far
-    the values of the `Free`s (numbers that a fit may move) would move.
-
-    **Arguments:**
-
-    - `model`, `noise`: the fitted model, and the standard deviations of the errors of its sensors.
-    - `linear`: the errors and their derivatives at the best point.
-    - `covariance`: (n, n) the covariance of the free numbers, computed as if the errors were white.
-    - `considered_errors`: the constant errors, within the `Tolerance` of a sensor, that the
-      intervals allow for.
-    - `quantities`: the q reported quantities.
-    - `slopes`: the derivatives (q, n) of the quantities with respect to the n free numbers. Further
-      rows at the end, for the flatness of bodies, are not used.
-    """
-    bodies = {log + name for name, chart in named_charts(model) for log in chart.log_names}
-    free = {slot.name for slot in model.slots}
-    rows = [i for i, one in enumerate(quantities) if one.name in bodies and one.name != "mass"]
-    rows = rows or [i for i, one in enumerate(quantities) if one.name.split(" ")[0] in free]
-    rows = [i for i in rows if np.isfinite(quantities[i].deviation)]
-    known = (
-        rows
-        if np.isfinite(linear.weighted_jacobian).all() and np.isfinite(covariance).all()
-        else []
-    )
-    usual_shifts = (
-        considered.usual_shifts(model, linear, noise, covariance, slopes[known]) if known else []
-    )
-    return describe_allowed_sensor_errors(
-        model, considered_errors, usual_shifts, [quantities[i] for i in known]
-    )
-
-
-def _covariance_with_considered_errors(
-    covariance: uncertainty.Covariance,
-    considered_errors: tuple[considered.Consideration, ...],
-    model: Model,
-) -> uncertainty.Covariance:
-    """Return the `covariance` of a fit plus the covariance that considered errors of its sensors
-    cause.
-
-    A considered error is a constant error of a sensor, such as an error of scale. Its size is
-    limited by the `Tolerance` of the sensor. The fit does not estimate it, but the intervals allow
-    for it.
-
-    **Arguments:**
-
-    - `covariance`: the covariance of the free numbers.
-    - `considered_errors`: the considered errors. Each one holds the changes of the free numbers
-      that it causes.
-    - `model`: the fitted model.
-    """
-    if not considered_errors:
-        return covariance
-    root = considered.shift_matrix(considered_errors, len(covariance.determined))
-    added, words = (
-        root @ root.T,
-        considered.describe(considered_errors, model.records.sensors),
-    )
-    return dataclasses.replace(
-        covariance,
-        covariance=covariance.covariance + added,
-        determined=covariance.determined + added,
-        kind=f"{covariance.kind}; considered: {words}",
     )

@@ -2,12 +2,12 @@
 
 Each cause has a direction: the change that the cause would make in the readings along the fitted
 motion. The errors are regressed on this direction together with the derivatives of the readings
-with respect to all free numbers (a score test: Rao 1948, doi:10.1017/S0305004100023987). Therefore
-a cause explains nothing if a change of the free numbers has the same effect on the readings.
+with respect to all parameters (a score test: Rao 1948, doi:10.1017/S0305004100023987). Therefore a
+cause explains nothing if a change of the parameters has the same effect on the readings.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -62,17 +62,13 @@ ATTITUDES = {
 
 
 def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None) -> Cause | None:
-    """Return the likely mistake with which the gyro or the attitudes of one body were read from a
-    file, such as a wrong unit, a mirrored axis, or a quaternion with its scalar last.
+    """Return the likely mistake with which the gyro or the attitudes of one body were read.
 
-    The result is `None` if no mistake is likely. Each possible mistake has a correction of the
-    rates or attitudes, which is tried on the recordings. The rates of the gyro are compared with
-    the rates between successive attitudes. Without attitudes the rates are inserted in Euler's
-    equations with the inertia that fits best, and a correction is accepted only if a real body can
-    have this inertia. A mirrored axis then shows only under a torque: free motion with a mirrored
-    axis is a free motion, too.
-
-    **Arguments:** `recordings` are the recordings of one body; `torque` is the torque of the model.
+    The correction of each possible mistake is tried on the recordings. The rates of the gyro are
+    compared with the rates between successive attitudes. Without attitudes the rates are inserted
+    in Euler's equations with the inertia that fits best, and a correction is accepted only if a
+    real body can have this inertia. A mirrored axis then shows only under a torque: free motion
+    with a mirrored axis is a free motion, too.
     """
     gyros = readings_of(recordings[0], Gyro)
     if not gyros:
@@ -86,26 +82,21 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None
         return None
     known = [attitudes(recording) for recording in recordings]
     if all(len(t) > 10 for t, _ in known):
-        bound = BETTER * _relative_rate_difference(recordings, known, _SAME)
-        ratios = {
-            name: _relative_rate_difference(recordings, known, turn) for name, turn in RATES.items()
-        }
+        bound = BETTER * _rate_misfit(recordings, known, _SAME)
+        ratios = {name: _rate_misfit(recordings, known, turn) for name, turn in RATES.items()}
         for name, change in ATTITUDES.items():
             changed = [(t, change(q)) for t, q in known]
-            ratios[name] = _relative_rate_difference(recordings, changed, _SAME)
-    elif rate_only(torque):
-        bound, margin = _euler_residual_and_tensor_margin(recordings, torque, _SAME)
+            ratios[name] = _rate_misfit(recordings, changed, _SAME)
+    elif depends_on_rate_only(torque):
+        bound, margin = _euler_residual(recordings, torque, _SAME)
         # The body that fits the uncorrected rates best may be unreal. Sensor errors alone can make
         # it slightly unreal, but not as far as a margin of −0.8. With such a margin the file was
         # misread, and a correction to a real body is believed even if it does not make the residual
         # smaller.
         bound *= BETTER if margin > -0.8 else EQUAL
-        fits = {
-            name: _euler_residual_and_tensor_margin(recordings, torque, turn)
-            for name, turn in RATES.items()
-        }
+        fits = {name: _euler_residual(recordings, torque, turn) for name, turn in RATES.items()}
         if torque is not None:
-            fits["the torque with the other sign"] = _euler_residual_and_tensor_margin(
+            fits["the torque with the other sign"] = _euler_residual(
                 recordings, torque, _SAME, -1.0
             )
         # A correction is believed only if the body that fits best is real (a margin not below
@@ -124,64 +115,44 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None
     return Cause("misread", "Gyro", 1.0, f"most likely {words}", f"read the log again: {words}")
 
 
-def _euler_residual_and_tensor_margin(
+class _EulerResidual(NamedTuple):
+    residual: float  # relative to the angular momentum
+    # The smallest eigenvalue of the matrix of second moments, divided by the largest magnitude of
+    # an eigenvalue: positive if a real body can have the tensor.
+    margin: float
+
+
+def _euler_residual(
     recordings: Sequence[Recording],
     torque: Torque | None,
-    correction: np.ndarray,
+    correction: Float[np.ndarray, "3 3"],
     sign: float = 1.0,
-) -> tuple[float, float]:
-    """Return how well the inertia tensor that fits the recorded body rates best satisfies Euler's
-    equations, and whether a real body can have this tensor.
+) -> _EulerResidual:
+    """Return the residual of Euler's equations with the inertia tensor that fits best.
 
-    Two numbers are returned:
-
-    - The residual of Euler's equations, relative to the angular momentum.
-    - The margin of the tensor, which is positive if a real body can have the tensor. The matrix of
-      second moments of a tensor I is `½ tr(I) E − I`, with the unit matrix E; its eigenvalues are
-      positive for a real body. The margin is the smallest of the eigenvalues, divided by the
-      largest magnitude of an eigenvalue.
-
-    **Arguments:**
-
-    - `recordings`: the recordings of one body, with its gyro.
-    - `torque`: the torque on the body, or `None`.
-    - `correction`: (3, 3) the matrix by which the recorded rates are multiplied, to try a
-      permutation or a mirror of the axes, or another unit.
-    - `sign`: the factor by which the torque is multiplied; −1 tries a torque whose sign was wrong.
+    The recorded rates are multiplied by `correction`, the torque by `sign`.
     """
     balances = [integrated_euler(recording, torque, correction) for recording in recordings]
     matrix, side, momentum = (np.concatenate(part) for part in zip(*balances, strict=True))
     components, margin = solve_inertia(matrix, sign * side)
     left = np.linalg.norm(matrix @ components - sign * side)
-    return float(left / np.linalg.norm(momentum @ components)), margin
+    return _EulerResidual(float(left / np.linalg.norm(momentum @ components)), margin)
 
 
-def _relative_rate_difference(
+def _rate_misfit(
     recordings: Sequence[Recording],
     attitudes: Sequence[tuple[np.ndarray, np.ndarray]],
-    correction: np.ndarray,
+    correction: Float[np.ndarray, "3 3"],
 ) -> float:
-    """Return how far the body rates of a gyro differ from the mean body rates between successive
-    recorded attitudes.
-
-    The result is the root mean square difference, divided by the root mean square rate between
-    attitudes.
-
-    **Arguments:**
-
-    - `recordings`: the recordings of one body, with its gyro.
-    - `attitudes`: for each recording the times (n,), s, and the quaternions (n, 4).
-    - `correction`: (3, 3) the matrix by which the rates of the gyro are multiplied, to try a
-      permutation or a mirror of the axes, or another unit.
+    """Return the root mean square difference of the rates of a gyro, times `correction`, from those
+    between successive `attitudes` (times and quaternions), relative to these.
     """
     left, size = 0.0, 1e-300
     for recording, (t, q) in zip(recordings, attitudes, strict=True):
         when, wanted = mean_rates(t, jnp.asarray(q))
         reading = readings_of(recording, Gyro)[0]
-        gyro_times, w = (
-            np.asarray(recording.t)[reading.host_mask],
-            np.asarray(reading.values)[reading.host_mask],
-        )
+        used = reading.host_mask
+        gyro_times, w = np.asarray(recording.t)[used], np.asarray(reading.values)[used]
         shown = np.stack(
             [np.interp(when, gyro_times, axis) for axis in (w @ correction.T).T], axis=1
         )
@@ -194,9 +165,9 @@ def _relative_rate_difference(
 # cause that explains at least NEARLY times as much as the best one is then named, too.
 ENOUGH, NEARLY = 0.7, 0.95
 # A cause changes the readings along one or more directions of length one. All changes of the
-# readings that the free numbers can make are subtracted from them. A combination of the remainders
-# is dropped if its singular value is at most this number, since the free numbers could make nearly
-# the same change.
+# readings that the parameters can make are subtracted from them. A combination of the remainders is
+# dropped if its singular value is at most this number, since the parameters could make nearly the
+# same change.
 APART = 0.05
 # The causes in LINEAR change the readings in proportion to their size only if the size is below
 # SMALL.
@@ -207,6 +178,18 @@ SKEW = np.zeros((3, 3, 3))
 SKEW[1, 0, 0] = SKEW[2, 0, 1] = SKEW[2, 1, 2] = 1.0
 
 
+class _Candidate(NamedTuple):
+    name: str
+    direction: Float[np.ndarray, "records times 3 c"]  # the change by a cause of unit size
+    words: str  # with `{size}` for the size of the cause
+    remedy: str
+
+
+class _Share(NamedTuple):
+    share: float  # of the squared errors, 0 to 1
+    size: Float[np.ndarray, " c"]  # of the cause, such as the components of a bias
+
+
 def causes(
     model: Model,
     x: Float[Array, " n"],
@@ -214,17 +197,9 @@ def causes(
     linear: Linearisation,
     indices: Sequence[int],
 ) -> tuple[Cause, ...]:
-    """Return the most likely cause of the errors of each sensor in `indices`.
+    """Return the most likely cause of the errors of each sensor in `indices` that has one.
 
-    A sensor without a likely cause is left out. If a file was most likely misread, this cause alone
-    is returned.
-
-    **Arguments:**
-
-    - `model`, `x`: the fitted model, and the free numbers (n,) at the best point.
-    - `noise`: the standard deviations of the errors of each sensor.
-    - `linear`: the errors and their derivatives at x.
-    - `indices`: the indices of the sensors whose errors the model does not explain.
+    If a file was most likely misread, this cause alone is returned.
     """
     given = zip(stacking.on_host(model.records, model.counts), model.body_names, strict=True)
     mine = [recording for recording, name in given if name == model.body_names[0]]
@@ -239,10 +214,9 @@ def causes(
         sensor: Any = model.records.readings[index].sensor
         cause = time_stamp_cause(model, noise, linear, index)
         if cause is None and _is_vector_error(sensor):
-            rows = _candidate_causes(model, x, linear, index)
-            given = model, noise, linear, index, free
-            shares = [_explained_share(*given, row[1]) for row in rows]
-            cause = _cause_with_largest_share(sensor, rows, shares)
+            rows = _candidates(model, x, linear, index)
+            shares = [_share(model, noise, linear, index, free, row.direction) for row in rows]
+            cause = _likeliest(sensor, rows, shares)
         if cause is None and hasattr(sensor, "suspect"):
             cause = Cause(sensor.suspect[0], type(sensor).__name__, None, *sensor.suspect[1:])
         out += [] if cause is None else [cause]
@@ -250,16 +224,10 @@ def causes(
 
 
 def time_stamp_cause(model: Model, noise: Noise, linear: Linearisation, index: int) -> Cause | None:
-    """Return the cause "clock" if the time stamps of a sensor scatter by more than its jitter, the
-    standard deviation of the time stamps that the fit allows for.
+    """Return the cause "clock" if the time stamps of a sensor scatter by more than its jitter.
 
-    Otherwise the result is `None`. A late time stamp makes an error along dy/dt, the derivative of
-    the readings y with respect to time. Time stamps are the likely cause if the errors along dy/dt
-    are larger than errors of random direction would be.
-
-    **Arguments:** `model` is the fitted model, `noise` the standard deviations of the errors of
-    each sensor, `linear` the errors and their derivatives at the best point, and `index` the index
-    of the sensor.
+    A late time stamp makes an error along dy/dt, the derivative of the readings y with respect to
+    time: the errors along it are then larger than errors of random direction would be.
     """
     sensor, error = model.records.readings[index].sensor, linear.raw[index]
     kept = linear.mask[index].all(axis=-1)
@@ -291,55 +259,29 @@ def time_stamp_cause(model: Model, noise: Noise, linear: Linearisation, index: i
 def _cause_with_share(
     name: str, sensor: AbstractSensor, share: float, words: str, remedy: str
 ) -> Cause:
-    """Return a likely cause of the errors of a sensor.
-
-    The words of the cause say what percentage of the squared errors it explains.
-
-    **Arguments:**
-
-    - `name`: a short name of the cause, such as "drag".
-    - `sensor`: the sensor that has the errors.
-    - `share`: the fraction of the sum of squared errors that the cause explains, 0 to 1.
-    - `words`: the cause in words.
-    - `remedy`: what to do about the cause, in words.
-    """
+    """Return a cause whose words say what fraction of the squared errors it explains."""
     kind = type(sensor).__name__
     explained = f"{100 * share:.0f} % of the squared errors of the {kind}"
     return Cause(name, kind, share, f"most likely {words}: {explained}", remedy)
 
 
-def _cause_with_largest_share(
-    sensor: AbstractSensor,
-    candidates: Sequence[tuple[str, np.ndarray, str, str]],
-    shares: Sequence[tuple[float, np.ndarray]],
+def _likeliest(
+    sensor: AbstractSensor, candidates: Sequence[_Candidate], shares: Sequence[_Share]
 ) -> Cause | None:
-    """Return the cause that explains the largest fraction of the squared errors of a `sensor`.
+    """Return the cause that explains most of the squared errors of a `sensor`, if that is enough.
 
-    Causes that explain nearly as large a fraction are joined to it by "or". The result is `None` if
-    the largest fraction is at most 0.7.
-
-    The fractions are computed as if the readings changed in proportion to the size of a cause. A
-    large error of the scale, mounting or skew does not change the readings in proportion to its
-    size, so that it is left out. A large scale error is kept only if it is the same for all axes,
-    since it then shows a wrong unit.
-
-    **Arguments:**
-
-    - `sensor`: the sensor that has the errors.
-    - `candidates`: for each possible cause four things, as `_candidate_causes` returns them: its
-      name; the change of the readings by a cause of unit size; the cause in words; and its remedy
-      in words.
-    - `shares`: for each possible cause two things: the fraction of the squared errors that it
-      explains; and its size (c,), the c numbers of the cause, such as the components of a bias.
+    Causes that explain nearly as much are joined to it by "or". A large error of the scale,
+    mounting or skew does not change the readings in proportion to its size, as the shares take it,
+    so that it is left out.
     """
     kept = [
-        (share, name, words.format(size=", ".join(f"{x:.2g}" for x in size)), remedy)
-        for (name, _, words, remedy), (share, size) in zip(candidates, shares, strict=True)
-        if name not in LINEAR
+        (share, one.name, one.words.format(size=", ".join(f"{x:.2g}" for x in size)), one.remedy)
+        for one, (share, size) in zip(candidates, shares, strict=True)
+        if one.name not in LINEAR
         or np.abs(size).max() < SMALL
         # A wrong unit, such as g read as m/s², is a large scale error that is the same for all
         # axes.
-        or (name == "scale" and np.ptp(size) < 0.1 * abs(size.mean()))
+        or (one.name == "scale" and np.ptp(size) < 0.1 * abs(size.mean()))
     ]
     most = max((share for share, *_ in kept), default=0.0)
     if not most > ENOUGH:
@@ -350,38 +292,20 @@ def _cause_with_largest_share(
 
 
 def _is_vector_error(sensor: AbstractSensor) -> bool:
-    """Return whether a `sensor` reads a vector along three axes, with an error for each axis."""
     return sensor.reading_shape == (3,) and sensor.components == 3
 
 
-def _candidate_causes(
+def _candidates(
     model: Model, x: Float[Array, " n"], linear: Linearisation, index: int
-) -> tuple[tuple[str, np.ndarray, str, str], ...]:
-    """Return the possible causes of the errors of a sensor, and how each cause would change the
-    readings.
-
-    **Arguments:**
-
-    - `model`: the fitted model.
-    - `x`: (n,) the free numbers at the best point.
-    - `linear`: the errors and their derivatives at x.
-    - `index`: the index of the sensor.
-
-    **Returns** for each cause four things:
-
-    - its name, such as "bias";
-    - the change (R, T, 3, c) of the readings by a cause of unit size, for R recordings, T times,
-      three axes and the c numbers of the cause, such as the three components of a bias;
-    - the cause in words, in which `{size}`, if it occurs, stands for the size of the cause;
-    - the remedy in words.
-    """
+) -> list[_Candidate]:
+    """Return the possible causes of the errors of a sensor."""
     reading = model.records.readings[index]
     t, shown = np.asarray(model.records.t), np.asarray(reading.values) - linear.raw[index]
     axes = np.broadcast_to(np.eye(3), (*shown.shape, 3))
     turned = np.cross(shown[..., None, :], axes).swapaxes(-1, -2)
     unit, itself = reading.sensor.unit, shown[..., None] * axes
-    response = _rate_response_to_torques(model, x, linear, index)
-    return (
+    response = _rate_response(model, x, linear, index)
+    rows = (
         ("lag", slope_in_time(model, shown)[..., None], "a clock offset of {size} s",
          "let a Free move the sensor's offset, or the delay of the torque's log"),
         ("bias", axes, f"a bias left out, ({{size}}) {unit}", "let a Free move the sensor's bias"),
@@ -402,34 +326,25 @@ def _candidate_causes(
          f"a bias that drifts by ({{size}}) {unit} a second",
          "cut the record into pieces with a bias each"),
     )  # fmt: skip
+    return [_Candidate(*row) for row in rows]
 
 
-def _rate_response_to_torques(
+def _rate_response(
     model: Model, x: Float[Array, " n"], linear: Linearisation, index: int
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that maps torques to the changes of the body rate that the torques make.
+    """Return a function from torques τ (R, T, 3, c) to the changes of the body rate by them.
 
-    The torques τ, in N m, and the changes, in rad/s, have the shape (R, T, 3, c), for R recordings,
-    T times and c torques in the body frame. The change at the time t is `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt`, with
-    the integral from the first time to t. Here I is the inertia tensor, and Φ = dΩ/dΩ₀ is the
-    derivative of the body rate Ω with respect to the initial rate Ω₀ along the fitted motion.
-
-    **Arguments:**
-
-    - `model`: the fitted model.
-    - `x`: (n,) the free numbers at the best point.
-    - `linear`: the errors at x with their derivatives, which hold Φ.
-    - `index`: the index of the sensor. The change is zero if this sensor is not a `Gyro`.
+    The change is `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt`, with the integral from the first time to t, where
+    Φ = dΩ/dΩ₀ is the derivative of the rate with respect to the initial rate along the fitted
+    motion. It is zero for a sensor that is not a `Gyro`.
     """
     if not isinstance(model.records.readings[index].sensor, Gyro):
         return np.zeros_like
-    width = model.index.width
+    width, of = model.index.width, model.body_indices
     flow = linear.raw_slopes[index][..., width - 3 : width]
-    tensors = np.stack([np.asarray(tensor_of(b)) for b in body_list(model.bodies(x))])
-    of = (
-        np.zeros(model.count, int) if model.body_indices is None else np.asarray(model.body_indices)
-    )
-    back = np.linalg.pinv(flow) @ np.linalg.inv(tensors)[of][:, None]
+    tensors = np.stack([np.asarray(tensor_of(b)) for b in bodies_as_list(model.bodies(x))])
+    back = np.linalg.inv(tensors)[np.zeros(model.count, int) if of is None else np.asarray(of)]
+    back = np.linalg.pinv(flow) @ back[:, None]
     steps = np.diff(np.asarray(model.records.t), axis=1)[..., None, None]
 
     def response(torque: np.ndarray) -> np.ndarray:
@@ -440,31 +355,18 @@ def _rate_response_to_torques(
     return response
 
 
-def _explained_share(
+def _share(
     model: Model,
     noise: Noise,
     linear: Linearisation,
     index: int,
-    free_columns: np.ndarray,
-    direction: np.ndarray,
-) -> tuple[float, np.ndarray]:
-    """Return two things: the fraction of a sensor's squared errors that a cause explains, 0 to 1;
-    and the size (c,) of the cause.
+    free_columns: Float[np.ndarray, "records rows m"],
+    direction: Float[np.ndarray, "records times k c"],
+) -> _Share:
+    """Return the fraction of a sensor's squared errors that a cause along `direction` explains.
 
-    A cause has c numbers, such as the three components of a bias. The direction of one of these
-    numbers is the change of the readings if this number is one and all others are zero. The size of
-    the cause holds the coefficients of the c directions in the least-squares fit of the errors.
-
-    **Arguments:**
-
-    - `model`: the fitted model.
-    - `noise`: the standard deviations of the errors of each sensor.
-    - `linear`: the errors and their derivatives at the best point.
-    - `index`: the index of the sensor.
-    - `free_columns`: (R, N, m) for each of R recordings m orthonormal columns. They span all
-      changes that the free numbers can make in the N errors of the recording. These changes are
-      subtracted from the directions and from the errors.
-    - `direction`: (R, T, k, c) the c directions, for T times and k components of a reading.
+    The `free_columns` are orthonormal and span all changes of the errors that the parameters can
+    make, which are subtracted from directions and errors.
     """
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]
@@ -484,4 +386,4 @@ def _explained_share(
     projection = np.where(s > APART, u.T @ residual_of_free(errors, 1)[:, 0], 0.0)
     total = float(np.sum(errors[index] ** 2))
     share = min(float(projection @ projection) / total, 1.0)
-    return share, v.T @ (projection / np.maximum(s, APART)) / size
+    return _Share(share, v.T @ (projection / np.maximum(s, APART)) / size)

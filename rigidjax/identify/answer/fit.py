@@ -177,19 +177,29 @@ def fit(
         finer = _converged_integrator(first, task, rough)
         task = task if rough else task._replace(model=_with_integrator(padded, finer))
     if descent is not None:
-        points = _descend_from_each(points, task, descent, key, progress, interrupts)
-    attempts = _search_from_each(points, task, checkpoint, progress, interrupts)
+        points = _descend(points, task, descent, key, progress, interrupts)
+    attempts = _search(points, task, checkpoint, progress, interrupts)
     best = min(attempts, key=_finite_cost)
     lowest = float(best.cost)
-    for estimated in (_estimate_noise_in_turn, _estimate_spreads_in_turn):
+    for estimated in (_noise_in_turn, _spreads_in_turn):
         best, task = estimated(best, task)
-    best = _with_errors_and_derivatives(best, task.model)
+    best = _with_blocks(best, task.model)
     rough.clear()
     while (finer := _converged_integrator(best, task, rough)) is not None:
         task = task._replace(model=_with_integrator(task.model, finer))
-        best, task = _estimate_noise_in_turn(search_whole(Attempt(best.x), task), task)
-        best = _with_errors_and_derivatives(best, task.model)
-    shown = model if task.model is padded else _with_original_readings(model, task.model)
+        best, task = _noise_in_turn(search_whole_records(Attempt(best.x), task), task)
+        best = _with_blocks(best, task.model)
+    shown = model
+    if task.model is not padded:
+        # The model that is shown has no masked readings at the end of recordings. It keeps the
+        # scatter of the time stamps (jitter) that the fit estimated.
+        records = model.records
+        for index, r in enumerate(task.model.records.readings):
+            if r.jitter_error is not None:
+                one, jitter = records.readings[index], cast(Any, r.sensor).jitter
+                one = one.with_jitter(r.jitter_error[:, : one.mask.shape[1]], jitter.deviation)
+                records = eqx.tree_at(lambda a, i=index: a.readings[i], records, one)
+        shown = eqx.tree_at(lambda m: m.records, task.model, records)
     return assess(task.model, best, task.noise, attempts, lowest, shown, interrupts, rough)
 
 
@@ -197,12 +207,10 @@ _ON_CPU = "computed on the CPU, which is faster than a GPU for so few readings"
 
 
 def _cpu_if_faster(model: Model) -> Any:
-    """Return the CPU if a fit of the `model` is faster on the CPU than on the default device, else
-    `None`.
+    """Return the CPU if a fit is faster there than on the default device, else `None`.
 
-    The result is `None` in four cases: the arrays of the model hold so many numbers that a GPU is
-    faster; the machine has no GPU; the user chose a device by `jax.default_device`; or the user put
-    arrays of the model on a device.
+    The result is `None` as well if the user chose a device, by `jax.default_device` or by arrays
+    of the model that were put there.
     """
     chosen: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     if chosen is not None or jax.default_backend() == "cpu":
@@ -213,61 +221,25 @@ def _cpu_if_faster(model: Model) -> Any:
     return jax.devices("cpu")[0]
 
 
-def _with_original_readings(original: Model, fitted: Model) -> Model:
-    """Return the `fitted` model with the readings of the `original` model in place of its padded
-    readings.
-
-    A fit adds masked readings at the end of each recording, so that recordings of similar length
-    share one compiled program. The scatter of the time stamps (jitter) that the fit estimated is
-    kept.
-    """
-    records = original.records
-    for index, r in enumerate(fitted.records.readings):
-        if r.jitter_error is not None:
-            one, jitter = records.readings[index], cast(Any, r.sensor).jitter
-            one = one.with_jitter(r.jitter_error[:, : one.mask.shape[1]], jitter.deviation)
-            records = eqx.tree_at(lambda a, i=index: a.readings[i], records, one)
-    return eqx.tree_at(lambda m: m.records, fitted, records)
-
-
 def _finite_cost(attempt: Attempt) -> float:
-    """Return the cost at the end of a search, or infinity if it is NaN, so that NaN is never taken
-    for the least cost.
-
-    The cost is half the sum of squared residuals. The `attempt` is the end of the search from one
-    starting point.
-    """
+    """Return the cost at the end of a search, or infinity in place of NaN."""
     cost = float(attempt.cost)
     return cost if np.isfinite(cost) else np.inf
 
 
-def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
-    """Estimate the unknown noise of sensors and the best point alternately, until the noise settles
-    or a largest number of rounds is reached.
+def _noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
+    """Estimate the unknown noise of sensors and the best point alternately.
 
-    If all noise is known, the arguments are returned unchanged.
-
-    **Arguments:**
-
-    - `best`: the best point for the noise in `task`.
-    - `task`: the model and the noise of its sensors, with the tolerance and the largest number of
-      steps of a search.
-
-    **Returns** two things: the new best point; and the task with the new noise.
+    The rounds end when the noise settles; known noise is left as it is.
     """
     if all(reading.has_known_noise for reading in task.model.records.readings):
         return best, task
-
-    def estimate(best: Attempt, task: Task) -> Task:
-        blocks = _with_errors_and_derivatives(best, task.model).blocks
-        model, noise = estimate_noise(task.model, best.x, blocks, task.noise)
-        return task._replace(model=model, noise=noise)
-
-    # Repeat the estimate of the noise, because a new noise changes three things on which the
-    # estimate depends: the weights of the sensors, the weights of the robust loss, and the degrees
-    # of freedom that the fit uses up.
+    # Repeat the estimate of the noise, because it depends on what a new noise changes: the weights
+    # of the sensors, the weights of the robust loss, and the degrees of freedom that the fit uses.
     for turn in range(_ROUNDS):
-        before, task = task.noise, estimate(best, task)
+        before, blocks = task.noise, _with_blocks(best, task.model).blocks
+        model, noise = estimate_noise(task.model, best.x, blocks, before)
+        task = task._replace(model=model, noise=noise)
         pairs = zip(before, task.noise, strict=True)
         if turn > 1 and all(np.allclose(b, a, rtol=_SETTLED, atol=0.0) for a, b in pairs):
             break
@@ -275,7 +247,7 @@ def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     return best, task
 
 
-def _descend_from_each(
+def _descend(
     points: list[Array],
     task: Task,
     descent: Descent,
@@ -283,18 +255,9 @@ def _descend_from_each(
     progress: Callable[[str], Any] | None,
     interrupts: list[str],
 ) -> list[Array]:
-    """Return the free numbers (n,) to which stochastic gradient descent leads from each starting
-    point.
+    """Return where stochastic gradient descent leads from each starting point.
 
-    **Arguments:**
-
-    - `points`: the free numbers (n,) at each start.
-    - `task`: the model, and the noise of its sensors.
-    - `descent`: the settings of the descent (optimiser, steps and batch).
-    - `key`: the key of the random batches, or `None` for the same batches at each call.
-    - `progress`: a function that is called with a line of text, or `None`.
-    - `interrupts`: a list, to which a line is added after an interrupt (Ctrl-C). The remaining
-      starts are then left out.
+    After an interrupt (Ctrl-C) a line is added to `interrupts`, and further starts are left out.
     """
     keys = jax.random.split(jax.random.key(1) if key is None else key, len(points))
     out: list[Array] = []
@@ -307,7 +270,7 @@ def _descend_from_each(
     return out
 
 
-def _search_from_each(
+def _search(
     points: list[Array],
     task: Task,
     checkpoint: str | Path | None,
@@ -316,17 +279,8 @@ def _search_from_each(
 ) -> list[Attempt]:
     """Return the end of the least-squares search from each starting point.
 
-    **Arguments:**
-
-    - `points`: the free numbers (n,) at each start.
-    - `task`: the model and the noise of its sensors, with the tolerance and the largest number of
-      steps of a search.
-    - `checkpoint`: the file that holds the ends of earlier searches, which are not repeated, and in
-      which each new end is saved; `None` for no file.
-    - `progress`: a function that is called with a line of text after each search, or `None`.
-    - `interrupts`: a list, to which a line is added after an interrupt (Ctrl-C). The remaining
-      starts are then left out. If no search has ended or reached a finite cost, the interrupt is
-      raised again.
+    Searches in the file `checkpoint` are not repeated. After an interrupt (Ctrl-C) a line is added
+    to `interrupts`, and further starts are left out; it is raised again if no search has ended.
     """
     like, print_of = Attempt(points[0]), ""
     if checkpoint is not None:
@@ -368,35 +322,21 @@ def _search_from_each(
     return attempts
 
 
-def _with_errors_and_derivatives(best: Attempt, model: Model) -> Attempt:
-    """Return `best`, the end of a search, with the errors of the `model` at its free numbers and
-    the derivatives of the errors.
-
-    Errors and derivatives are computed only if `best` does not hold them already.
-    """
+def _with_blocks(best: Attempt, model: Model) -> Attempt:
+    """Return the end of a search with the errors there and their derivatives, if it lacks them."""
     if best.blocks is not None:
         return best
     return dataclasses.replace(best, blocks=blocks_at(model, best.x))
 
 
 @eqx.filter_jit
-def _errors_without_derivatives(
-    model: Model, x: Float[Array, " n"]
-) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors of all sensors at the free numbers x (n,) of a `model`, without
-    derivatives.
-
-    There is one array (R, T, k) for each sensor, for R recordings, T times and k components of an
-    error. A program without derivatives takes less time to compile.
-    """
+def _only_errors(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
+    """Return the errors of all sensors: without derivatives a program compiles sooner."""
     return all_errors(model, x)
 
 
 def _with_integrator(model: Model, integrator: AbstractIntegrator | None) -> Model:
-    """Return the `model` with the `integrator` in place of its own integrator.
-
-    If `integrator` is `None`, the model is returned unchanged.
-    """
+    """Return the `model` with another integrator, or unchanged for `None`."""
     if integrator is None:
         return model
     return eqx.tree_at(lambda m: m.integrator, model, integrator)
@@ -407,16 +347,8 @@ def _converged_integrator(
 ) -> AbstractIntegrator | None:
     """Return an integrator with steps so short that shorter steps hardly change the predictions.
 
-    Predictions hardly change if each change is at most a twentieth of the noise. The result is
-    `None` if the present integrator of the model is accurate enough.
-
-    **Arguments:**
-
-    - `best`: the end of a search, with the errors at its free numbers. The predictions of two
-      integrators are compared at these numbers.
-    - `task`: the model with its integrator, and the noise of its sensors.
-    - `remarks`: a list, to which a line is added if even the shortest steps still change the
-      predictions.
+    They may change by a twentieth of the noise. The result is `None` if the present integrator is
+    accurate enough; a line is added to `remarks` if even the shortest steps are not.
     """
     model, (errors, _) = task.model, best.blocks
     steps, apart = model.integrator, 0.0
@@ -425,7 +357,7 @@ def _converged_integrator(
         if jax.tree.structure(finer) == jax.tree.structure(model.integrator):
             exact, _ = blocks_at(closer, best.x)
         else:
-            exact = _errors_without_derivatives(closer, best.x)
+            exact = _only_errors(closer, best.x)
         apart = max(
             float(np.max(np.abs(np.asarray(a) - np.asarray(b)) / np.asarray(sigma)[:, None]))
             for a, b, sigma in zip(errors, exact, task.noise, strict=True)
@@ -447,29 +379,22 @@ def _converged_integrator(
     return None if steps is model.integrator else steps
 
 
-def _estimate_spreads_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
-    """Estimate the unknown spreads of `Free`s (numbers that a fit may move) and the best point
-    alternately, until the spreads settle or a largest number of rounds is reached.
-
-    The spread of a `Free` is the standard deviation, between recordings, of its value about the
-    value that the recordings share. If no spread is unknown, the arguments are returned unchanged.
-
-    **Arguments:**
-
-    - `best`: the best point for the spreads in `task`.
-    - `task`: the model with its spreads, and the noise of its sensors, with the tolerance and the
-      largest number of steps of a search.
-
-    **Returns** two things: the new best point; and the task with the new spreads.
-    """
+def _spreads_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
+    """Estimate the unknown spreads of `Free`s and the best point alternately, until they settle."""
     indices = [index for index, slot in enumerate(task.model.slots) if slot.estimated]
     if not indices:
         return best, task
     before = np.asarray([task.model.slots[i].spread for i in indices], float)
+    places = [np.ravel(task.model.slots[i].own).astype(int) for i in indices]
     least = _LEAST * before
     for _ in range(_ROUNDS):
-        best = _with_errors_and_derivatives(best, task.model)
-        new = np.maximum(_expected_spreads(best, task, indices), least)
+        best = _with_blocks(best, task.model)
+        # The expected mean square of the deviations of recordings from the shared value: Laplace's
+        # method takes the posterior density as normal about the best point.
+        linear = linearise(task.model, best.x, task.noise, best.blocks)
+        variance, x = np.diag(white_covariance(linear).determined), np.asarray(best.x)
+        squares = [np.mean(x[mine] ** 2) + np.mean(variance[mine]) for mine in places]
+        new = np.maximum(np.sqrt(squares), least)
         widths = [jnp.asarray(width) for width in new]
         model = eqx.tree_at(lambda m: [m.slots[i].spread for i in indices], task.model, widths)
         task = task._replace(model=model)
@@ -478,24 +403,3 @@ def _estimate_spreads_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]
             break
         before = new
     return best, task
-
-
-def _expected_spreads(best: Attempt, task: Task, indices: list[int]) -> np.ndarray:
-    """Return the expected spread (k,) of each of k `Free`s (numbers that a fit may move) whose
-    value differs between recordings.
-
-    The spread is the root mean square, over recordings, of the deviation of the value of a `Free`
-    in one recording from the value that the recordings share. The expectation is over the posterior
-    density of the free numbers, which Laplace's method takes as normal about the point `best`.
-
-    **Arguments:**
-
-    - `best`: the end of a search, with the errors and their derivatives there.
-    - `task`: the model and the noise of its sensors.
-    - `indices`: the indices of the k `Free`s in `task.model.slots`, the list of all `Free`s of the
-      model.
-    """
-    linear = linearise(task.model, best.x, task.noise, best.blocks)
-    variance, x = np.diag(white_covariance(linear).determined), np.asarray(best.x)
-    places = [np.ravel(task.model.slots[i].own).astype(int) for i in indices]
-    return np.sqrt([np.mean(x[mine] ** 2) + np.mean(variance[mine]) for mine in places])

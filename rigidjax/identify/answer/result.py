@@ -165,7 +165,7 @@ class Fit(eqx.Module):
         """
         # Do not use χ² under a robust loss: outliers would dominate χ².
         error_ratio = np.sqrt(self.chi2 / self.dof) if self.model.loss is None else 1.0
-        words = answers.advice_on_intervals(
+        words = answers.advice(
             self.search,
             self.explanation,
             self.causes,

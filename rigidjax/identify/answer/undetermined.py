@@ -158,7 +158,7 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
     out = []
     for row in rows:
         direction = np.linalg.lstsq(basis.T, row)[0] @ null
-        # The derivatives of the readings along `direction` are zero, but the readings may change all
+        # The derivatives of the readings along `direction` are zero. The readings may change all
         # the same: where a torque switches at a time or a state that moves. Half the difference of
         # a step forwards and a step backwards shows it; readings that depend on the square of a
         # number change by the same in both.
