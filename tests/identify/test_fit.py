@@ -339,7 +339,7 @@ def test_a_record_of_another_length_is_the_same_program(caplog):
     programs = set(re.findall(r"Compiling jit\((\w+)\)", caplog.text))
     named = {
         "least_squares_from",
-        "_only_errors",
+        "all_errors",
         "_linearised",
         "_quantities_at",
     }

@@ -22,8 +22,8 @@ from rigidjax.identify.filtering.steps import (
     ExtendedState,
     ReadNumbers,
     Stops,
+    correlated_torques,
     dynamics_of,
-    time_correlated_torques,
 )
 from rigidjax.identify.model.model import Model, checked_x, require_single
 from rigidjax.identify.model.scene import Process, Scene
@@ -133,7 +133,16 @@ def first_belief(
     scene, record = scene_and_recording(model, x)
     start: Any = scene.start if state is None else state
     if state is None and x is None:
-        _require_shown_attitude(record, start)
+        if not _checks.is_known(record):
+            raise TypeError(
+                "state: wanted the initial state, got None; the readings cannot show it, since "
+                "they are traced by JAX"
+            )
+        if isinstance(start, HasAttitude) and not len(attitudes(record)[1]):
+            raise ValueError(
+                "state: the readings alone show no initial attitude (an attitude sensor, two "
+                "directions, or three markers do); give an Attitude"
+            )
     _checks.require_unbatched_instance(
         start, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid"
     )
@@ -160,23 +169,13 @@ def belief_at(
     scene: Scene,
     drifts: Sequence[Drift],
 ) -> Belief:
-    """Return the `Belief` (an estimated state with a root of its covariance) at the time t, with
-    independent errors.
+    """Return the `Belief` at the time t with independent errors, in the dtype of the `state`.
 
-    All arrays except the time get the dtype of the `state`.
-
-    **Arguments:**
-
-    - `t`: the time, s.
-    - `state`: the estimated motion, a `Spin`, `Attitude` or `Rigid`.
-    - `deviations`: (k,) the standard deviations of the k components of an error of `state`.
-    - `scene`: the body, torques and sensors. Each `CorrelatedTorque` in it begins at zero, with the
-      standard deviation of its stationary distribution.
-    - `drifts`: the walks, which are numbers of the scene that drift randomly, such as the bias of a
-      gyro. They begin at their values in the scene.
+    The `deviations` are those of the motion. Each `CorrelatedTorque` begins at zero, with the
+    deviation of its stationary distribution, and walks begin at their values in the scene.
     """
     dtype = state.omega.dtype
-    coloured = time_correlated_torques(scene.process)
+    coloured = correlated_torques(scene.process)
     walks = tuple(value.astype(dtype) for value in drifting_values(scene, drifts))
     parts = [deviations, *(law.deviation for law in coloured)]
     parts += [drift.deviation.reshape(-1) for drift in drifts]
@@ -186,39 +185,10 @@ def belief_at(
     )
 
 
-def _require_shown_attitude(recording: Recording, state: HasSpin | None) -> None:
-    """Raise an error if the initial state of a filter has an attitude that no reading shows.
-
-    An attitude sensor, two directions or three markers show the attitude.
-
-    **Arguments:** `recording` the readings of all sensors; `state` the initial state, of which only
-    the type counts: an `Attitude` or a `Rigid` has an attitude, a `Spin` has none. **Raises:**
-    `TypeError` for a traced recording, whose readings cannot be looked at; `ValueError` if `state`
-    has an attitude and no reading shows it.
-    """
-    if not _checks.is_known(recording):
-        raise TypeError(
-            "state: wanted the initial state, got None; the readings cannot show it, since they "
-            "are traced by JAX"
-        )
-    if isinstance(state, HasAttitude) and not len(attitudes(recording)[1]):
-        raise ValueError(
-            "state: the readings alone show no initial attitude (an attitude sensor, two "
-            "directions, or three markers do); give an Attitude"
-        )
-
-
 def scene_and_recording(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recording]:
-    """Return the scene of the only recording of a `model`, and the recording (its times and
-    readings).
+    """Return the scene of the only recording at the parameters x, and the recording.
 
-    A scene holds all on which readings depend: the body, the torques, the sensors and the initial
-    state. The torque in the returned scene reads the inputs that the recording holds, such as a log
-    of thrust.
-
-    **Arguments:** `model` a `Model` of one recording; `x` (n,) its free numbers, at which the scene
-    is taken, or `None` for a model whose body is known. **Raises** `ValueError` for several
-    recordings, for a missing x, and for a sensor that a filter cannot use.
+    The torque of the scene reads the inputs that the recording holds.
     """
     require_single(model)
     if model.count != 1:
@@ -233,22 +203,15 @@ def scene_and_recording(model: Model, x: Float[Array, " n"] | None) -> tuple[Sce
                 "fit(model).x or model.start(body) makes them"
             )
         x = model.start()
-    scene = _scene_of_first_recording(model, checked_x(model, x))
+    scene = _first_scene(model, require_numbers(model, x))
     steps.require_sensors(scene.sensors)
     return scene, stacking.pick(model.records, 0)
 
 
 @eqx.filter_jit
-def _scene_of_first_recording(model: Model, x: Float[Array, " n"]) -> Scene:
-    """Return the scene of the first recording of a `model`, computed in one compiled program.
-
-    A scene holds all on which readings depend: the body, the torques, the sensors and the initial
-    state. The torque in the returned scene reads the inputs that the recording holds, such as a log
-    of thrust. Numbers of the scene that are free have the values of x (n,), the free numbers of the
-    model.
-    """
-    row = model.index.rows(x)[0]
-    record, reference, body_index = stacking.pick(
+def _first_scene(model: Model, x: Float[Array, " n"]) -> Scene:
+    row = model.index.rows_of_recordings(x)[0]
+    record, reference, body_index = stacking.pick_records(
         (model.records, model.reference, model.body_indices), 0
     )
     scene = scene_at(model, row, record, reference, body_index)
@@ -256,53 +219,28 @@ def _scene_of_first_recording(model: Model, x: Float[Array, " n"]) -> Scene:
 
 
 class Grid(NamedTuple):
-    """Hold the times at which the steps of a filter end.
+    """Hold the N times at which the steps of a filter end.
 
     These are the T times of the recording, and times between them if the intervals are long.
-
-    **Fields:**
-
-    - `t`: (N,) the times, s.
-    - `source`: (N,) for each time of `t`, the index of the first time of the recording that is not
-      earlier.
-    - `real`: (N,) for each time of `t`, whether it is a time of the recording, so that its readings
-      count.
-    - `rows`: (T,) the index in `t` of each time of the recording.
     """
 
-    t: Float[Array, " n"]
-    source: Int[Array, " n"]
-    real: Bool[Array, " n"]
-    rows: Int[Array, " t"]
+    t: Float[Array, " n"]  # s
+    source: Int[Array, " n"]  # the first time of the recording that is not earlier
+    real: Bool[Array, " n"]  # whether it is a time of the recording, whose readings count
+    rows: Int[Array, " t"]  # the index in `t` of each time of the recording
 
-    def at_recording_times(self, values: PyTree[Array]) -> PyTree[Array]:
-        """Return the entries of `values` at the times of the recording.
-
-        The arrays in `values` have a leading axis over all N times of this grid, the times at which
-        the steps of a filter end.
-        """
+    def at_recording(self, values: PyTree[Array]) -> PyTree[Array]:
+        """Return the entries of `values`, arrays over all times, at those of the recording."""
         # If all times of the grid are times of the recording, indexing would only copy the arrays.
         same = self.rows.size == self.t.size
         return values if same else jax.tree.map(lambda leaf: leaf[self.rows], values)
 
 
-def grid_of_step_times(
+def step_grid(
     process: Process | None, recording: Recording, belief: Belief, substeps: int | None
 ) -> Grid:
-    """Return the times at which the steps of a filter end, from the time of a `belief` to the last
-    reading.
-
-    The steps end at the times of the `recording`. If one step between two of these times would be
-    too long, steps also end at further times between the two, at equal distances.
-
-    **Arguments:**
-
-    - `process`: the unknown torque, or `None`. A step is at most a quarter of each of its
-      correlation times.
-    - `recording`: the times and readings.
-    - `belief`: the estimate from which the filter starts, at or before the first reading.
-    - `substeps`: the number of steps from one time of the recording to the next; `None` chooses
-      this number by the body rate and the correlation times.
+    """Return the times at which steps end: those of the recording and, if a step would be too long
+    (`steps.step_counts`), times between them at equal distances.
     """
     xp = _checks.array_module((recording.t, belief.t))
     t, t0 = xp.asarray(recording.t), xp.asarray(belief.t)
@@ -313,7 +251,7 @@ def grid_of_step_times(
         )
         _checks.error_if(t, t[0] < t0, words)
     ends = xp.concatenate([t0[None], t])
-    counts = steps.step_counts_between(process, ends, belief.x.motion, substeps, recording)
+    counts = steps.step_counts(process, ends, belief.x.motion, substeps, recording)
     index = np.repeat(np.arange(counts.size), counts)
     rows = np.cumsum(counts) - 1
     part = (np.arange(index.size) - np.repeat(rows - counts, counts)) / counts[index]
@@ -323,17 +261,7 @@ def grid_of_step_times(
 
 
 class FilterInput(NamedTuple):
-    """Hold the checked arguments of a filter, which `checked_input` makes.
-
-    **Fields:**
-
-    - `scene`: the body, known torque, unknown torque (`process`), sensors and initial state. The
-      known torque reads the inputs of the recording, such as a log of thrust.
-    - `drifts`: the walks of the model, which are numbers that drift randomly.
-    - `recording`: the readings.
-    - `first`: the belief before the first reading.
-    - `grid`: the times at which the steps of the filter end.
-    """
+    """Hold the checked arguments of a filter, which `checked_input` makes."""
 
     scene: Scene
     drifts: tuple[Drift, ...]
@@ -455,13 +383,11 @@ def filter(
     ((2, 3), (2, 3), 'followed')
     """
     run = _filter(checked_input(model, belief, x, substeps))
-    return raise_if_filter_lost(run) if throw else run
+    return require_followed(run) if throw else run
 
 
-def raise_if_filter_lost(run: Any) -> Any:
-    """Return the result `run` of a filter, or raise an error if the filter was lost or an estimate
-    is not finite.
-    """
+def require_followed(run: Any) -> Any:
+    """Return the result of a filter, or raise an error if it was lost or is not finite."""
     status = run.status
     at = f" (at {float(run.lost_at):g} s)" if _checks.is_known(run.lost_at) else ""
     advice = (
@@ -568,75 +494,41 @@ def step(
 
 @eqx.filter_jit
 def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) -> Belief:
-    """Return the estimate after one step of a filter to a new time and its readings, in one
-    compiled program.
-
-    **Arguments:**
-
-    - `scene`: the body, torques and sensors.
-    - `drifts`: the numbers that drift as random walks, such as the bias of a gyro.
-    - `belief`: the estimated state before the step, with a root S of the covariance `S Sᵀ` of its
-      errors.
-    - `stop`: the new time, s, and for each sensor its reading at this time and whether there is
-      one.
-    """
     # Missing readings do not count, but their derivatives must be finite. They are replaced by a
     # unit vector, since for a quaternion of zeros derivatives would be NaN.
     units = (jnp.eye(1, v.size, dtype=v.dtype).reshape(v.shape) for v in stop.values)
     values = tuple(map(jnp.where, stop.masks, stop.values, units))
     values = tuple(value.astype(belief.root.dtype) for value in values)
     dynamics = dynamics_of(scene, drifts, belief.x)
-    return _predict_and_update(dynamics, belief, stop._replace(values=values))[0]
+    return _update(dynamics, belief, stop._replace(values=values))[0]
 
 
-def _predict_and_update(
-    dynamics: Dynamics, belief: Belief, stop: Stops
-) -> tuple[Belief, ReadNumbers]:
-    """Return two things: the estimate after one step of a filter; and the readings of this step,
-    compared with their predictions.
-
-    The step first predicts the state at the new time by the equations of motion. Then it corrects
-    the state by the readings at this time.
-
-    **Arguments:**
-
-    - `dynamics`: the equations of motion, the noise of the torques, and the sensors.
-    - `belief`: the estimated state before the step, with a root S of the covariance `S Sᵀ` of its
-      errors.
-    - `stop`: the new time, s, and for each sensor its reading at this time and whether there is
-      one.
-
-    **Returns** the new `Belief`, and the `ReadNumbers` with three arrays (k,) for the k components
-    of all sensors: the innovations (reading minus prediction); their variances; and a mask, true
-    for a component that was read and is below full scale.
+def _update(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, ReadNumbers]:
+    """Return the estimate after a step to a new time and its readings, and these readings compared
+    with their predictions.
     """
     dtype = belief.root.dtype
     # Subtract times before they are rounded to the dtype of the state: after a thousand seconds the
     # seven digits of float32 are too few.
     since = (stop.t - belief.t).astype(dtype)
-    x, grown, noise = dynamics.predict_and_linearise(belief.t.astype(dtype), since, belief.x)
-    root = roots.predicted_covariance_root(grown, belief.root, noise)
+    x, grown, noise = dynamics.predict(belief.t.astype(dtype), since, belief.x)
+    root = roots.predicted_root(grown, belief.root, noise)
     matrix, error, deviation, mask = steps.linearise_readings(dynamics, stop, x)
     e = jnp.zeros_like(root[0])
     e, root, innovation, variance = roots.kalman_update(e, root, matrix, error, deviation**2, mask)
-    return Belief(
-        stop.t, plus(x, e), steps.covariance_root_about_neighbour(x, e, root)
-    ), ReadNumbers(innovation, variance, mask)
+    after = Belief(stop.t, plus(x, e), steps.recentred_root(x, e, root))
+    return after, ReadNumbers(innovation, variance, mask)
 
 
-def scan_filter(
-    run: FilterInput, keep: Callable[[Belief, ReadNumbers], PyTree[Array]]
-) -> tuple[Dynamics, Stops, PyTree[Array]]:
-    """Run the filter over all its times, with `lax.scan`, and store what `keep` picks at each time.
+class Scan(NamedTuple):
+    dynamics: Dynamics
+    stops: Stops
+    kept: PyTree[Array]  # with a leading axis of times
 
-    **Arguments:**
 
-    - `run`: the checked arguments of the filter.
-    - `keep`: a function of the `Belief` after the readings at a time and of the `ReadNumbers` at
-      this time (each reading minus its prediction). It returns the arrays to store.
-
-    **Returns** three things: the equations of the filter; the times with their readings, as
-    `Stops`; and the stored arrays, with a leading axis of times.
+def scan_filter(run: FilterInput, keep: Callable[[Belief, ReadNumbers], PyTree[Array]]) -> Scan:
+    """Run the filter over all its times, and store what `keep` picks of the `Belief` and the
+    `ReadNumbers` at each time.
     """
     scene, drifts, recording, first, grid = run
     dtype = first.root.dtype
@@ -646,60 +538,36 @@ def scan_filter(
     stops = Stops(grid.t, values, masks)
 
     def filter_step(belief: Belief, stop: Stops) -> tuple[Belief, Any]:
-        belief, read = _predict_and_update(dynamics, belief, stop)
+        belief, read = _update(dynamics, belief, stop)
         return belief, keep(belief, read)
 
     # Let a reverse pass compute each step again. Without `jax.checkpoint` it would store some
     # thousand numbers for each step.
     filter_step = jax.checkpoint(filter_step)  # pyright: ignore[reportPrivateImportUsage]
-    return dynamics, stops, lax.scan(filter_step, first, stops)[1]
+    return Scan(dynamics, stops, lax.scan(filter_step, first, stops)[1])
 
 
 @eqx.filter_jit
 def _filter(run: FilterInput) -> Filtered:
-    """Return the result of the Kalman filter `filter`, computed in one compiled program.
-
-    The argument `run` holds the checked arguments of `filter`: the body, torques, sensors and
-    initial state; the numbers that drift as random walks, such as the bias of a gyro; the readings;
-    the estimate before the first reading; and the times at which the steps end.
-    """
-    both = scan_filter(run, lambda belief, read: (belief, read))[2]
-    beliefs, read = run.grid.at_recording_times(both)
+    both = scan_filter(run, lambda belief, read: (belief, read)).kept
+    beliefs, read = run.grid.at_recording(both)
     reads = steps.split_by_sensor(run.scene.sensors, read)
-    total = roots.log_density_terms(*read).total_log_density
-    return Filtered(beliefs, reads, total, *status_and_loss_time(beliefs, reads, run.first.t))
+    total = roots.density_terms(*read).total
+    return Filtered(beliefs, reads, total, *outcome(beliefs, reads, run.first.t))
 
 
 @eqx.filter_jit
 def _log_likelihood(run: FilterInput) -> Scalar:
-    """Return the logarithm of the density of all readings, by a Kalman filter in one compiled
-    program.
-
-    The argument `run` holds the checked arguments of `log_likelihood`: the body, torques, sensors
-    and initial state; the numbers that drift as random walks, such as the bias of a gyro; the
-    readings; the estimate before the first reading; and the times at which the steps end.
-    """
-    return roots.log_density_terms(*scan_filter(run, lambda _, read: read)[2]).total_log_density
+    return roots.density_terms(*scan_filter(run, lambda _, read: read).kept).total
 
 
-def status_and_loss_time(
-    beliefs: Belief, reads: tuple[ReadNumbers, ...], t0: Array
-) -> tuple[Int[Array, ""], Scalar]:
-    """Return two things: whether a filter followed the readings; and the time, s, at which it was
-    lost.
+class Outcome(NamedTuple):
+    status: Int[Array, ""]  # the index of its text in `WORDS`
+    lost_at: Scalar  # s, NaN if the filter was not lost
 
-    The status is 0 if the filter followed the readings, 1 if it was lost, and 2 if an estimate is
-    NaN or infinite. The filter is lost if for at least a second, and for at least three readings of
-    one sensor in a row, no reading was within six standard deviations of its prediction. The time
-    is NaN if the filter was not lost.
 
-    **Arguments:**
-
-    - `beliefs`: the estimates at the T times of the recording.
-    - `reads`: for each sensor the innovations, (T, k) for k components, their variances, and a
-      mask.
-    - `t0`: the time of the belief before the first reading, s.
-    """
+def outcome(beliefs: Belief, reads: tuple[ReadNumbers, ...], t0: Array) -> Outcome:
+    """Return whether a filter, which began at the time t0, followed the readings."""
     t, times = beliefs.t, jnp.arange(beliefs.t.shape[0])
     lost = jnp.zeros(t.shape, bool)
     for read in reads:
@@ -714,25 +582,18 @@ def status_and_loss_time(
         lost = lost | (bad & (t - since >= LOST_AFTER) & many)
     whole = jnp.isfinite(beliefs.root).all() & jnp.isfinite(beliefs.x.motion.omega).all()
     status = jnp.where(whole, jnp.where(lost.any(), 1, 0), 2)
-    return status, jnp.where(lost.any(), t[jnp.argmax(lost)], jnp.nan)
+    return Outcome(status, jnp.where(lost.any(), t[jnp.argmax(lost)], jnp.nan))
 
 
 def checked_input(
     model: Model, belief: Belief, x: Float[Array, " n"] | None, substeps: int | None
 ) -> FilterInput:
-    """Return the arguments of `filter` and `smooth` after checks, with the scene and the times of
-    the steps.
-
-    **Arguments:** `model`, `belief`, `x` and `substeps` are as for `filter`. **Raises:**
-    `TypeError` for a `belief` without the parts of the state that a sensor reads, such as an
-    attitude; and the errors of `scene_and_recording` (for several recordings, a missing `x`, or a
-    sensor that a filter cannot use) and of `grid_of_step_times` (for readings before the belief).
-    """
+    """Return the arguments of `filter` and `smooth` after checks, which raise their errors."""
     scene, recording = scene_and_recording(model, x)
     _checks.require_instance(belief, Belief, "belief", hint="identify.first_belief makes it")
     for sensor in scene.sensors:
         if not isinstance(belief.x.motion, sensor.feels):
             kind, got = sensor.feels.__name__, type(belief.x.motion).__name__
             raise TypeError(f"belief: a sensor needs a state with {kind}, got a {got}")
-    grid = grid_of_step_times(scene.process, recording, belief, substeps)
+    grid = step_grid(scene.process, recording, belief, substeps)
     return FilterInput(scene, model.walks, recording, belief, grid)

@@ -64,10 +64,8 @@ class LinearModel(eqx.Module):
         offset: Parameter | None = None,
     ):
         self.transition = _checks.numeric_array(transition, "transition")
-        self.noise, self.matrix = (
-            _checks.numeric_array(noise, "noise"),
-            _checks.numeric_array(matrix, "matrix"),
-        )
+        self.noise = _checks.numeric_array(noise, "noise")
+        self.matrix = _checks.numeric_array(matrix, "matrix")
         sigma = _checks.numeric_array(deviation, "deviation")
         words = (
             "deviation: wanted positive standard deviations; a measurement without noise is "
@@ -177,7 +175,7 @@ def linear_filter(
     >>> estimate.mean[0].tolist(), estimate.innovation[0].tolist()
     ([0.5], [1.0])
     """
-    return linear_estimate(*_checked_arguments(model, readings, mean, root, mask), smooth=False)
+    return linear_estimate(*_checked(model, readings, mean, root, mask), smooth=False)
 
 
 def linear_smooth(
@@ -198,34 +196,26 @@ def linear_smooth(
     >>> bool(estimate.mean[0, 0] > 0.5), estimate.kicks.shape
     (True, (2, 1))
     """
-    return linear_estimate(*_checked_arguments(model, readings, mean, root, mask), smooth=True)
+    return linear_estimate(*_checked(model, readings, mean, root, mask), smooth=True)
 
 
-def _checked_arguments(
+class _Problem(NamedTuple):
+    parts: ArraysByField
+    readings: Float[Array, "times k"]  # zero where masked
+    mean: Float[Array, " n"]
+    root: Float[Array, "n n"]
+    mask: Bool[Array, "times k"]
+
+
+def _checked(
     model: LinearModel, readings: Readings, mean: Mean, root: Root, mask: Mask
-) -> tuple[ArraysByField, Array, Array, Array, Array]:
-    """Return the arguments of `linear_filter` (a Kalman filter) or `linear_smooth` as checked
-    arrays.
-
-    **Arguments:**
-
-    - `model`: the linear model, with n entries of the state and k numbers read at a time.
-    - `readings`: (T, k) the numbers read at each of T times.
-    - `mean`, `root`: (n,) the mean of the first state, and (n, n) a root S of its covariance
-      `S Sᵀ`.
-    - `mask`: (T, k) true for the numbers to use; `None` to use all.
-
-    **Returns** five things: the arrays of the `model` as a dict of field name → array; the
-    readings, with zeros in place of masked ones; the `mean`; the `root`; and the mask (T, k).
-    **Raises** `ValueError` for shapes that do not fit, and for NaN or infinity that is not masked.
-    """
+) -> _Problem:
+    """Return the arguments of `linear_filter` after checks, which raise its errors."""
     _checks.require_instance(model, LinearModel, "model")
     n, k = model.size, model.deviation.shape[-1]
     readings = _checks.array_of_rows(readings, (k,), "readings")
-    mean, root = (
-        _checks.array_of_shape(mean, (n,), "mean"),
-        _checks.array_of_shape(root, (n, n), "root"),
-    )
+    mean = _checks.array_of_shape(mean, (n,), "mean")
+    root = _checks.array_of_shape(root, (n, n), "root")
     times = readings.shape[0]
     if not times:
         raise ValueError("readings: wanted at least one row, got none")
@@ -240,20 +230,15 @@ def _checked_arguments(
     words = "readings: contains NaN or infinity; mask it if it is a gap"
     readings = jnp.where(mask, _checks.error_if(readings, bad.any(), words), 0)
     parts = {name: getattr(model, name) for name in _AXES}
-    for name, part in _drop_constant_arrays(parts).items():
+    for name, part in _varying(parts).items():
         wanted = times - 1 if name in _STEPS else times
         if part.shape[0] != wanted:
             raise ValueError(f"{name}: wanted {wanted} rows for {times} times, got {part.shape[0]}")
-    return parts, readings, mean, root, mask
+    return _Problem(parts, readings, mean, root, mask)
 
 
-def _drop_constant_arrays(parts: ArraysByField) -> ArraysByField:
-    """Return the arrays of a linear model that change from step to step or from time to time.
-
-    An array that changes has one more axis, its first, than an array that does not change. The
-    argument `parts` and the result are dicts that map the name of a field of `LinearModel` to its
-    array. An entry of `parts` that is `None` is left out.
-    """
+def _varying(parts: ArraysByField) -> ArraysByField:
+    """Return the arrays that change from step to step: these have one more axis, their first."""
     return {n: part for n, part in parts.items() if part is not None and part.ndim > _AXES[n]}
 
 
@@ -261,25 +246,15 @@ def _drop_constant_arrays(parts: ArraysByField) -> ArraysByField:
 def linear_estimate(
     parts: ArraysByField, readings: Array, mean: Array, root: Array, mask: Array, *, smooth: bool
 ) -> LinearEstimate:
-    """Return the states of a linear model at T times, estimated by the Kalman filter or the
-    smoother.
+    """Return the states of a linear model by the Kalman filter or, with `smooth`, by the smoother.
 
-    **Arguments:**
-
-    - `parts`: the arrays of a `LinearModel`, as a dict of field name → array.
-    - `readings`: (T, k) the numbers read at each time.
-    - `mean`, `root`: (n,) the mean of the first state, and (n, n) a root of its covariance, before
-      the first readings.
-    - `mask`: (T, k) true for the numbers that count.
-    - `smooth`: whether each state is estimated from all readings (the smoother of Rauch, Tung and
-      Striebel), and not only from the readings up to its time.
+    The `parts` are the arrays of a `LinearModel`; `mean` and `root` are before the first readings.
     """
-    steps = {name: part for name, part in _drop_constant_arrays(parts).items() if name in _STEPS}
-    times = {
-        name: part for name, part in _drop_constant_arrays(parts).items() if name not in _STEPS
-    }
+    varying = _varying(parts)
+    steps = {name: part for name, part in varying.items() if name in _STEPS}
+    times = {name: part for name, part in varying.items() if name not in _STEPS}
 
-    def update_by_readings(row: tuple, mean: Array, root: Array) -> roots.Update:
+    def update_by(row: tuple, mean: Array, root: Array) -> roots.Update:
         times, y, mask = row
         at_time: dict[str, Any] = parts | times
         error = y if at_time["offset"] is None else y - at_time["offset"]
@@ -287,7 +262,7 @@ def linear_estimate(
             mean, root, at_time["matrix"], error, at_time["deviation"] ** 2, mask
         )
 
-    def advance_to_next_time(
+    def advance(
         carry: tuple[Array, Array], row_of_step: tuple[ArraysByField, tuple]
     ) -> tuple[Any, Any]:
         (mean, root), (steps, row) = carry, row_of_step
@@ -296,63 +271,37 @@ def linear_estimate(
         predicted = jnp.sum(transition * mean[None], 1)
         if push is not None:
             predicted = predicted + push
-        joint = smoother_gain_and_roots(transition, noise, root) if smooth else None
-        before = (
-            roots.predicted_covariance_root(transition, root, noise)
-            if joint is None
-            else joint.predicted
-        )
-        update = update_by_readings(row, predicted, before)
+        joint = smoother_matrices(transition, noise, root) if smooth else None
+        before = joint.predicted if joint else roots.predicted_root(transition, root, noise)
+        update = update_by(row, predicted, before)
         return (update.step, update.root), (update, predicted, joint)
 
     rows = times, readings, mask
     first_row, later_rows = (
         jax.tree.map(lambda leaf, at=at: leaf[at], rows) for at in (0, slice(1, None))
     )
-    first = update_by_readings(first_row, mean, root)
-    _, (rest, predicted, joint) = lax.scan(
-        advance_to_next_time, (first.step, first.root), (steps, later_rows)
-    )
+    first = update_by(first_row, mean, root)
+    _, (rest, predicted, joint) = lax.scan(advance, (first.step, first.root), (steps, later_rows))
     updates = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
     means, all_roots, innovation, variance = updates
-    total, kicks = (
-        roots.log_density_terms(innovation, variance, mask).total_log_density,
-        (None, None),
-    )
+    total, kicks = roots.density_terms(innovation, variance, mask).total, (None, None)
     if smooth:
         end, noise = (means[-1], all_roots[-1]), parts["noise"]
-        means, all_roots, *kicks = smoother_backward_pass(joint, means[:-1], predicted, noise, end)
+        means, all_roots, *kicks = backward_pass(joint, means[:-1], predicted, noise, end)
     return LinearEstimate(means, all_roots, innovation, variance, total, *kicks)
 
 
 class SmootherMatrices(NamedTuple):
-    """Hold the matrices of one forward step that the backward pass of a smoother needs.
+    """Hold the matrices of one forward step that the backward pass of a smoother needs."""
 
-    `smoother_gain_and_roots` computes them.
-
-    **Fields:**
-
-    - `predicted`: a root of the covariance of the predicted state after the step.
-    - `gain`: the gain of the smoother, a matrix that maps a change of the state after the step to
-      the change of the state before the step.
-    - `rest`: a root of the covariance of the state before the step, if the state after the step is
-      known.
-    """
-
-    predicted: Float[Array, "n n"]
-    gain: Float[Array, "n n"]
-    rest: Float[Array, "n n"]
+    predicted: Float[Array, "n n"]  # a root of the covariance of the predicted state
+    gain: Float[Array, "n n"]  # maps a change after the step to the change before it
+    rest: Float[Array, "n n"]  # a root of the covariance before, for a known state after the step
 
 
-def smoother_gain_and_roots(transition: Array, noise: Array, root: Array) -> SmootherMatrices:
-    """Return the gain of a smoother and two roots of covariances for one step.
-
-    The three matrices are computed from blocks of the triangular root of the matrix `[[F S, G], [S,
-    0]]` (Park and Kailath 1995, doi:10.1080/00207179508921582).
-
-    **Arguments:** `transition` F (n, n), which maps a state before the step to the state after it;
-    `noise` G (n, m), a root of the covariance that the noise of the step adds; `root` S (n, n), a
-    root of the covariance of the state before the step. **Returns** the `SmootherMatrices`.
+def smoother_matrices(transition: Array, noise: Array, root: Array) -> SmootherMatrices:
+    """Return the gain of a smoother and roots of covariances for one step, from blocks of the
+    triangular root of `[[F S, G], [S, 0]]` (Park and Kailath 1995, doi:10.1080/00207179508921582).
     """
     n, m = noise.shape
     upper = jnp.concatenate([roots.matrix_product(transition, root), noise], 1)
@@ -361,46 +310,33 @@ def smoother_gain_and_roots(transition: Array, noise: Array, root: Array) -> Smo
     # least as many columns as rows.
     whole = roots.triangular_root(jnp.pad(whole, ((0, 0), (0, max(0, n - m)))))
     predicted, cross = whole[:n, :n], whole[n:, :n]
-    return SmootherMatrices(
-        predicted, roots.right_divide_by_triangular(cross, predicted), whole[n:, n:]
-    )
+    return SmootherMatrices(predicted, roots.right_divide(cross, predicted), whole[n:, n:])
 
 
-def smoother_backward_pass(
+class Backward(NamedTuple):
+    mean: Float[Array, "times n"]
+    root: Float[Array, "times n n"]
+    kicks: Float[Array, "steps m"]  # the means of the unit noise of each step
+    kick_covariance: Float[Array, "steps m m"]
+
+
+def backward_pass(
     joint: SmootherMatrices, mean: Array, predicted: Array, noise: Array, last: tuple[Array, Array]
-) -> tuple[
-    Float[Array, "times n"],
-    Float[Array, "times n n"],
-    Float[Array, "steps m"],
-    Float[Array, "steps m m"],
-]:
+) -> Backward:
     """Return the smoothed states and the noise of each step, by a pass back over all steps.
-
-    Four things are returned: the smoothed means (T, n); roots (T, n, n) of the smoothed
-    covariances; the means (T − 1, m) of the unit noise of each step; and the covariances
-    (T − 1, m, m) of this noise.
 
     The method is the backward pass of Rauch, Tung and Striebel (1965). The covariance of the unit
     noise of a step is `I − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ` with the unit matrix I and `Z = L⁻¹ G`.
     Here G maps the unit noise to the state after the step, L is a root of the predicted covariance
-    of this state, and S is a root of its smoothed covariance.
-
-    **Arguments:**
-
-    - `joint`: the results of `smoother_gain_and_roots` for all steps, stacked.
-    - `mean`: (T − 1, n) the filtered mean before each step.
-    - `predicted`: (T − 1, n) the predicted mean after each step.
-    - `noise`: G (n, m) for all steps, or (T − 1, n, m) with one G for each step.
-    - `last`: the filtered mean (n,) and root (n, n) at the last time.
+    of this state, and S is a root of its smoothed covariance. The filtered `mean` (T − 1, n) is
+    that before each step, `predicted` that after it, and `last` holds mean and root at the end.
     """
 
     def noise_estimate(
         noise: Array, predicted_root: Array, error: Array, root: Array
     ) -> tuple[Array, Array]:
         m = noise.shape[1]
-        both = roots.left_divide_by_triangular(
-            predicted_root, jnp.concatenate([noise, error[:, None], root], 1)
-        )
+        both = roots.left_divide(predicted_root, jnp.concatenate([noise, error[:, None], root], 1))
         whitened, mean, scaled_root = both[:, :m], both[:, m], both[:, m + 1 :]
         mean = jnp.sum(whitened * mean[:, None], 0)
         left = jnp.eye(m, dtype=noise.dtype) - roots.matrix_product(whitened.T, whitened)
@@ -414,10 +350,10 @@ def smoother_backward_pass(
             noise if own_noise is None else own_noise, joint.predicted, off, root
         )
         mean = mean + jnp.sum(joint.gain * off[None], 1)
-        out = mean, roots.predicted_covariance_root(joint.gain, root, joint.rest)
+        out = mean, roots.predicted_root(joint.gain, root, joint.rest)
         return out, (*out, *kicks)
 
     own_noise = noise if noise.ndim > 2 else None
     _, before = lax.scan(step_back, last, (joint, mean, predicted, own_noise), reverse=True)
     means, all_roots = (jnp.concatenate([a, b[None]]) for a, b in zip(before, last, strict=False))
-    return means, all_roots, *before[2:]
+    return Backward(means, all_roots, *before[2:])

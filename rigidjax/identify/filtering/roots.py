@@ -16,68 +16,52 @@ from rigidjax._types import Scalar, ScalarLike
 def triangular_root(rows: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """Return the lower triangular matrix L with `L Lᵀ = A Aᵀ` and no negative diagonal entry.
 
-    L is computed by the modified Gram–Schmidt process on the `rows` A (n, m), whose triangular
-    factor is as accurate as that of Householder's method (Björck 1967, doi:10.1007/BF01934122). A
-    row of A may depend linearly on the rows before it, to a few units of round-off. An example is
-    the row, in a root of a covariance, of a number that is known without error. The diagonal entry
-    of L in this row is then zero, with zero derivatives; the derivatives of `jnp.linalg.qr` would
-    be NaN.
+    L is computed by the modified Gram–Schmidt process, whose triangular factor is as accurate as
+    that of Householder's method (Björck 1967, doi:10.1007/BF01934122). A row of A may depend
+    linearly on the rows before it, to a few units of round-off, such as the row of a number that is
+    known without error. The diagonal entry of L is then zero, with zero derivatives; those of
+    `jnp.linalg.qr` would be NaN.
     """
     n = rows.shape[0]
     below = jnp.arange(n)
     least = (4 * float(jnp.finfo(rows.dtype).eps)) ** 2 * jnp.sum(rows * rows, 1)
 
-    def gram_schmidt_step(rows: Array, k: Array) -> tuple[Array, Array]:
+    def orthogonalise(rows: Array, k: Array) -> tuple[Array, Array]:
         row = lax.dynamic_index_in_dim(rows, k, keepdims=False)
-        unit = row * inverse_sqrt_or_zero(jnp.sum(row * row), least[k])
+        unit = row * inverse_sqrt(jnp.sum(row * row), least[k])
         column = jnp.where(below >= k, jnp.sum(rows * unit[None], 1), 0)
         return rows - column[:, None] * unit[None], column
 
-    return lax.scan(gram_schmidt_step, rows, below)[1].T
+    return lax.scan(orthogonalise, rows, below)[1].T
 
 
-def predicted_covariance_root(
+def predicted_root(
     transition: Float[Array, "k n"], root: Float[Array, "n n"], noise: Float[Array, "k m"]
 ) -> Float[Array, "k k"]:
-    """Return a triangular root (k, k) of the predicted covariance, `F P Fᵀ + G Gᵀ`.
-
-    **Arguments:** `transition` F (k, n), which maps errors before a step to errors after it; `root`
-    S (n, n), a root of the covariance `P = S Sᵀ` before the step; `noise` G (k, m), a root of the
-    covariance that the noise of the step adds.
+    """Return a triangular root of `F P Fᵀ + G Gᵀ` with the `transition` F, `P = S Sᵀ` from the
+    `root` S, and the `noise` G.
     """
     return triangular_root(jnp.concatenate([matrix_product(transition, root), noise], 1))
 
 
-def inverse_sqrt_or_zero(x: Array, threshold: ScalarLike = 0.0) -> Array:
+def inverse_sqrt(x: Array, threshold: ScalarLike = 0.0) -> Array:
     """Return 1/√x where x is above `threshold`, and zero with zero derivatives elsewhere."""
     there = x > threshold
     return jnp.where(there, 1 / jnp.sqrt(jnp.where(there, x, 1)), 0)
 
 
 def matrix_product(left: Float[Array, "n m"], right: Float[Array, "m k"]) -> Float[Array, "n k"]:
-    """Return the matrix product `left right` in full precision, by sums over products of entries.
-
-    These sums are cheap if the matrices have only a few rows.
-    """
+    """Return `left right` in full precision, by sums that are cheap for matrices of few rows."""
     return jnp.sum(left[:, :, None] * right[None], 1)
 
 
 class Update(NamedTuple):
-    """Hold the update of an estimate by the numbers read.
+    """Hold the update of an estimate by the numbers read."""
 
-    **Fields:**
-
-    - `step`: (n,) the new mean of the errors of the estimate.
-    - `root`: (n, n) the new root of the covariance of the errors.
-    - `innovation`: (k,) ν, each number read minus its prediction from all numbers read before.
-    - `variance`: (k,) s, the variance of each ν. A masked number has the innovation 0 and the
-      variance 1, and so does not count.
-    """
-
-    step: Float[Array, " n"]
+    step: Float[Array, " n"]  # the new mean of the errors of the estimate
     root: Float[Array, "n n"]
-    innovation: Float[Array, "*k"]
-    variance: Float[Array, "*k"]
+    innovation: Float[Array, "*k"]  # each number minus its prediction from all read before
+    variance: Float[Array, "*k"]  # of the innovation, which is 0 with variance 1 if masked
 
 
 def kalman_update(
@@ -88,23 +72,13 @@ def kalman_update(
     variance: Float[Array, " k"],
     mask: Bool[Array, " k"],
 ) -> Update:
-    """Return the estimate of a vector e (n,) of errors after k numbers were read.
-
-    Each number is `h · e` plus noise, with a vector h (n,) of its own.
+    """Return the estimate of a vector e of errors after k numbers `h · e` plus noise were read.
 
     The numbers are taken one after another by Potter's formula, `s = |v|² + r`, `S ← S − S v vᵀ/(s
     + √(rs))` with `v = Sᵀh` (Battin, Astronautical Guidance (1964), §9.6; Bierman, Factorization
     Methods (1977), §II.4). Here S is the root of the covariance of e, s is the variance of the
-    innovation (the number minus its prediction), and r is the variance of the noise of the number.
-
-    **Arguments:**
-
-    - `step`: (n,) the mean of e before the update.
-    - `root`: (n, n) S before the update.
-    - `matrix`: (k, n) the vectors h, one in each row.
-    - `error`: (k,) the numbers read.
-    - `variance`: (k,) the variance r of the noise of each number.
-    - `mask`: (k,) false for a number that does not count.
+    innovation, and r the `variance` of the noise; `step` is the mean of e before, the rows of
+    `matrix` are the vectors h, and `error` holds the numbers.
     """
 
     def absorb(state: tuple[Array, Array], number: tuple) -> tuple[Any, Any]:
@@ -124,61 +98,39 @@ def kalman_update(
 
 
 class LogDensityTerms(NamedTuple):
-    """Hold the terms of a log-density in which each number read is normal, given the numbers read
-    before it.
+    """Hold the terms of a log-density in which each number read is normal, given those before it.
 
-    **Fields:** `error` is the error of each number divided by its standard deviation;
-    `log_variance` is the logarithm of 2π times the variance of each number. Masked numbers have
-    zeros in both fields.
+    Masked numbers have zeros in both fields.
     """
 
-    error: Float[Array, "*n"]
-    log_variance: Float[Array, "*n"]
+    error: Float[Array, "*n"]  # in standard deviations
+    log_variance: Float[Array, "*n"]  # the logarithm of 2π times the variance
 
     @property
-    def total_log_density(self) -> Scalar:
-        """Return the logarithm of the density of all numbers read, −½ Σ (error² + log_variance),
-        from these terms.
-        """
+    def total(self) -> Scalar:
+        """Return the logarithm of the density of all numbers read."""
         return -0.5 * jnp.sum(self.error**2 + self.log_variance)
 
 
-def log_density_terms(innovation: Array, variance: Array, mask: Array) -> LogDensityTerms:
-    """Return the terms of the log-density of readings, from their innovations (reading minus
-    prediction).
-
-    **Arguments:** `innovation` the innovations, `variance` their variances, and `mask` true for the
-    numbers read, three arrays of one shape. **Returns** the `LogDensityTerms`, arrays of this shape
-    too: each innovation divided by its standard deviation, and the logarithm of 2π times its
-    variance. Both are zero where `mask` is false.
-    """
+def density_terms(innovation: Array, variance: Array, mask: Array) -> LogDensityTerms:
+    """Return the terms of the log-density of readings from their innovations."""
     error = jnp.where(mask, innovation * lax.rsqrt(variance), 0)
     return LogDensityTerms(error, jnp.where(mask, jnp.log(2 * math.pi * variance), 0))
 
 
-def left_divide_by_triangular(
-    lower: Float[Array, "n n"], rhs: Float[Array, "n m"]
-) -> Float[Array, "n m"]:
-    """Return `lower⁻¹ rhs` by forward substitution, where `lower` is a lower triangular matrix.
+def left_divide(lower: Float[Array, "n n"], rhs: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """Return `lower⁻¹ rhs`; where a diagonal entry is zero, the row of the result is zero."""
 
-    If a diagonal entry of `lower` is zero, the row of the result with the same index is zero.
-    """
-
-    def forward_substitution_step(rhs: Array, k: Array) -> tuple[Array, Array]:
+    def substitute(rhs: Array, k: Array) -> tuple[Array, Array]:
         column = lax.dynamic_index_in_dim(lower, k, 1, keepdims=False)
         there = column[k] > 0
         row = rhs[k] * jnp.where(there, 1 / jnp.where(there, column[k], 1), 0)
         return rhs - column[:, None] * row[None], row
 
-    return lax.scan(forward_substitution_step, rhs, jnp.arange(lower.shape[0]))[1]
+    return lax.scan(substitute, rhs, jnp.arange(lower.shape[0]))[1]
 
 
-def right_divide_by_triangular(
-    numerator: Float[Array, "m n"], lower: Float[Array, "n n"]
-) -> Float[Array, "m n"]:
-    """Return `numerator lower⁻¹`, where `lower` is a lower triangular matrix.
-
-    If a diagonal entry of `lower` is zero, the column of the result with the same index is zero.
-    """
-    turned = left_divide_by_triangular(lower[::-1, ::-1].T, numerator[:, ::-1].T)
+def right_divide(numerator: Float[Array, "m n"], lower: Float[Array, "n n"]) -> Float[Array, "m n"]:
+    """Return `numerator lower⁻¹`; where a diagonal entry is zero, the column is zero."""
+    turned = left_divide(lower[::-1, ::-1].T, numerator[:, ::-1].T)
     return turned.T[:, ::-1]

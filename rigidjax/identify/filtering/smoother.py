@@ -17,9 +17,9 @@ from rigidjax.identify.filtering.filter import (
     Belief,
     FilterInput,
     checked_input,
-    raise_if_filter_lost,
+    outcome,
+    require_followed,
     scan_filter,
-    status_and_loss_time,
 )
 from rigidjax.identify.filtering.linear import LinearEstimate, linear_estimate
 from rigidjax.identify.filtering.steps import Dynamics, ExtendedState, ReadNumbers, Stops
@@ -144,27 +144,15 @@ def smooth(
         "more iterations, a better initial state, or a model that the readings fit; throw=False "
         "returns it"
     )
-    return _checks.error_if(raise_if_filter_lost(run), run.change > 1, words)
+    return _checks.error_if(require_followed(run), run.change > 1, words)
 
 
 @eqx.filter_jit
 def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
-    """Return the most probable motion, given all readings, by an iterated smoother in one compiled
-    program.
-
-    **Arguments:**
-
-    - `run`: the checked arguments of `smooth`: the body, torques, sensors and initial state; the
-      numbers that drift as random walks, such as the bias of a gyro; the readings; the estimate
-      before the first reading; and the times at which the steps of the filter end.
-    - `iterations`: the largest number of iterations.
-    - `tolerance`: the iteration ends when no component of a state changes by more than `tolerance`
-      times its standard deviation.
-    """
     sensors, first, grid = run.scene.sensors, run.first, run.grid
     dynamics, stops, kept = scan_filter(run, lambda belief, read: (belief, read))
-    beliefs, read = grid.at_recording_times(kept)
-    status, lost_at = status_and_loss_time(beliefs, steps.split_by_sensor(sensors, read), first.t)
+    beliefs, read = grid.at_recording(kept)
+    status, lost_at = outcome(beliefs, steps.split_by_sensor(sensors, read), first.t)
     path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, kept[0].x)
 
     def is_running(state: tuple) -> Array:
@@ -172,17 +160,15 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
 
     def iterate(state: tuple) -> tuple:
         path, estimate, _, count = state
-        out = _gauss_newton_iteration(
-            dynamics, first, stops, path, estimate.kicks[:, : dynamics.noise_dimension]
-        )
-        return *out, count + 1
+        kicks = estimate.kicks[:, : dynamics.normals_per_step]
+        return *_iteration(dynamics, first, stops, path, kicks), count + 1
 
-    still = jnp.zeros((stops.t.shape[0], dynamics.noise_dimension), first.root.dtype)
+    still = jnp.zeros((stops.t.shape[0], dynamics.normals_per_step), first.root.dtype)
     # Start the loop from an estimate of zeros: a first iteration before the loop would compile the
     # iteration a second time.
     blank = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-        jax.eval_shape(lambda: _gauss_newton_iteration(dynamics, first, stops, path, still)[1]),
+        jax.eval_shape(lambda: _iteration(dynamics, first, stops, path, still).estimate),
     )
     far = jnp.asarray(jnp.inf, first.root.dtype)
     path, estimate, change, count = lax.while_loop(
@@ -192,7 +178,7 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
     white = []
     for index, root in enumerate(dynamics.white):
         mine = slice(6 * index, 6 * index + 3)
-        size = roots.inverse_sqrt_or_zero(h)[:, None] * root[None]
+        size = roots.inverse_sqrt(h)[:, None] * root[None]
         variance = jnp.diagonal(estimate.kick_covariance, axis1=1, axis2=2)[:, mine]
         white.append(Push(size * estimate.kicks[:, mine], size * jnp.sqrt(variance)))
     belief = Belief(stops.t, jax.tree.map(lambda leaf: leaf[1:], path), estimate.root[1:])
@@ -211,65 +197,47 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
     return Smoothed(belief, grid.rows, tuple(pushes), reads, total, change, count, status, lost_at)
 
 
-def _gauss_newton_iteration(
-    dynamics: Dynamics, belief: Belief, stops: Stops, path: ExtendedState, kicks: Array
-) -> tuple[ExtendedState, LinearEstimate, Scalar]:
-    """Return the most probable motion of the problem linearised about a `path`: one Gauss–Newton
-    iteration.
+class _Iteration(NamedTuple):
+    path: ExtendedState  # N + 1 states: before the first reading, and at each stop
+    estimate: LinearEstimate  # of the changes of the states
+    change: Scalar  # the largest one of a component of a state, in standard deviations
 
-    The linear problem is solved exactly by a Kalman filter and a backward pass.
 
-    **Arguments:**
-
-    - `dynamics`: the equations of motion, the noise of the torques, and the sensors.
-    - `belief`: the estimated state before the first reading, with a root S of the covariance `S Sᵀ`
-      of its errors.
-    - `stops`: the N times at which steps end, with their readings.
-    - `path`: the N + 1 states about which the problem is linearised, at the time of the `belief`
-      and at the N times.
-    - `kicks`: (N, m) the unit normal numbers that make the noise of the torques, m numbers for each
-      step from a state of `path` to the next.
-
-    **Returns** three things: the N + 1 new states; the estimate of the changes of the states, with
-    their covariances; and the largest change of a component of a state, in standard deviations of
-    this component.
+def _iteration(
+    dynamics: Dynamics,
+    belief: Belief,
+    stops: Stops,
+    path: ExtendedState,
+    kicks: Float[Array, "stops normals"],
+) -> _Iteration:
+    """Return the most probable motion of the problem linearised about a `path` of N + 1 states and
+    the noise that `kicks` make: one Gauss–Newton iteration.
     """
     dtype = belief.root.dtype
 
-    def linearise_step_and_readings(
+    def linearise(
         row: tuple[Array, Stops, ExtendedState, ExtendedState, Array],
-    ) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array, Array]]:
-        """Return two things: one step of the motion, linearised about the given `path` of states;
-        and the readings at the end of the step, linearised too.
+    ) -> tuple[tuple[Array, Array, Array], steps.LinearReadings]:
+        """Return a step from the state x of the path to its state y, and the readings there, both
+        linearised.
 
-        The `row` holds five things: the time t0 before the step, s; the time at the end of the step
-        and the readings at this time (`Stops`); the state of the `path` before the step; the state
-        of the `path` after the step; and the unit normal numbers (m,) that make the noise of the
-        torques in the step.
-
-        The linearised step is three arrays F, G and d: an error e of the state before the step
-        becomes `F e + d + G u` after the step, with the unit normal noise u. The linearised
-        readings are four arrays: the derivatives of the predicted readings with respect to an error
-        of the state; reading minus prediction; the standard deviations of the noise; and a mask,
-        true for a component that was read and is below full scale.
+        An error e of x becomes `F e + d + G u` at y, with the unit normal noise u; F, G and d are
+        returned.
         """
         t0, stop, x, y, kick = row
-        after, grown, noise = dynamics.predict_and_linearise(
+        after, grown, noise = dynamics.predict(
             t0.astype(dtype), (stop.t - t0).astype(dtype), x, kick
         )
         off = minus(after, y)
-        grown, noise = (
-            steps.covariance_root_about_neighbour(y, off, part, inverse=True)
-            for part in (grown, noise)
-        )
-        push = off - jnp.sum(noise[:, : dynamics.noise_dimension] * kick[None], 1)
+        grown, noise = (steps.recentred_root(y, off, part, inverse=True) for part in (grown, noise))
+        push = off - jnp.sum(noise[:, : dynamics.normals_per_step] * kick[None], 1)
         return (grown, noise, push), steps.linearise_readings(dynamics, stop, y)
 
     before = jnp.concatenate([belief.t[None], stops.t[:-1]])
     x0, earlier, later = (
         jax.tree.map(lambda leaf, at=at: leaf[at], path) for at in (0, slice(-1), slice(1, None))
     )
-    moves, rows = lax.map(linearise_step_and_readings, (before, stops, earlier, later, kicks))
+    moves, rows = lax.map(linearise, (before, stops, earlier, later, kicks))
     # The first row belongs to the time of the belief before the first reading; nothing is read at
     # this time.
     matrix, error, deviation, mask = (jnp.pad(a, [(1, 0)] + [(0, 0)] * (a.ndim - 1)) for a in rows)
@@ -280,9 +248,9 @@ def _gauss_newton_iteration(
         parts,
         error,
         -off,
-        steps.covariance_root_about_neighbour(x0, off, belief.root),
+        steps.recentred_root(x0, off, belief.root),
         mask,
         smooth=True,
     )
-    change = jnp.max(jnp.abs(out.mean) * roots.inverse_sqrt_or_zero(jnp.sum(out.root**2, -1)))
-    return jax.vmap(plus)(path, out.mean), out, change
+    change = jnp.max(jnp.abs(out.mean) * roots.inverse_sqrt(jnp.sum(out.root**2, -1)))
+    return _Iteration(jax.vmap(plus)(path, out.mean), out, change)

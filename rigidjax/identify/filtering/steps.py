@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.scipy.linalg import block_diag
-from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree, UInt32
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin, Mat3, Scalar
@@ -66,9 +66,7 @@ class ExtendedState(eqx.Module):
 
 
 def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
-    """Raise `ValueError` for a sensor that the filter cannot use: one without noise, with a
-    low-pass filter, or with jitter.
-    """
+    """Raise `ValueError` for a sensor that the filter cannot use."""
     for sensor in sensors:
         name = type(sensor).__name__
         if sensor.noise is None:
@@ -90,67 +88,42 @@ def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
 
 class Dynamics(eqx.Module):
     """Hold the equations of motion, the noise and the sensors that a filter uses, for one dtype and
-    one type of state.
-
-    `dynamics_of` makes a `Dynamics`.
-
-    **Fields:**
-
-    - `scene`: all on which readings depend (body, torques, sensors and initial state), with the
-      body in the form that the equations of motion need.
-    - `field`: the equations of motion under the known torque, a function of time, state and `None`.
-    - `inverse`: (3, 3) the inverse of the inertia tensor.
-    - `white`: the square root of the spectral density of each `RandomTorque`.
-    - `coloured`: for each `CorrelatedTorque`, the square root of its spectral density and its
-      correlation time, s.
-    - `drifts`: the square root of the spectral density of each walk, a number that drifts randomly.
-    - `paths`: for each walk, the path of its numbers in the tree of the scene.
+    one type of state; densities are given by their square roots.
     """
 
     scene: Scene
-    field: Callable[..., Any]
-    inverse: Mat3
-    white: tuple[Array, ...]
-    coloured: tuple[tuple[Array, Scalar], ...]
-    drifts: tuple[Array, ...]
-    paths: tuple[tuple[Any, ...], ...] = eqx.field(static=True)
-
-    def sensors_with_walks(self, walks: Sequence[Array]) -> tuple[AbstractSensor, ...]:
-        """Return the sensors of the scene with `walks` as the values of their drifting numbers."""
-        return with_leaves(self.scene, self.paths, walks).sensors
+    field: Callable[..., Any]  # under the known torque
+    inverse: Mat3  # of the inertia tensor
+    white: tuple[Array, ...]  # the density of each `RandomTorque`
+    coloured: tuple[tuple[Array, Scalar], ...]  # density and time, s, of each `CorrelatedTorque`
+    drifts: tuple[Array, ...]  # the density of each walk
+    paths: tuple[tuple[Any, ...], ...] = eqx.field(static=True)  # of each walk in the scene
 
     @property
-    def noise_dimension(self) -> int:
-        """Return the number of unit normal numbers that make the noise of one step of motion and
-        torques.
-        """
+    def normals_per_step(self) -> int:
         return 6 * (len(self.white) + len(self.coloured))
 
-    def rate_with_torques(self, rate_of_change: PyTree, torques: Sequence[Array]) -> PyTree:
-        """Return the rate of change of a motion under additional `torques` (3,), body frame.
-
-        `rate_of_change` is that of the motion without the additional torques.
-        """
+    def with_torques(self, rate_of_change: PyTree, torques: Sequence[Array]) -> PyTree:
+        """Return the rate of change of a motion under additional `torques` (3,), body frame."""
         if not torques:
             return rate_of_change
         spin = rate_of_change.omega + jnp.sum(self.inverse * sum(torques[1:], torques[0])[None], 1)
         return eqx.tree_at(lambda s: s.omega, rate_of_change, spin)
 
-    def advance_under_noise(
-        self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array
+    def advance(
+        self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Float[Array, " normals"]
     ) -> ExtendedState:
-        """Return the state after a step of duration h, s, from the state x at the time t, under
-        random torques.
+        """Return the state after a step of duration h, s, from the state x at the time t.
 
         The step is one of the classical Runge–Kutta method of order 4. The `kicks` are unit normal
-        numbers, six for each random torque, which make its noise: each white noise is replaced by
-        `√(density/h) (k₀ + √3 (1 − 2τ/h) k₁)` at the time t + τ, where k₀ and k₁ (3,) are kicks.
-        These are the first two terms of the expansion of white noise in Legendre polynomials. If
-        the body is at rest at t, its rate and angle at t + h have, to first order in the noise, the
-        exact joint covariance (Foster, Lyons and Oberhauser 2020, doi:10.1137/19M1261912).
+        numbers, six for each random torque: each white noise is replaced by `√(density/h) (k₀ + √3
+        (1 − 2τ/h) k₁)` at the time t + τ, where k₀ and k₁ (3,) are kicks. These are the first two
+        terms of the expansion of white noise in Legendre polynomials. If the body is at rest at t,
+        its rate and angle at t + h have, to first order in the noise, the exact joint covariance
+        (Foster, Lyons and Oberhauser 2020, doi:10.1137/19M1261912).
         """
         safe = jnp.where(h > 0, h, 1)
-        pairs = kicks.reshape(-1, 2, 3) * roots.inverse_sqrt_or_zero(h)
+        pairs = kicks.reshape(-1, 2, 3) * roots.inverse_sqrt(h)
 
         def noise_at(pair: Array, share: Scalar) -> Array:
             return pair[0] + 3.0**0.5 * share * pair[1]
@@ -164,7 +137,7 @@ class Dynamics(eqx.Module):
                 (r * noise_at(pair, share) - tau) / time for (r, time), pair, tau in later
             )
             change = self.field(t + elapsed, motion, None)
-            return self.rate_with_torques(change, [*white, *torques]), slopes
+            return self.with_torques(change, [*white, *torques]), slopes
 
         motion, torques = state_after_step(
             KUTTA4, rate_of_state, jnp.zeros_like(h), h, (x.motion, x.torques)
@@ -173,20 +146,14 @@ class Dynamics(eqx.Module):
             motion = eqx.tree_at(lambda s: s.q, motion, to_unit_length(motion.q))
         return ExtendedState(motion, torques, x.walks)
 
-    def predict_and_linearise(
+    def predict(
         self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array | None = None
-    ) -> tuple[ExtendedState, Float[Array, "n n"], Float[Array, "n m"]]:
-        """Return three things: the state after a step of duration h, s, from the state x at the
-        time t; and two matrices F and G that describe the errors of this state.
-
-        The matrix F (n, n) maps an error of x to the error of the new state. The matrix G (n, m) is
-        a root of the covariance that the noise of the step adds; its last columns belong to the
-        walks, which are numbers that drift randomly. F and G are the derivatives of the step for
-        the noise that `kicks` give (unit normal numbers, six for each random torque; zeros for
-        `None`).
+    ) -> "Prediction":
+        """Return the state after a step of duration h, s, from the state x at the time t, and how
+        its errors come about, at the noise that `kicks` give (zeros for `None`).
         """
-        kicks = jnp.zeros(self.noise_dimension, x.motion.omega.dtype) if kicks is None else kicks
-        after, push = jax.linearize(lambda y, k: self.advance_under_noise(t, h, y, k), x, kicks)
+        kicks = jnp.zeros(self.normals_per_step, x.motion.omega.dtype) if kicks is None else kicks
+        after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
         moving = ExtendedState(x.motion, x.torques, ())
         size, drifting = dimension(moving), dimension(x) - dimension(moving)
         still = tuple(jnp.zeros_like(w) for w in x.walks)
@@ -197,76 +164,64 @@ class Dynamics(eqx.Module):
             return tangent_to_vector(after, moved)[:size]
 
         both = jax.vmap(jacobian_column, out_axes=1)(
-            jnp.eye(size + self.noise_dimension, dtype=kicks.dtype)
+            jnp.eye(size + self.normals_per_step, dtype=kicks.dtype)
         )
         grown, noise = both[:, :size], both[:, size:]
         if not drifting:
-            return after, grown, noise
+            return Prediction(after, grown, noise)
         same = jnp.eye(drifting, dtype=kicks.dtype)
         strewn = jnp.diag(jnp.concatenate([d.reshape(-1) for d in self.drifts]) * jnp.sqrt(h))
-        return after, block_diag(grown, same), block_diag(noise, strewn)
+        return Prediction(after, block_diag(grown, same), block_diag(noise, strewn))
+
+
+class Prediction(NamedTuple):
+    state: ExtendedState
+    transition: Float[Array, "n n"]  # maps an error before the step to one after it
+    noise: Float[Array, "n m"]  # a root of the covariance that the step adds, walks last
 
 
 def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: ExtendedState) -> Dynamics:
-    """Return the equations of motion, the noise of the torques and the sensors, in the form a
-    filter uses.
-
-    **Arguments:**
-
-    - `scene`: the body, torques, sensors and initial state of a recording. The known torque in the
-      scene must not read an `Input`, a quantity that the recording holds.
-    - `drifts`: the walks of the model, which are numbers of the scene that drift randomly, such as
-      the bias of a gyro.
-    - `x`: a state, whose dtype and type (`Spin`, `Attitude` or `Rigid`) the equations get.
-    """
+    """Return what a filter uses of a `scene` whose torque reads no `Input`, for states like x."""
     dtype = x.motion.omega.dtype
     body: Any = needed_body(in_precision(scene.body, dtype), type(x.motion))
     return Dynamics(
         eqx.tree_at(lambda s: s.body, scene, body),
         equations_of_motion(body, x.motion, in_precision(scene.torque, dtype)),
         inverse(tensor_of(body)),
-        tuple(jnp.sqrt(law.density.astype(dtype)) for law in white_noise_torques(scene.process)),
+        tuple(
+            jnp.sqrt(law.density.astype(dtype))
+            for law in parts_of(scene.process)
+            if isinstance(law, RandomTorque)
+        ),
         tuple(
             (jnp.sqrt(law.density.astype(dtype)), law.time.astype(dtype))
-            for law in time_correlated_torques(scene.process)
+            for law in correlated_torques(scene.process)
         ),
         tuple(jnp.sqrt(drift.density.astype(dtype)) for drift in drifts),
         tuple(drift.path for drift in drifts),
     )
 
 
-def white_noise_torques(process: Process | None) -> tuple[RandomTorque, ...]:
-    """Return the torques of a `process` (the unknown torque of a model) that are white noise."""
-    return tuple(part for part in parts_of(process) if isinstance(part, RandomTorque))
-
-
-def time_correlated_torques(process: Process | None) -> tuple[CorrelatedTorque, ...]:
-    """Return the torques of a `process` (the unknown torque of a model) that are correlated in
-    time.
-
-    A filter estimates such torques as additional states.
-    """
+def correlated_torques(process: Process | None) -> tuple[CorrelatedTorque, ...]:
+    """Return the unknown torques that are correlated in time: a filter takes them as states."""
     return tuple(part for part in parts_of(process) if isinstance(part, CorrelatedTorque))
 
 
-def covariance_root_about_neighbour(
+def recentred_root(
     x: ExtendedState,
     change: Float[Array, " n"],
     root: Float[Array, "n m"],
     *,
     inverse: bool = False,
 ) -> Float[Array, "n m"]:
-    """Return a root (n, m) of the covariance of errors about a neighbour of the state x, computed
-    from a root of the covariance of errors about x.
+    """Return a root of the covariance of errors about the neighbour x + e of x with the `change` e,
+    from the `root` for errors about x.
 
-    The neighbour is x changed by the vector `change` (n,), here called e; `root` (n, m) belongs to
-    errors about x. Only the rows of rotation vectors change: a rotation vector e + δ from x is the
-    rotation vector `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ` from the neighbour. Here J_r is the right
-    Jacobian, to second order in e (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848).
-
-    With `inverse` the direction is the opposite: `root` belongs to errors about the neighbour, and
-    the result to errors about x. The rows are then multiplied by `J_r(e)⁻¹`, the derivative of
-    `log(exp(e) exp(δ))` with respect to δ, to third order in e.
+    Only the rows of rotation vectors change: a rotation vector e + δ from x is the rotation vector
+    `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ` from the neighbour. Here J_r is the right Jacobian, to
+    second order in e (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848). With `inverse` the
+    `root` belongs to the neighbour and the result to x: the rows are multiplied by `J_r(e)⁻¹`, to
+    third order in e.
     """
     first, second = (0.5, 1 / 12) if inverse else (-0.5, 1 / 6)
     across = jax.vmap(cross, (None, 1), 1)
@@ -279,33 +234,27 @@ def covariance_root_about_neighbour(
 
 
 class Stops(NamedTuple):
-    """Hold the times at which the steps of a filter end, and the readings at these times.
+    """Hold the times at which the steps of a filter end, and the readings of each sensor there.
 
-    **Fields:** `t` holds the times, s; `values` the readings of each sensor; `masks`, for each
-    sensor, whether it has a reading. One step uses one row of each array.
+    One step uses one row of each array.
     """
 
     t: Array
     values: tuple[Array, ...]
-    masks: tuple[Array, ...]
+    masks: tuple[Array, ...]  # whether there is a reading
 
 
-def linearise_readings(
-    dynamics: Dynamics, stop: Stops, x: ExtendedState
-) -> tuple[Float[Array, "k n"], Float[Array, " k"], Float[Array, " k"], Bool[Array, " k"]]:
-    """Return the readings of all sensors at one time, linearised about the state x.
+class LinearReadings(NamedTuple):
+    """Hold the k components of the errors of all sensors."""
 
-    **Arguments:**
+    matrix: Float[Array, "k n"]  # the derivatives of the predicted readings
+    error: Float[Array, " k"]  # reading minus prediction
+    deviation: Float[Array, " k"]
+    mask: Bool[Array, " k"]  # true for a component that was read and is below full scale
 
-    - `dynamics`: the equations of motion and the sensors.
-    - `stop`: the time, s, and for each sensor its reading and whether there is one.
-    - `x`: the predicted state at this time.
 
-    **Returns** four things, for the k components of the errors of all sensors: the derivatives (k,
-    n) of the predicted readings with respect to the n components of an error of x; the errors (k,),
-    reading minus prediction; the standard deviations (k,) of their noise; and a mask (k,), true for
-    a component that was read and is below full scale.
-    """
+def linearise_readings(dynamics: Dynamics, stop: Stops, x: ExtendedState) -> LinearReadings:
+    """Return the readings of all sensors at one time, linearised about the predicted state x."""
     dtype = x.motion.omega.dtype
     t = stop.t.astype(dtype)
     basis = jax.vmap(lambda e: vector_to_tangent(x, e))(jnp.eye(dimension(x), dtype=dtype))
@@ -314,10 +263,11 @@ def linearise_readings(
         sensor = in_precision(dynamics.scene.sensors[index], dtype)
 
         def reading_error(y: ExtendedState, index: int = index, value: Array = value) -> Array:
-            drifted = in_precision(dynamics.sensors_with_walks(y.walks)[index], dtype)
+            scene = with_leaves(dynamics.scene, dynamics.paths, y.walks)
+            drifted = in_precision(scene.sensors[index], dtype)
 
             def field_with_torques(t: Array, state: PyTree, args: object = None) -> PyTree:
-                return dynamics.rate_with_torques(dynamics.field(t, state, args), y.torques)
+                return dynamics.with_torques(dynamics.field(t, state, args), y.torques)
 
             motion, when = y.motion, t
             offset = getattr(drifted, "offset", None)
@@ -335,8 +285,7 @@ def linearise_readings(
             mask = mask & (jnp.abs(value) < limit * (1 - 1e-6))
         assert sensor.noise is not None
         out.append((matrix, value_of_error, sensor.noise, mask))
-    matrix, errors, noise, mask = (jnp.concatenate(parts) for parts in zip(*out, strict=True))
-    return matrix, errors, noise, mask
+    return LinearReadings(*(jnp.concatenate(parts) for parts in zip(*out, strict=True)))
 
 
 class ReadNumbers(NamedTuple):
@@ -354,12 +303,7 @@ class ReadNumbers(NamedTuple):
 def split_by_sensor(
     sensors: Sequence[AbstractSensor], numbers: ReadNumbers
 ) -> tuple[ReadNumbers, ...]:
-    """Return, for each sensor, the numbers that a filter read from it, compared with their
-    predictions.
-
-    The argument `numbers` holds the innovations, their variances and the mask of all `sensors`, one
-    after another along the last axis.
-    """
+    """Return, for each sensor, its part of the numbers of all, which follow one another."""
     ends = np.cumsum([sensor.components for sensor in sensors])[:-1]
     return tuple(
         ReadNumbers(*own) for own in zip(*(jnp.split(a, ends, -1) for a in numbers), strict=True)
@@ -370,31 +314,21 @@ def split_by_sensor(
 MEMORY_A_STEP = 0.25
 
 
-def step_counts_between(
+def step_counts(
     process: Process | None,
     ts: Array | np.ndarray,
     state: HasSpin,
     substeps: int | None,
     recording: Recording | None = None,
-) -> np.ndarray:
-    """Return the number of fixed steps of a filter from each of the T times `ts` to the next, (T −
-    1,).
+) -> Int[np.ndarray, " intervals"]:
+    """Return the number of fixed steps from each time to the next, `substeps` if given.
 
-    **Arguments:**
-
-    - `process`: the unknown torque, or `None`. A step is at most a quarter of each of its
-      correlation times.
-    - `ts`: (T,) the times, s.
-    - `state`: the initial state. Steps are so short that the body turns only little in each of
-      them. The turn is computed from the body rate in `state` or from the rates that gyros read,
-      whichever is larger.
-    - `substeps`: the number of steps; `None` chooses this number by these rates and correlation
-      times, and takes 1 if JAX traces the times, the state or the correlation times.
-    - `recording`: the readings of the gyros, or `None`.
+    A step is at most a quarter of each correlation time, and the body turns only little in it, by
+    its rate in `state` or the rates that gyros read. The number is 1 if JAX traces these.
     """
     if substeps is not None:
         return np.full(ts.shape[0] - 1, _checks.integer(substeps, "substeps", 1))
-    coloured = time_correlated_torques(process)
+    coloured = correlated_torques(process)
     if not _checks.is_known((ts, state.omega, coloured)):
         return np.ones(ts.shape[0] - 1, int)
     rate = float(np.linalg.norm(np.asarray(state.omega, float)))
@@ -475,7 +409,7 @@ def sample(
     if _checks.is_known(times):
         words = "ts: wanted increasing times, got some that are equal or decrease"
         _checks.error_if(times, not (np.diff(np.asarray(times)) > 0).all(), words)
-    pieces = int(step_counts_between(process, times, state0, substeps).max())
+    pieces = int(step_counts(process, times, state0, substeps).max())
     scene = Scene(body, torque, process, (), project_to_group(state0))
     return _sample(key, scene, times, pieces)
 
@@ -484,20 +418,9 @@ def sample(
 def _sample(
     key: PRNGKeyArray | UInt32[Array, "2"], scene: Scene, ts: Array, pieces: int
 ) -> Sampled:
-    """Draw one motion under a random torque, in one compiled program.
-
-    **Arguments:**
-
-    - `key`: a key of `jax.random`.
-    - `scene`: the body, the known torque, the random torque and the initial state.
-    - `ts`: (T,) the times, s.
-    - `pieces`: the number of equal steps from each time to the next.
-
-    **Returns** a `Sampled`: the times, the T states, and the T values of each random torque that is
-    correlated in time.
-    """
+    """Draw one motion in one compiled program, by `pieces` equal steps between two times."""
     state0: Any = scene.start
-    dtype, coloured = state0.omega.dtype, time_correlated_torques(scene.process)
+    dtype, coloured = state0.omega.dtype, correlated_torques(scene.process)
     first, later = jax.random.split(key)
     keys = jax.random.split(first, len(coloured))
     torques = tuple(
@@ -515,14 +438,12 @@ def _sample(
         # after zero the seven digits of float32 are too few.
         h = ((right - left) / pieces).astype(dtype)
         left = left.astype(dtype)
-        kicks = jax.random.normal(one, (pieces, dynamics.noise_dimension), dtype)
+        kicks = jax.random.normal(one, (pieces, dynamics.normals_per_step), dtype)
 
-        def take_substep(
-            x: ExtendedState, piece: tuple[Array, Array]
-        ) -> tuple[ExtendedState, None]:
-            return dynamics.advance_under_noise(left + piece[0] * h, h, x, piece[1]), None
+        def advance(x: ExtendedState, piece: tuple[Array, Array]) -> tuple[ExtendedState, None]:
+            return dynamics.advance(left + piece[0] * h, h, x, piece[1]), None
 
-        x, _ = lax.scan(take_substep, x, (jnp.arange(pieces, dtype=dtype), kicks))
+        x, _ = lax.scan(advance, x, (jnp.arange(pieces, dtype=dtype), kicks))
         return x, x
 
     keys = jax.random.split(later, ts.shape[0] - 1)

@@ -17,14 +17,13 @@ from rigidjax.identify.filtering import roots
 from rigidjax.identify.filtering.filter import (
     FilterInput,
     belief_at,
-    grid_of_step_times,
     scan_filter,
+    step_grid,
 )
 from rigidjax.identify.filtering.roots import LogDensityTerms
 from rigidjax.identify.filtering.steps import require_sensors
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.normal import normal_matrix
-from rigidjax.identify.model.scene import Scene
+from rigidjax.identify.model.normal import normal_matrix_of_jacobians
 from rigidjax.identify.model.terms import (
     BodyIndex,
     bound_torque,
@@ -39,126 +38,76 @@ from rigidjax.identify.model.terms import (
 from rigidjax.motion.manifold import dimension
 
 
-def log_density_terms_of_recording(
+def recording_terms(
     model: Model,
     free_numbers: Array,
     record: Recording,
     reference: ReferenceStates,
     body_index: BodyIndex,
 ) -> LogDensityTerms:
-    """Return the terms of the log-density of the readings of one recording.
+    """Return the terms of the log-density of the readings of one recording, for its parameters.
 
-    The errors of the readings are normal. They are the differences of the readings from the motion
-    that the equations of motion give. If the model has an unknown torque, or numbers that drift as
-    random walks, a Kalman filter integrates over these unknowns, and the errors are the differences
-    of the readings from the predictions of the filter.
-
-    **Arguments:**
-
-    - `model`: the model.
-    - `free_numbers`: (m,) the free numbers on which this recording depends.
-    - `record`: the times and readings of the recording.
-    - `reference`: the state about which the initial state of the recording is parametrised.
-    - `body_index`: the index of the body of the recording among several bodies, or `None` for one
-      body.
-
-    **Returns** the `LogDensityTerms`, two arrays with an entry for each component of each reading:
-    its error divided by its standard deviation; and the logarithm of 2π times its variance.
+    If the model has an unknown torque or walks, a Kalman filter integrates over these unknowns. Its
+    terms are those of innovations; without such unknowns the residuals are independent.
     """
     scene = scene_at(model, free_numbers, record, reference, body_index)
     if scene.process is None and not model.walks:
-        return _log_density_terms_of_motion(model, scene, record)
+        scaled, log_variance = [], []
+        errors = errors_of_scene(model, scene, record)
+        for reading, sensor, error in zip(record.readings, scene.sensors, errors, strict=True):
+            limit: Any = getattr(sensor, "limit", None)
+            noise: Any = sensor.noise
+            one, full, wider = standardised_errors_and_saturation(
+                reading.values, reading.mask, error, noise, limit, reading.jitter_error
+            )
+            scaled.append(one)
+            # A component at full scale contributes the probability P of a reading beyond it instead
+            # of a density: its error is √(−2 log P), and its logarithm of a variance is zero.
+            mask = reading.mask[:, None] & ~full
+            logs = jnp.log(2 * math.pi * noise**2)[None]
+            log_variance.append(jnp.where(mask, logs if wider is None else logs + wider, 0))
+        return LogDensityTerms(
+            *(jnp.concatenate([a.reshape(-1) for a in part]) for part in (scaled, log_variance))
+        )
     require_sensors(scene.sensors)
     scene = dataclasses.replace(scene, torque=bound_torque(scene, record))
     start: Any = scene.start
     known = jnp.zeros(dimension(start), start.omega.dtype)
     first = belief_at(record.t[0], start, known, scene, model.walks)
-    grid = grid_of_step_times(scene.process, record, first, model.filter_steps)
+    grid = step_grid(scene.process, record, first, model.filter_steps)
     run = FilterInput(scene, model.walks, record, first, grid)
     _, _, read = scan_filter(run, lambda _, read: read)
-    return jax.tree.map(jnp.ravel, roots.log_density_terms(*read))
-
-
-def _log_density_terms_of_motion(model: Model, scene: Scene, record: Recording) -> LogDensityTerms:
-    """Return the terms of the log-density of one recording if no torque is random and no
-    parameter drifts.
-
-    The errors of the readings, which are their differences from the motion that the equations of
-    motion give, are then independent and normal.
-
-    **Arguments:**
-
-    - `model`: the model, which holds the integrator.
-    - `scene`: the body, torque, sensors and initial state of the recording.
-    - `record`: the times and readings of the recording.
-
-    **Returns** the `LogDensityTerms`, two arrays with an entry for each component of each reading:
-    z, its error divided by its standard deviation σ; and l = log(2πσ²). The log-density is −½ Σ (z²
-    + l). For a masked reading both entries are zero. For a component at full scale only a bound is
-    known: z is √(−2 log P), where P is the probability that a reading exceeds this bound, and l is
-    zero.
-    """
-    errors = scene_errors(model, scene, record)
-    scaled, log_variance = [], []
-    for reading, sensor, error in zip(record.readings, scene.sensors, errors, strict=True):
-        limit: Any = getattr(sensor, "limit", None)
-        noise: Any = sensor.noise
-        one, full, wider = standardise(
-            reading.values, reading.mask, error, noise, limit, reading.jitter_error
-        )
-        scaled.append(one)
-        # A component at full scale contributes the probability of a reading beyond the full scale
-        # instead of a density, so that its logarithm of a variance is set to zero.
-        mask = reading.mask[:, None] & ~full
-        logs = jnp.log(2 * math.pi * noise**2)[None]
-        log_variance.append(jnp.where(mask, logs if wider is None else logs + wider, 0))
-    return LogDensityTerms(
-        *(jnp.concatenate([a.reshape(-1) for a in part]) for part in (scaled, log_variance))
-    )
-
-
-def log_density_terms_of_all_readings(model: Model, x: Float[Array, " n"]) -> LogDensityTerms:
-    """Return the terms (R, N) of the log-density of all readings of a `model`.
-
-    R is the number of recordings, N the number of terms of each recording, and x (n,) holds the
-    free numbers. Derivatives with respect to x are computed for one recording after another, in
-    forward mode.
-    """
-    return map_rows(model.index.rows(x), model, log_density_terms_of_recording)
+    return jax.tree.map(jnp.ravel, roots.density_terms(*read))
 
 
 def log_posterior_density(model: Model, x: Float[Array, " n"]) -> Scalar:
-    """Return the logarithm of the posterior density of a `model` at its free numbers x, up to a
-    constant.
+    """Return the logarithm of the posterior density at the parameters x, up to a constant.
 
-    It is the logarithm of the density of all readings plus the logarithms of the priors.
+    Its derivatives are computed for one recording after another, in forward mode.
     """
-    return log_density_terms_of_all_readings(model, x).total_log_density - 0.5 * jnp.sum(
-        prior_residuals(model, x) ** 2
+    terms = differentiable_map_over_recordings(
+        model.index.rows_of_recordings(x), model, recording_terms
     )
+    return terms.total - 0.5 * jnp.sum(prior_residuals(model, x) ** 2)
 
 
 class Curvature(NamedTuple):
-    """Hold a quadratic approximation of minus the logarithm of a posterior density, at a point.
-
-    **Fields:** `cost` is minus the logarithm of the density; `gram` (n, n) is Fisher's information;
-    `slope` (n,) is the gradient of the cost.
-    """
+    """Hold a quadratic approximation of minus the logarithm of a posterior density, at a point."""
 
     cost: Scalar
-    gram: Float[Array, "n n"]
-    slope: Float[Array, " n"]
+    gram: Float[Array, "n n"]  # Fisher's information
+    slope: Float[Array, " n"]  # the gradient of the cost
 
 
-def cost_gradient_and_information(model: Model, x: Float[Array, " n"]) -> Curvature:
-    """Return the cost, gradient and Fisher's information of a posterior density at x (n,).
+def curvature(model: Model, x: Float[Array, " n"]) -> Curvature:
+    """Return the cost, gradient and Fisher's information of a posterior density at x.
 
-    The free numbers x change the variances of the readings, too. The information is that of the
-    priors plus `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ`, where the sum is over the innovations ν (each
-    reading minus its prediction), s is the variance of ν, and ∂ is the gradient with respect to x
-    (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714, for the filter).
+    The parameters change the variances of the readings, too. The information is that of the priors
+    plus `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ`, where the sum is over the innovations ν, s is the
+    variance of ν, and ∂ is the gradient with respect to x (Gupta and Mehra 1974,
+    doi:10.1109/TAC.1974.1100714, for the filter).
     """
-    value, slopes = error_jacobians(model, x, log_density_terms_of_recording)
+    value, slopes = errors_and_jacobians(model, x, recording_terms)
     # Compute dν/√s, with the innovation ν of variance s, from the derivative of ν/√s, by d(ν/√s) =
     # dν/√s − ½ ν/√s d(log s).
     moved = slopes.error + 0.5 * value.error[..., None] * slopes.log_variance
@@ -168,6 +117,6 @@ def cost_gradient_and_information(model: Model, x: Float[Array, " n"]) -> Curvat
     each = jnp.einsum("rn,rni->ri", value.error, slopes.error)
     each = each + 0.5 * jnp.sum(slopes.log_variance, 1)
     slope = jnp.zeros(size + 1, x.dtype).at[places].add(each)[:-1]
-    rest, rows = value_and_jacfwd(lambda x: prior_residuals(model, x), x)
-    cost = 0.5 * jnp.sum(rest**2) - value.total_log_density
+    rows, rest = jacobian_and_value(lambda x: prior_residuals(model, x), x)
+    cost = 0.5 * jnp.sum(rest**2) - value.total
     return Curvature(cost, gram + rows.T @ rows, slope + rest @ rows)

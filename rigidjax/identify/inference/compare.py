@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from rigidjax import _checks
 from rigidjax.identify.answer.fit import fit
@@ -80,7 +81,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
         size = one.x.size
         size += groups * sum(jitter is not None and jitter.estimated for jitter in jitters)
         independent_readings = np.array(counts[name]) / shortest
-        misfit = independent_readings @ _log_mean_square_errors(one)
+        misfit = independent_readings @ _log_mean_squares(one)
         penalty = size * np.log(max(independent_readings.sum(), 2.0))
         rows.append((misfit + penalty, name, size, one))
     rows.sort(key=lambda row: row[0])
@@ -91,14 +92,12 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     )
 
 
-def _log_mean_square_errors(fit: Fit) -> np.ndarray:
-    """Return the logarithm of the mean square error of each sensor of a `fit`, (sensors,).
+def _log_mean_squares(fit: Fit) -> Float[np.ndarray, " sensors"]:
+    """Return the logarithm of the mean square error of each sensor.
 
-    Jitter (errors of time stamps) correlates the errors of a sensor and raises their variance. The
-    errors of a sensor with jitter are therefore first whitened, so that they have the variance of
-    the noise alone. Then the mean logarithm of the factor by which jitter raises the variance is
-    added. White errors with the resulting mean square have the same likelihood as the errors of the
-    sensor.
+    Jitter (errors of time stamps) correlates errors and raises their variance. Such errors are
+    whitened to the variance of the noise alone, and the mean logarithm of the factor by which
+    jitter raises the variance is added: white errors of this mean square are as likely.
     """
     out, model = 2.0 * np.log(np.maximum(fit.rms, 1e-300)), fit.model
     errors, _ = blocks_at(model, fit.x)
@@ -149,18 +148,15 @@ def cross_validate(
     for index, left_out in enumerate(recordings):
         others = [r for k, r in enumerate(recordings) if k != index]
         fit_of_others = fit(build(others), **options)
-        test_model = _fix_shared_numbers(build([left_out]), fit_of_others)
+        test_model = _with_shared_fixed(build([left_out]), fit_of_others)
         out.append(fit(test_model, **{**options, "starts": 1}).rms)
     return tuple(out)
 
 
-def _fix_shared_numbers(model: Model, fit_of_others: Fit) -> Model:
-    """Return a `model` whose body and shared numbers are fixed at their values in the fit
-    `fit_of_others`.
+def _with_shared_fixed(model: Model, fit_of_others: Fit) -> Model:
+    """Return a `model` of one recording whose body and shared parameters are those of a fit.
 
-    It is used to predict one recording by a fit of all other recordings. The `model` holds this
-    recording alone. In the result only two things are free: its initial state, and each `Free` (a
-    number that a fit may move) that has a value for each recording.
+    Only its initial state is free, and each `Free` with a value for each recording.
     """
     x = model.start()
     for slot, fitted in zip(model.slots, fit_of_others.model.slots, strict=True):

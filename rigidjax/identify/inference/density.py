@@ -3,13 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
@@ -125,21 +125,21 @@ class LogDensity(eqx.Module):
             )
         known = process is None or deviation is None
         prior = None if known else jnp.asarray(_checks.positive_float(deviation, "deviation"))
-        noise_slots, variances = _slots_and_variances_of_unknown_noise(model)
-        process_slots = [] if prior is None else _slots_of_random_torque(process, prior)
-        total = sum(int(reading.host_mask.sum()) for reading in model.records.readings)
-        variances += [np.full(1, 1 / math.sqrt(total)) for _ in process_slots]
-        new_slots = [*noise_slots, *process_slots]
-        self.model, places = _add_free_numbers_and_reindex(model, fit.noises, process, new_slots)
-        has_deterministic_motion = process is None and not model.walks
-        covariance = _covariance_for_white_errors(fit, has_deterministic_motion)
+        factors = _noise_factors(model)
+        if prior is not None:
+            total = sum(int(reading.host_mask.sum()) for reading in model.records.readings)
+            wide = np.full(1, 1 / math.sqrt(total))
+            factors += [_Factor(slot, wide) for slot in _process_slots(process, prior)]
+        slots = [factor.slot for factor in factors]
+        self.model, places = _extended(model, fit.noises, process, slots)
+        covariance = _white_covariance(fit, process is None and not model.walks)
         self.x0 = jnp.zeros(self.model.size, fit.x.dtype).at[places].set(fit.x)
         whole = np.zeros((self.model.size, self.model.size))
         whole[np.ix_(places, places)] = covariance
         added = self.model.slots[len(model.slots) :]
-        for slot, variance in zip(added, variances, strict=True):
+        for slot, factor in zip(added, factors, strict=True):
             own = np.ravel(np.asarray(slot.shared))
-            whole[own, own] = variance
+            whole[own, own] = factor.variance
         self.covariance = jnp.asarray(whole, fit.x.dtype)
 
     @property
@@ -177,42 +177,40 @@ def map_draws(
     return jax.vmap(lambda one: function(density.unpack(one)))(x)
 
 
-def _slots_and_variances_of_unknown_noise(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
-    """Return two things for each sensor of a `model` whose noise is unknown: a slot; and an array
-    (groups,) of variances.
+class _Factor(NamedTuple):
+    """Hold a new parameter, the logarithm of a factor, and its variance in Laplace's method."""
 
-    A slot is the description of a `Free`, a number that a fit may move. Here it describes one
-    factor of the noise of the sensor for each group of recordings that share their noise. The free
-    number is the logarithm of the factor. The variances say how well the readings determine these
-    logarithms: 1/(2N) for a group in which the sensor read N numbers.
-    """
-    groups, slots, variances = np.asarray(model.noise_groups), [], []
+    slot: Slot
+    variance: Float[np.ndarray, " groups"]
+
+
+_MARK = object()
+
+
+def _noise_factors(model: Model) -> list[_Factor]:
+    """Return a factor of the unknown noise of each sensor, for each group of recordings."""
+    groups, out = np.asarray(model.noise_groups), []
+    scene = scene_at_starting_values(model, model.records)
     for index, reading in enumerate(model.records.readings):
         if reading.sensor.noise is not None:
             continue
         rows = np.bincount(groups, np.asarray(reading.host_mask.sum(axis=1)))
         # The logarithm of a standard deviation has the variance 1/(2n) if n numbers were read.
-        variances.append(0.5 / np.maximum(rows * reading.sensor.components, 1))
-        path = _path_of_picked_leaf(model, lambda s, index=index: s.sensors[index].noise)
+        variance = 0.5 / np.maximum(rows * reading.sensor.components, 1)
+        # The leaf is `None` until it is marked.
+        marked = eqx.tree_at(
+            lambda s, index=index: s.sensors[index].noise, scene, _MARK, is_leaf=lambda x: x is None
+        )
+        path = next(path for path, leaf in jax.tree.leaves_with_path(marked) if leaf is _MARK)
         name = f"noise of {type(reading.sensor).__name__} {index}"
         labels = tuple(str(group) for group in range(rows.size))
-        slots.append(
-            _slot_of_positive_factor(
-                path, name, (1,), reading.sensor.unit, labels, model.noise_groups
-            )
-        )
-    return slots, variances
+        slot = _slot(path, name, (1,), reading.sensor.unit, labels, model.noise_groups)
+        out.append(_Factor(slot, variance))
+    return out
 
 
-def _slots_of_random_torque(process: Process | None, prior: Array) -> list[Slot]:
-    """Return a slot for each number of a random torque, such as its spectral density.
-
-    A slot is the description of a `Free`, a number that a fit may move. Here the free number is the
-    logarithm of a factor, by which the number of the torque is multiplied.
-
-    **Arguments:** `process` the random torque, or `None`, which has no numbers; `prior` the
-    standard deviation of the normal prior of each logarithm, about zero.
-    """
+def _process_slots(process: Process | None, prior: Array) -> list[Slot]:
+    """Return a slot for each number of a random torque; `prior` is the deviation of logarithms."""
     scene, slots = Scene(None, None, process, (), None), []
     several, number = len(parts_of(process)) > 1, -1
     for path, leaf in jax.tree.leaves_with_path(scene):
@@ -221,13 +219,11 @@ def _slots_of_random_torque(process: Process | None, prior: Array) -> list[Slot]
         # torque.
         number += path[-1].name == "density"
         name = f"{path[-1].name} {number}" if several else path[-1].name
-        slots.append(
-            _slot_of_positive_factor(path, name, (1,) * jnp.ndim(leaf), "", (), None, prior)
-        )
+        slots.append(_slot(path, name, (1,) * jnp.ndim(leaf), "", (), None, prior))
     return slots
 
 
-def _slot_of_positive_factor(
+def _slot(
     path: tuple[Any, ...],
     name: str,
     shape: tuple[int, ...],
@@ -236,58 +232,20 @@ def _slot_of_positive_factor(
     groups: Array | None,
     prior: Array | None = None,
 ) -> Slot:
-    """Return the slot of a positive factor, by which a number or an array of a scene is multiplied.
-
-    A slot is the description of a `Free`, a number that a fit may move. Here the free number is the
-    logarithm of the factor. A scene is the body, torques, sensors and initial state of a recording.
-
-    **Arguments:**
-
-    - `path`: the path of the number (a leaf) in the tree of the scene.
-    - `name`, `unit`: the name of the factor in reports, and the unit of the number.
-    - `shape`: the shape of the factor.
-    - `labels`, `groups`: for a factor that each group of recordings has by itself, the names of the
-      groups, and the index of the group of each recording; `()` and `None` for a factor that all
-      recordings share.
-    - `prior`: the standard deviation of the prior of the logarithm, or `None` for a flat prior.
-    """
+    """Return the slot of a positive factor of a leaf of the scene, one for each group if any."""
     one = jnp.ones(())
     return Slot(path, name, unit, False, True, shape, labels, groups, one, prior, None)
 
 
-def _path_of_picked_leaf(model: Model, where: Callable[[Scene], Any]) -> tuple[Any, ...]:
-    """Return the path, in the tree of a scene of the `model`, of the leaf that `where` picks.
-
-    A scene is the body, torques, sensors and initial state of a recording. The function `where`
-    picks a leaf of it, such as `lambda s: s.sensors[0].noise`. The leaf may be `None`, such as the
-    noise of a sensor if it is unknown.
-    """
-    scene = starting_scene(model, model.records)
-    marked = eqx.tree_at(where, scene, 0.0, is_leaf=lambda node: node is None)
-    pairs = jax.tree.leaves_with_path(eqx.tree_at(where, marked, _MARK))
-    return next(path for path, leaf in pairs if leaf is _MARK)
+class _Extended(NamedTuple):
+    model: Model
+    places: Int[np.ndarray, " n"]  # of the old parameters among the new ones
 
 
-_MARK = object()
+def _extended(model: Model, noises: Noise, process: Process | None, slots: list[Slot]) -> _Extended:
+    """Return a model with the parameters of further `slots`, with known `noises` and a process.
 
-
-def _add_free_numbers_and_reindex(
-    model: Model, noises: Noise, process: Process | None, slots: list[Slot]
-) -> tuple[Model, np.ndarray]:
-    """Return two things: a model with additional free numbers; and the indices (n,), in this model,
-    of the n free numbers of the old model.
-
-    **Arguments:**
-
-    - `model`: the old model with n free numbers.
-    - `noises`: for each sensor of the new model the standard deviations (R, k) of its noise, for R
-      recordings and k components.
-    - `process`: the random torque of the new model, or `None`.
-    - `slots`: a slot (the description of a `Free`, a number that a fit may move) for each
-      additional number. None of these numbers is given separately for each recording.
-
-    The additional numbers come before the numbers that belong to one recording alone, which
-    therefore get other indices.
+    They come before the parameters of one recording alone, which get other indices.
     """
     bodies = body_places(model.chart, model.body_indices, model.count)
     kinds = model.index.start.shape[1] // 3
@@ -309,22 +267,14 @@ def _add_free_numbers_and_reindex(
     new_model = replaced(
         model, records=records, process=process, slots=placed, index=index, filter_steps=steps
     )
-    return new_model, places
+    return _Extended(new_model, places)
 
 
-def _covariance_for_white_errors(fit: Fit, has_deterministic_motion: bool) -> np.ndarray:
-    """Return the covariance (n, n) of the free numbers of a `fit` for a posterior density, which
-    takes the errors of the readings as white.
+def _white_covariance(fit: Fit, has_deterministic_motion: bool) -> Float[np.ndarray, "n n"]:
+    """Return the covariance of a fit without what it allows for beside white errors.
 
-    It is the covariance of the fit, except in two cases. In these cases the covariance of the fit
-    allows for more than white errors, and the covariance for white errors is returned:
-
-    - The covariance of the fit allows for constant errors of the sensors within their `Tolerance`.
-    - It is a sandwich covariance, which allows for autocorrelated errors, and it is singular or
-      `has_deterministic_motion` is true.
-
-    `has_deterministic_motion` says that the model has no random torque and no number that drifts as
-    a random walk, so that the readings are normal about one motion.
+    This is constant errors within a `Tolerance` and, if the motion has no random part or the
+    covariance is singular, autocorrelation.
     """
     covariance = np.asarray(fit.covariance)
     if fit.considered and fit.linear is not None:

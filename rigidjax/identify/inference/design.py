@@ -80,12 +80,6 @@ def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
 
 @eqx.filter_jit
 def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """Return Fisher's information matrix (n, n) of the free numbers x (n,), in one compiled
-    program.
-
-    It is `Jᵀ Σ⁻¹ J` with the derivatives J of all predictions of the `model`, and the covariance Σ
-    of the noise of its sensors, which must be known.
-    """
     sensors = model.records.sensors
     noises: list[Any] = [sensor.noise for sensor in sensors]
     _, slopes = error_jacobians(model, x)
@@ -99,11 +93,8 @@ def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
 
 
 def _require_known_noise(model: Model, x: Float[Array, " n"]) -> None:
-    """Raise `ValueError` if a sensor of the `model` has unknown noise, or jitter to be estimated.
-
-    It is also raised unless x is a vector (n,) of the free numbers of the `model`.
-    """
-    checked_x(model, x)
+    """Raise an error for unknown noise or jitter, or if x are no parameters of the `model`."""
+    require_numbers(model, x)
     for sensor in model.records.sensors:
         if sensor.noise is None:
             raise ValueError(
@@ -117,9 +108,6 @@ def _require_known_noise(model: Model, x: Float[Array, " n"]) -> None:
 
 
 def _require_not_traced(model: Model, motion: PyTree) -> None:
-    """Raise `TypeError` if the `model`, or one of the arrays in the tree `motion`, is traced by
-    JAX.
-    """
     if not _checks.is_known((model, motion)):
         raise TypeError(
             "model, x, body, omega: wanted known numbers, got traced ones; call it outside of "
@@ -157,31 +145,39 @@ def best_first_rate(
     _require_known_noise(model, model.start(body, omega))
     start = _checks.array_of_shape(omega, (3,), "omega").astype(model.records.t.dtype)
     size = jnp.sqrt(jnp.sum(start**2))
-    best = _most_informative_rate_direction(model, body, start / size, size, max_steps)
+    best = _best_direction(model, body, start / size, size, max_steps)
     rate = size * best / jnp.sqrt(jnp.sum(best**2))
     return rate, expected_quantities(model, model.start(body, rate))
 
 
 @eqx.filter_jit
-def _most_informative_rate_direction(
+def _best_direction(
     model: Model, body: PyTree, initial_direction: Array, rate_size: Array, max_steps: int
 ) -> Vec3:
-    """Return the direction (3,) of the initial body rate that determines the body best, by BFGS.
-
-    The search starts at `initial_direction`, and finds a minimum of the determinant of the
-    covariance of the body's free numbers. The length of the resulting vector is only near 1.
-
-    **Arguments:**
-
-    - `model`: the planned recordings and sensors.
-    - `body`: the expected body.
-    - `initial_direction`: (3,) the unit vector from which the search starts.
-    - `rate_size`: the length of the initial rate, rad/s.
-    - `max_steps`: the largest number of steps of the search.
+    """Return the direction of the initial rate that determines the body best; its length is only
+    near 1.
     """
+
+    def uncertainty(direction: Array, args: tuple[Model, PyTree, Array]) -> Scalar:
+        """Return ½ log det C / n for the covariance C of the body's n parameters, with a penalty
+        that keeps the length near 1.
+        """
+        model, body, size = args
+        length = jnp.sqrt(jnp.sum(direction**2))
+        information = fisher(model, model.start(body, size * direction / length))
+        n = model.index.bodies
+        # The information on the body, if the other parameters are free as well, is the Schur
+        # complement of their block in the information matrix.
+        mine, across, rest = information[:n, :n], information[:n, n:], information[n:, n:]
+        scale = jnp.sqrt(jnp.diagonal(rest))
+        rest = rest / (scale[:, None] * scale[None, :]) + 1e-12 * jnp.eye(rest.shape[0])
+        half = jnp.linalg.solve(rest, (across / scale[None, :]).T)
+        left = mine - (across / scale[None, :]) @ half
+        return -0.5 * jnp.linalg.slogdet(left)[1] / n + (length - 1.0) ** 2
+
     minimise: Any = optx.minimise
     out = minimise(
-        _log_uncertainty_of_body,
+        uncertainty,
         optx.BFGS(rtol=1e-4, atol=1e-4),
         initial_direction,
         (model, body, rate_size),
@@ -190,27 +186,3 @@ def _most_informative_rate_direction(
         throw=False,
     )
     return out.value
-
-
-def _log_uncertainty_of_body(direction: Array, args: tuple[Model, PyTree, Array]) -> Scalar:
-    """Return the uncertainty of a body that is to be found from planned recordings, with a penalty.
-
-    The uncertainty is ½ log det C / n, where C (n, n) is the covariance of the n free numbers of
-    the body for one direction of the initial body rate. It is the mean logarithm of the standard
-    deviations along the principal axes of C. The penalty keeps the length of `direction` near 1.
-
-    **Arguments:** `direction` (3,) the direction, in the body frame; `args` the model with the
-    planned recordings, the expected body, and the length of the initial rate, rad/s.
-    """
-    model, body, size = args
-    length = jnp.sqrt(jnp.sum(direction**2))
-    information = fisher(model, model.start(body, size * direction / length))
-    n = model.index.bodies
-    # The information on the body, if the other numbers are free as well, is the Schur complement of
-    # their block in the information matrix.
-    mine, across, rest = information[:n, :n], information[:n, n:], information[n:, n:]
-    scale = jnp.sqrt(jnp.diagonal(rest))
-    rest = rest / (scale[:, None] * scale[None, :]) + 1e-12 * jnp.eye(rest.shape[0])
-    half = jnp.linalg.solve(rest, (across / scale[None, :]).T)
-    left = mine - (across / scale[None, :]) @ half
-    return -0.5 * jnp.linalg.slogdet(left)[1] / n + (length - 1.0) ** 2

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.body.inertia import tensor_of
-from rigidjax.identify.filtering.terms import cost_gradient_and_information
+from rigidjax.identify.filtering.terms import curvature
 from rigidjax.identify.inference.density import LogDensity, map_draws
 from rigidjax.identify.model.model import Unpacked
 from rigidjax.identify.model.normal import NormalMatrix
@@ -216,10 +216,7 @@ class Posterior(eqx.Module):
 
 
 def _identity(point: Unpacked) -> Unpacked:
-    """Return the `point` unchanged.
-
-    A module-level function is the same object in all calls, so that JAX compiles only once.
-    """
+    # A module-level function is the same object in all calls, so that JAX compiles only once.
     return point
 
 
@@ -260,35 +257,26 @@ def posterior(
     if isinstance(sample, Nuts):
         _checks.import_library(*_BLACKJAX)
     root = jnp.linalg.cholesky(density.covariance)
-    x = _draw_chains(density, root, jax.random.split(key, chains), sample)
+    x = _draw(density, root, jax.random.split(key, chains), sample)
     return Posterior(density, x)
 
 
 @eqx.filter_jit
-def _draw_chains(
+def _draw(
     density: LogDensity, root: Array, keys: Array, sampler: Sampler
 ) -> Float[Array, "chains samples n"]:
-    """Draw from a posterior density by Markov chains, one for each key, in one compiled program.
+    """Draw from a posterior density by a Markov chain for each key.
 
-    **Arguments:**
-
-    - `density`: the logarithm of the density of x (n,), with a central point x0.
-    - `root`: (n, n) a root of the covariance C of x (a matrix B with B Bᵀ = C). The sampler draws z
-      (n,), with `x = x0 + root z`.
-    - `keys`: a key of `jax.random` for each chain.
-    - `sampler`: a function of a key, a log-density of z and the first z, which returns draws of z
-      (samples, n).
-
-    **Returns** the draws of x, (chains, samples, n).
+    The sampler draws z with `x = x0 + root z`, where the `root` is one of the covariance of x.
     """
 
-    def to_numbers(z: Array) -> Array:
+    def to_x(z: Array) -> Array:
         return density.x0 + jnp.sum(root * z[None], 1)
 
     def chain(key: Array) -> Array:
         first, later = jax.random.split(key)
         start = 0.5 * jax.random.normal(first, density.x0.shape, density.x0.dtype)
-        return jax.vmap(to_numbers)(sampler(later, lambda z: density(to_numbers(z)), start))
+        return jax.vmap(to_x)(sampler(later, lambda z: density(to_x(z)), start))
 
     # Many recordings keep a core of the processor busy with one chain, and the chains run one after
     # another: chains that run together wait, in each step, for the chain with the longest
@@ -447,56 +435,26 @@ def refit(
 
 @eqx.filter_jit
 def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: int) -> Refit:
-    """Return the maximum of a posterior density and weighted draws about it, in one compiled
-    program.
-
-    **Arguments:**
-
-    - `density`: the logarithm of the density, as a function of n free numbers, with a starting
-      point.
-    - `settings`: the tolerance and the largest number of steps of the search.
-    - `key`: a key of `jax.random`.
-    - `count`: the number of draws.
+    """Return the maximum of a posterior density and draws about it from Student's t distribution,
+    which is somewhat wider; with weights they represent the density (importance sampling).
     """
 
     def evaluate(x: Array) -> tuple[None, Array, NormalMatrix, Array]:
-        cost, gram, slope = cost_gradient_and_information(density.model, x)
+        cost, gram, slope = curvature(density.model, x)
         return None, cost, NormalMatrix(gram), slope
 
     order_one = of_order_one(density.model, density.x0.dtype)
     end = minimise(evaluate, density.x0, order_one, settings, None)
     covariance = jnp.linalg.inv(end.normal.core)
-    draws, weights = _weighted_draws(density, end.point, covariance, key, count)
-    converged = end.converged & jnp.isfinite(weights).all()
-    return Refit(density, end.point, -end.cost, covariance, converged, draws, weights)
-
-
-def _weighted_draws(
-    density: LogDensity, mode: Array, covariance: Array, key: PRNGKeyArray, count: int
-) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-    """Return draws (m, n) about the maximum of a posterior density, and their weights (m,).
-
-    The draws come from Student's t distribution. With their weights, whose sum is 1, they represent
-    the posterior density (importance sampling).
-
-    **Arguments:**
-
-    - `density`: the logarithm of the density, as a function of n numbers.
-    - `mode`: (n,) the maximum of the density, and of the t distribution.
-    - `covariance`: (n, n) the covariance of the normal approximation at the maximum. The t
-      distribution has this shape, but is somewhat wider.
-    - `key`: a key of `jax.random`.
-    - `count`: the number m of draws.
-    """
-    size, kind = mode.size, mode.dtype
+    size, kind = end.point.size, end.point.dtype
     normal, square = jax.random.split(key)
     z = jax.random.normal(normal, (count, size), kind)
     shrunk = jax.random.chisquare(square, _FREEDOM, (count, 1), kind) / _FREEDOM
     z = z / jnp.sqrt(shrunk)
-    root = _WIDER * jnp.linalg.cholesky(covariance)
-    draws = mode[None] + z @ root.T
+    draws = end.point[None] + z @ (_WIDER * jnp.linalg.cholesky(covariance)).T
     wanted = lax.map(density, draws)
     drawn_from = -0.5 * (_FREEDOM + size) * jnp.log1p(jnp.sum(z * z, 1) / _FREEDOM)
     # A draw that is so far out that the density is NaN gets no weight.
-    logs = jnp.where(jnp.isfinite(wanted), wanted - drawn_from, -jnp.inf)
-    return draws, jax.nn.softmax(logs)
+    weights = jax.nn.softmax(jnp.where(jnp.isfinite(wanted), wanted - drawn_from, -jnp.inf))
+    converged = end.converged & jnp.isfinite(weights).all()
+    return Refit(density, end.point, -end.cost, covariance, converged, draws, weights)

@@ -6,7 +6,6 @@ The horizon is the number of steps from the measured start of a window to the pr
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax.identify.answer.result import Fit, require_one_fit
@@ -19,7 +18,7 @@ from rigidjax.identify.data.windows import (
 )
 from rigidjax.identify.model.charts import body_places
 from rigidjax.identify.model.index import build_index
-from rigidjax.identify.model.model import Model, replaced, require_inputs
+from rigidjax.identify.model.model import require_inputs_of_windows, with_replaced_fields
 from rigidjax.identify.model.terms import all_errors
 
 
@@ -61,32 +60,15 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
             "value for each window, which other windows do not have"
         )
     _checks.require_instance(windows.starts, type(model.reference.state), "windows.starts")
-    require_inputs(model.torque, windows)
-    model_on_windows, x = _model_on_windows(model, fit.x, windows)
-    errors = _errors_by_sensor(model_on_windows, x)[0]
-    return by_horizon(windows.starts, errors[:, 1:])
-
-
-def _model_on_windows(
-    model: Model, x: Float[Array, " n"], windows: Windows
-) -> tuple[Model, Float[Array, " m"]]:
-    """Return two things: a fitted model with other windows as its recordings; and its free numbers
-    (m,).
-
-    A window is a short stretch of a log of measured states. The state at its start is taken as
-    known, so that the free numbers of the new model are those that all windows share.
-
-    **Arguments:** `model` the fitted model of windows; `x` (n,) its free numbers at the best point;
-    `windows` the other windows.
-    """
-    reference, _, clusters = window_starts(windows, 1)
-    body_indices = None
-    bodies = body_places(model.chart, body_indices, windows.count)
+    require_inputs_of_windows(model.torque, windows)
+    # The states at the starts are known, so that the parameters are those that all windows share.
+    reference, _, clusters = window_starts_weights_and_stretches(windows, 1)
+    bodies = indices_of_body_numbers(model.chart, None, windows.count)
     index, slots = build_index(bodies, model.index.bodies, model.slots, 0)
     parts = dict(
         records=windows.records(),
         counts=np.full(windows.count, windows.length + 1, np.int32),
-        body_indices=body_indices,
+        body_indices=None,
         reference=reference,
         index=index,
         slots=slots,
@@ -94,15 +76,8 @@ def _model_on_windows(
         clusters=clusters,
         noise_groups=jnp.zeros(windows.count, jnp.int32),
     )
-    return replaced(model, **parts), x[: index.size]
+    errors = _errors(with_replaced_fields(model, **parts), fit.x[: index.size])[0]
+    return average_by_horizon(windows.starts, errors[:, 1:])
 
 
-@eqx.filter_jit
-def _errors_by_sensor(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors of all sensors of a `model` at its free numbers x (n,), in one compiled
-    program.
-
-    There is one array (R, T, k) for each sensor, reading minus prediction, for R recordings, T
-    times and k components.
-    """
-    return all_errors(model, x)
+_errors = eqx.filter_jit(all_errors)

@@ -1,7 +1,7 @@
 """Compute profile intervals, in which the least misfit for each value of a quantity stays small."""
 
 import functools
-from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -42,6 +42,16 @@ class Pull(AbstractPull):
         return ((value - self.target) / self.width)[None]
 
 
+class _Point(NamedTuple):
+    """Hold the end of a fit with a quantity pulled away from its best value."""
+
+    excess: float  # of the growth of twice the misfit over that at the end of the interval
+    value: float  # of the quantity, or its logarithm if it is positive
+
+
+_value = eqx.filter_jit(quantities.quantity_vector)
+
+
 def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     """Return the profile interval (low, high) of one reported quantity.
 
@@ -68,6 +78,8 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     >>> low < 3.1 < high
     True
     """
+    from scipy.optimize import brentq
+
     require_one_fit(fit)
     names = [quantity.name for quantity in fit.quantities]
     if not isinstance(name, str) or name not in names:
@@ -88,7 +100,9 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
         point = fit.x
 
         @functools.cache
-        def growth_and_value_at(steps: float, side: float = side) -> tuple[float, float]:
+        def at(steps: float, side: float = side) -> _Point:
+            if steps == 0:
+                return _Point(-(reach**2), float(middle))
             # The pull is weak: after the fit the quantity lies between its best value and the
             # target. This makes no error in the profile, because the fitted point has the least
             # misfit of all points with the same value of the quantity.
@@ -101,49 +115,16 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
             )
             point = search_whole(Attempt(point), Task(pulled_model, fit.noises, 1e-4, 100)).x
             grown = (2.0 * cost_of(model, point, fit.noises) - bottom) / shares - reach**2
-            return grown, float(_value(model, point)[index])
+            return _Point(grown, float(_value(model, point)[index]))
 
-        ends.append(_profile_interval_end(growth_and_value_at, reach, wide / deviation, side))
+        inner, outer, farthest = 0.0, reach, max(wide / deviation, 4.0 * reach)
+        while at(outer).excess < 0:
+            inner, outer = outer, 2.0 * outer
+            if outer > farthest:
+                ends.append(side * np.inf)
+                break
+        else:
+            end: Any = brentq(lambda x, at=at: at(x).excess, inner, outer, xtol=1e-2 * reach)
+            ends.append(at(end).value)
     low, high = (np.exp(end) if quantity.positive else end for end in ends)
     return float(low), float(high)
-
-
-_value = eqx.filter_jit(quantities.quantity_vector)
-
-
-def _profile_interval_end(
-    growth_and_value_at: Callable[[float], tuple[float, float]],
-    first_distance: float,
-    largest_distance: float,
-    side: float,
-) -> float:
-    """Return one end of a profile interval of a quantity, or infinity if the search finds no end.
-
-    The misfit is minimised over all other numbers here. Its growth is twice its difference from the
-    least misfit, divided by the number of samples over which errors are autocorrelated. At an end
-    of the interval the growth is the square of `first_distance`. An infinite end has the sign of
-    `side`.
-
-    **Arguments:**
-
-    - `growth_and_value_at`: a function that fits the model with the quantity pulled towards a
-      target. Given the distance of the target from the best value, in standard deviations, it
-      returns two numbers: the growth of the misfit minus the square of `first_distance`; and the
-      value of the quantity (its logarithm, if the quantity is positive).
-    - `first_distance`: the first distance to try, in standard deviations.
-    - `largest_distance`: the search is given up beyond this distance or four times
-      `first_distance`, whichever is larger, in standard deviations.
-    - `side`: −1 for the lower end of the interval, 1 for the upper end.
-    """
-    from scipy.optimize import brentq
-
-    inner, outer = 0.0, first_distance
-    while growth_and_value_at(outer)[0] < 0:
-        inner, outer = outer, 2.0 * outer
-        if outer > max(largest_distance, 4.0 * first_distance):
-            return side * np.inf
-
-    def misfit_excess(steps: float) -> float:
-        return growth_and_value_at(steps)[0] if steps > 0 else -(first_distance**2)
-
-    return growth_and_value_at(brentq(misfit_excess, inner, outer, xtol=1e-2 * first_distance))[1]  # pyright: ignore

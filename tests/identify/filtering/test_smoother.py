@@ -49,9 +49,7 @@ def test_it_is_the_most_probable_motion(short):
         for k in range(COUNT):
             if k:
                 kicks = z[6 * k : 6 * k + 6]
-                x = dynamics.advance_under_noise(
-                    record.t[k - 1], record.t[k] - record.t[k - 1], x, kicks
-                )
+                x = dynamics.advance(record.t[k - 1], record.t[k] - record.t[k - 1], x, kicks)
             moment = identify.SensorInput(record.t[k], x.motion, records.BODY, dynamics.field)
             for reading in record.readings:
                 sensor = reading.sensor

@@ -16,8 +16,8 @@ from identify.filtering import records
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.answer.answers import Answer
-from rigidjax.identify.filtering.terms import cost_gradient_and_information
-from rigidjax.identify.model.terms import error_jacobians
+from rigidjax.identify.filtering.terms import curvature
+from rigidjax.identify.model.terms import errors_and_jacobians
 from rigidjax.identify.uncertainty.covariance import linearise
 
 # The places of the initial rate among the free numbers of `model`.
@@ -505,9 +505,7 @@ def test_the_information_is_the_covariance_of_the_gradient(fitted, process):
         real = records.truth(keys[0], torque, rj.Spin(records.START.omega), ts, 2, body=body)
         omega = records.gyro(keys[1], real.states.omega, 0.02)
         where = lambda d: d.model.records.readings[0].values
-        return cost_gradient_and_information(
-            eqx.tree_at(where, density, omega[None]).model, density.x0
-        )
+        return curvature(eqx.tree_at(where, density, omega[None]).model, density.x0)
 
     keys = jax.random.split(jax.random.key(5), many)
     found = jax.jit(lambda keys: jax.lax.map(one, keys))(keys)
