@@ -331,13 +331,14 @@ def _widened(best: Fit) -> Fit:
     null = np.asarray(best.null_directions)
     numbers = quantities_on_host(best.model, best.x, best.near)
     freedom = best.degrees_of_freedom(numbers[1])
-    return dataclasses.replace(
-        best,
+    uncertain = dataclasses.replace(
+        best.uncertainty,
         covariance=jnp.asarray(covariance),
-        determined_covariance=jnp.asarray(seen),
-        covariance_kind=f"sandwich: a shape {SHAPE:.0%} off the ellipsoid; {best.covariance_kind}",
-        quantities=reported_quantities(best.model, numbers, seen, null, best.limits, freedom),
+        determined=jnp.asarray(seen),
+        kind=f"sandwich: a shape {SHAPE:.0%} off the ellipsoid; {best.covariance_kind}",
     )
+    reported = reported_quantities(best.model, numbers, seen, null, best.limits, freedom)
+    return dataclasses.replace(best, uncertainty=uncertain, quantities=reported)
 
 
 def _result(

@@ -9,6 +9,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.answer.answers import Answer
+from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.answer.undetermined import Combination
 
 TS = np.linspace(0.0, 1.0, 5)
@@ -33,9 +34,9 @@ def fit_with(chart, directions, search="found", model="explains the readings", m
     n = null.shape[1]
     like = jnp.eye(n)
     return identify.Fit(
-        problem, here, like, like, "none", tuple(jnp.ones((1, k)) for k in (3, 3)), (), 1.0, 1,
-        1.0, 1.0, jnp.ones(n), jnp.asarray(null), (), Answer(search),
-        Answer(model), (),
+        BestPoint(problem, here, tuple(jnp.ones((1, k)) for k in (3, 3))),
+        Uncertainty(like, like, "none", jnp.ones(n), jnp.asarray(null)),
+        Assessment(Answer(search), Answer(model), (), 1.0, 1, 1.0, 1.0), (), (),
     )  # fmt: skip
 
 
@@ -134,9 +135,9 @@ def test_a_number_that_switches_a_torque_is_named():
         null[row, np.ravel(slot.shared)] = 1.0
     like = jnp.eye(null.shape[1])
     fit = identify.Fit(
-        problem, here, like, like, "none", (jnp.full((1, 3), 1e-3),), (), 1.0, 1, 1.0, 1.0,
-        jnp.ones(null.shape[1]), jnp.asarray(null), (), Answer("found"),
-        Answer("explains the readings"), (),
+        BestPoint(problem, here, (jnp.full((1, 3), 1e-3),)),
+        Uncertainty(like, like, "none", jnp.ones(null.shape[1]), jnp.asarray(null)),
+        Assessment(Answer("found"), Answer("explains the readings"), (), 1.0, 1, 1.0, 1.0), (), (),
     )  # fmt: skip
     words = [one.in_words for one in fit.undetermined_combinations]
     assert words[0].startswith("Readings change with end, but derivatives do not see it: a torque")

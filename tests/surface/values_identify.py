@@ -681,7 +681,13 @@ leave_out(
     "identify.Model.recording", "identify.Model.recordings", "identify.Scene",
     "identify.Model.bodies", "identify.Model.scenes", "identify.Tolerance",
     "identify.Windows.records", "identify.Windows.scales",
-    "identify.Recording.sensors", "identify.Fit.values",
+    "identify.Recording.sensors", "identify.Fit.values", "identify.BestPoint",
+    "identify.BestPoint.derivative_point", "identify.Uncertainty", "identify.Assessment",
+    *(f"identify.Fit.{name}" for name in (
+        "model", "x", "noises", "near", "covariance", "determined_covariance", "covariance_kind",
+        "singular_values", "null_directions", "hidden_directions", "limits", "freedom",
+        "considered", "allowance", "search", "explanation", "left", "chi2", "dof", "correlation",
+        "independent")),
     "identify.Fit.spreads", "identify.Fit.noise", "identify.Fit.jitter", "identify.Fit.rms", "tumblers.Alias",
     "tumblers.LightCurve", "tumblers.LightCurve.rivals", "identify.Comparison",
 )  # fmt: skip

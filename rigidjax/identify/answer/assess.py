@@ -24,6 +24,7 @@ from rigidjax.identify.answer.answers import (
     Answer,
 )
 from rigidjax.identify.answer.causes import time_stamp_cause
+from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.answer.result import Fit, Start
 from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.model import Model, late_delays
@@ -380,28 +381,23 @@ def assess(
         word = NOT_ALONE if rivals else FOUND
         search = Answer(word, (*rival, *interrupted, *remarks))
     return Fit(
-        original,
-        x,
-        jnp.asarray(covariance.covariance),
-        jnp.asarray(covariance.determined),
-        covariance.kind,
-        noise,
-        tuple(starts),
-        chi2,
-        dof,
-        times.longest_span,
-        times.independent,
-        jnp.asarray(covariance.singular_values),
-        jnp.asarray(covariance.null_directions),
-        quantities,
-        search,
-        explanation,
-        left,
-        limits,
-        near,
-        freedom,
-        linear.first_times(original.records.t.shape[1]),
-        considered_errors,
-        words,
-        jnp.asarray(hidden),
+        point=BestPoint(original, x, noise, near),
+        uncertainty=Uncertainty(
+            covariance=jnp.asarray(covariance.covariance),
+            determined=jnp.asarray(covariance.determined),
+            kind=covariance.kind,
+            singular_values=jnp.asarray(covariance.singular_values),
+            null_directions=jnp.asarray(covariance.null_directions),
+            hidden_directions=jnp.asarray(hidden),
+            limits=limits,
+            freedom=freedom,
+            considered=considered_errors,
+            allowance=words,
+        ),
+        assessment=Assessment(
+            search, explanation, left, chi2, dof, times.longest_span, times.independent
+        ),
+        quantities=quantities,
+        starts=tuple(starts),
+        linear=linear.first_times(original.records.t.shape[1]),
     )

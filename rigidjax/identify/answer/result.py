@@ -14,6 +14,7 @@ from rigidjax import _checks
 from rigidjax.identify.answer import answers, undetermined
 from rigidjax.identify.answer.answers import Answer, Cause
 from rigidjax.identify.answer.causes import causes
+from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
 from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jacobian
 from rigidjax.identify.model.terms import Noise
@@ -51,41 +52,16 @@ class Fit(eqx.Module):
 
     **Fields:**
 
-    - `model`: the model that was fitted.
-    - `x`: (n,) the free numbers at the best point.
-    - `covariance`: (n, n) the covariance of x; infinite for numbers that the data do not determine.
-    - `determined_covariance`: (n, n) the covariance of x within the directions of x that the data
-      determine.
-    - `covariance_kind`: the method by which the covariance was computed, in words.
-    - `noises`: for each sensor the standard deviations (R, k) of the k components of its errors in
-      each of R recordings.
-    - `starts`: a `Start` for each starting point.
-    - `chi2`: χ², summed over the sensors whose noise was given.
-    - `dof`: the degrees of freedom of χ².
-    - `correlation`: the number of samples over which the errors are autocorrelated; 1 for white
-      errors.
-    - `independent`: the number of independent errors.
-    - `singular_values`: (n,) the singular values of the Jacobian of all residuals, with columns of
-      length one. The free numbers that belong to one recording alone are eliminated first.
-    - `null_directions`: (k, n) the directions of x that the data do not determine.
+    - `point`: the best point, a `BestPoint`. Of its fields `fit.model`, `fit.x`, `fit.noises` and
+      `fit.near` are short forms.
+    - `uncertainty`: the `Uncertainty` of x. Of its fields `fit.covariance`,
+      `fit.determined_covariance`, `fit.covariance_kind` and others are short forms.
+    - `assessment`: the answers on the search and on the model, an `Assessment`. Of its fields
+      `fit.search`, `fit.explanation`, `fit.chi2` and others are short forms.
     - `quantities`: all reported quantities.
-    - `search`: the answer on the search; its `word` is `found`, `not alone` or `not ended`.
-    - `explanation`: the answer on the model; its `word` is `explains the readings`, `leaves a part`
-      or `does not explain the readings`.
-    - `left`: the indices of the sensors whose errors the model does not explain.
-    - `limits`: for each body with free moments its distance from a flat body, whose principal
-      moments are I1 + I2 = I3. No real body lies beyond this limit.
-    - `near`: if a body is flat at x, the free numbers (n,) of a slightly thicker body, at which
-      derivatives are taken, because the derivative of the thickness is zero at a flat body; else
-      `None`.
-    - `freedom`: the numbers from which the degrees of freedom of the variance of any quantity are
-      computed; `None` takes them as infinite.
-    - `linear`: the errors and their derivatives at the best point, from which the covariance and
+    - `starts`: a `Start` for each starting point.
+    - `linear`: the residuals and their derivatives at the best point, from which the covariance and
       the answers are computed.
-    - `considered`: the sensor errors that the covariance allows for by a `Tolerance`.
-    - `allowance`: the sentences on the sensor errors that the intervals allow for.
-    - `hidden_directions`: (k, n) for a fit of windows the directions of x that only one stretch (a
-      run of neighbouring windows) shows. The variance along these directions is infinite.
     - `place`: where the fit was computed, in words, if that is not JAX's default device.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
@@ -93,31 +69,118 @@ class Fit(eqx.Module):
     (['Ix/Iz', 'Iy/Iz'], (8, 8))
     """
 
-    model: Model
-    x: Float[Array, " n"]
-    covariance: Float[Array, "n n"]
-    determined_covariance: Float[Array, "n n"]
-    covariance_kind: str
-    noises: Noise
-    starts: tuple[Start, ...]
-    chi2: float
-    dof: int
-    correlation: float
-    independent: float
-    singular_values: Float[Array, " n"]
-    null_directions: Float[Array, "unseen n"]
+    point: BestPoint
+    uncertainty: Uncertainty
+    assessment: Assessment
     quantities: tuple[Quantity, ...]
-    search: Answer
-    explanation: Answer
-    left: tuple[int, ...]
-    limits: tuple[Limit, ...] = ()
-    near: Float[Array, " n"] | None = None
-    freedom: Freedom | None = None
+    starts: tuple[Start, ...]
     linear: Linearisation | None = None
-    considered: tuple[Consideration, ...] = ()
-    allowance: str = ""
-    hidden_directions: Float[Array, "hidden n"] | None = None
     place: str = ""
+
+    @property
+    def model(self) -> Model:
+        """Return the model that was fitted."""
+        return self.point.model
+
+    @property
+    def x(self) -> Float[Array, " n"]:
+        """Return the parameters (n,) at the best point."""
+        return self.point.x
+
+    @property
+    def noises(self) -> Noise:
+        """Return the deviations (R, k) of the errors of each sensor in R recordings."""
+        return self.point.noises
+
+    @property
+    def near(self) -> Float[Array, " n"] | None:
+        """Return the parameters of a slightly thicker body if a body is flat at x, else `None`."""
+        return self.point.near
+
+    @property
+    def covariance(self) -> Float[Array, "n n"]:
+        """Return the covariance (n, n) of x, infinite where the data do not determine x."""
+        return self.uncertainty.covariance
+
+    @property
+    def determined_covariance(self) -> Float[Array, "n n"]:
+        """Return the covariance (n, n) of x within the directions that the data determine."""
+        return self.uncertainty.determined
+
+    @property
+    def covariance_kind(self) -> str:
+        """Return the method by which the covariance was computed, in words."""
+        return self.uncertainty.kind
+
+    @property
+    def singular_values(self) -> Float[Array, " n"]:
+        """Return the singular values (n,) of the Jacobian, with columns of length one."""
+        return self.uncertainty.singular_values
+
+    @property
+    def null_directions(self) -> Float[Array, "unseen n"]:
+        """Return the directions (k, n) of x that the data do not determine."""
+        return self.uncertainty.null_directions
+
+    @property
+    def hidden_directions(self) -> Float[Array, "hidden n"] | None:
+        """Return the directions (k, n) of x that only one stretch of windows shows."""
+        return self.uncertainty.hidden_directions
+
+    @property
+    def limits(self) -> tuple[Limit, ...]:
+        """Return for each body with free moments its distance from a flat body."""
+        return self.uncertainty.limits
+
+    @property
+    def freedom(self) -> Freedom | None:
+        """Return what gives the degrees of freedom of variances."""
+        return self.uncertainty.freedom
+
+    @property
+    def considered(self) -> tuple[Consideration, ...]:
+        """Return the sensor errors that the covariance allows for by a `Tolerance`."""
+        return self.uncertainty.considered
+
+    @property
+    def allowance(self) -> str:
+        """Return the sentences on the sensor errors that the intervals allow for."""
+        return self.uncertainty.allowance
+
+    @property
+    def search(self) -> Answer:
+        """Return the answer on the search: `found`, `not alone` or `not ended`."""
+        return self.assessment.search
+
+    @property
+    def explanation(self) -> Answer:
+        """Return the answer on the model, such as `explains the readings`."""
+        return self.assessment.explanation
+
+    @property
+    def left(self) -> tuple[int, ...]:
+        """Return the indices of the sensors whose errors the model does not explain."""
+        return self.assessment.left
+
+    @property
+    def chi2(self) -> float:
+        """Return χ², summed over the sensors whose noise was given."""
+        return self.assessment.chi2
+
+    @property
+    def dof(self) -> int:
+        """Return the degrees of freedom of χ²."""
+        return self.assessment.dof
+
+    @property
+    def correlation(self) -> float:
+        """Return the number of samples over which the errors are autocorrelated."""
+        return self.assessment.correlation
+
+    @property
+    def independent(self) -> float:
+        """Return the number of independent errors."""
+        return self.assessment.independent
 
     @property
     def status(self) -> str:
@@ -145,7 +208,7 @@ class Fit(eqx.Module):
         They are the best point x. But if a body is flat at x (I1 + I2 = I3), they are the field
         `near`, which describes a slightly thicker body.
         """
-        return self.x if self.near is None else self.near
+        return self.point.derivative_point
 
     @property
     def causes(self) -> tuple[Cause, ...]:
@@ -327,11 +390,7 @@ class Fit(eqx.Module):
         `slope` (…, n) holds the derivative of each function with respect to the n free numbers of
         this fit. The result is infinite if the field `freedom` is `None`.
         """
-        return (
-            np.full(slope.shape[:-1], np.inf)
-            if self.freedom is None
-            else self.freedom.of_variance(slope)
-        )
+        return undetermined.degrees_of_freedom(self.uncertainty, slope)
 
     @property
     def undetermined_combinations(self) -> tuple[Combination, ...]:
@@ -341,12 +400,14 @@ class Fit(eqx.Module):
         tuple is empty if the data determine all numbers. Each combination has the members
         `names`, `changes` and `in_words`.
         """
-        return undetermined_combinations(self)
+        return undetermined_combinations(self.point, self.null_directions)
 
     @property
     def identifiability(self) -> tuple[str, ...]:
         """Describe which quantities the data of this fit determine well, weakly, and not at all."""
-        return undetermined.describe_identifiability(self)
+        return undetermined.describe_identifiability(
+            self.point, self.uncertainty, self.assessment, self.quantities
+        )
 
 
 def value_and_interval_of(

@@ -1,7 +1,6 @@
 """Describe in words which numbers a fit determines, and which numbers it leaves undetermined."""
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -11,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.answer.answers import FAILS, NOT_ENDED
+from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.data.full_scale import describe_full_scale
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, body_list
@@ -34,10 +34,6 @@ from rigidjax.identify.uncertainty.quantities import (
 )
 from rigidjax.motion.manifold import minus, parts_by_name
 from rigidjax.rotation import quaternion
-
-if TYPE_CHECKING:
-    from rigidjax.identify.answer.result import Fit
-
 
 # A number belongs to a combination if it changes by more than this fraction of the largest change.
 PART = 1e-3
@@ -119,19 +115,21 @@ class Combination(eqx.Module):
 TENSOR = dict(zip(Tensor.plain_names, COMPONENTS, strict=True))
 
 
-def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
+def undetermined_combinations(
+    point: BestPoint, null_directions: Float[Array, "k n"]
+) -> tuple[Combination, ...]:
     """Return the combinations of numbers that the data of a fit do not determine at all.
 
     Each combination is made of few numbers, and it has one number that no other combination has,
     because the combinations are the rows of a reduced row echelon form.
     """
-    null = np.asarray(fit.null_directions)
+    null, model = np.asarray(null_directions), point.model
     if not null.size:
         return ()
     best = basis = None
-    values, slopes = _numbers_on_host(fit)
-    names, many = _labels(fit.model), len(named_charts(fit.model))
-    first, turns = len(labels(fit.model)), 3 * fit.model.count
+    values, slopes = _numbers_on_host(point)
+    names, many = _labels(model), len(named_charts(model))
+    first, turns = len(labels(model)), 3 * model.count
     for other in (1, 0):
         # Compute the combinations twice, with changes of attitude about the axes of the world and
         # about the axes of the body: first leave out the rows of the body's axes, then the rows of
@@ -147,7 +145,7 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
         relative = np.array([one.positive for one in here])
         size = np.where(relative | (size == 0), 1.0, size)
         changes = null @ slope.T / size
-        changes = np.where(_mask(fit, [one.name for one in here], changes), changes, 0.0)
+        changes = np.where(_mask(point, [one.name for one in here], changes), changes, 0.0)
         echelon = _echelon(changes)
         if best is None or np.count_nonzero(echelon) < np.count_nonzero(best[0]):
             best, basis = (echelon, here, size, values[rows], slope), changes
@@ -163,8 +161,8 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
         # a step forwards and a step backwards shows it; readings that depend on the square of a
         # number change by the same in both.
         step, switch = 0.01 * direction / np.abs(direction).max(), False
-        if fit.model.torque is not None:
-            switch = 0.5 * _change_of_readings(fit, (step, -step)) > CHANGED
+        if model.torque is not None:
+            switch = 0.5 * _change_of_readings(point, (step, -step)) > CHANGED
         echelon, here, size, value, slope = best
         order = np.flatnonzero(row)
         # The largest entry becomes a hundredth, and the first number rises.
@@ -177,24 +175,26 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
             tuple(label.positive for label in mine),
             switch,
         )
-        out.append(_by_one_factor(fit, one, row, size, value, slope, direction))
+        out.append(_by_one_factor(point, one, row, size, value, slope, direction))
     return tuple(out)
 
 
-def _change_of_readings(fit: "Fit", steps: tuple[np.ndarray, np.ndarray]) -> float:
+def _change_of_readings(point: BestPoint, steps: tuple[np.ndarray, np.ndarray]) -> float:
     """Return the length, in standard deviations, of the difference of all predicted readings after
     two steps (n,) from the best point.
     """
-    x = fit.derivative_point
-    after, before = (blocks_at(fit.model, x + jnp.asarray(step, x.dtype))[0] for step in steps)
-    parts = zip(after, before, fit.noises, strict=True)
+    x = point.derivative_point
+    after, before = (
+        errors_and_slopes(point.model, x + jnp.asarray(step, x.dtype))[0] for step in steps
+    )
+    parts = zip(after, before, point.noises, strict=True)
     return float(
         np.sqrt(sum(np.sum((np.asarray(a - b) / np.asarray(n)[:, None]) ** 2) for a, b, n in parts))
     )
 
 
 def _by_one_factor(
-    fit: "Fit",
+    point: BestPoint,
     one: Combination,
     row: np.ndarray,
     size: np.ndarray,
@@ -222,7 +222,7 @@ def _by_one_factor(
         step = FAR * direction / np.abs(row[order] * size[order] / here).max()
         first = slope[order[0]]
         aside = -0.5 * FAR * values[order[0]] * first / (first @ first)
-        if _change_of_readings(fit, (aside + step, aside)) < CHANGED:
+        if _change_of_readings(point, (aside + step, aside)) < CHANGED:
             return one
     return dataclasses.replace(
         one,
@@ -254,9 +254,9 @@ def _labels(model: Model) -> list[Label]:
     return out
 
 
-def _numbers_on_host(fit: "Fit") -> Linear:
+def _numbers_on_host(point: BestPoint) -> Linear:
     """Return all numbers that a report may name, in the order of `_labels`."""
-    slopes, values = _numbers(with_first_times_only(fit.model), fit.derivative_point)
+    slopes, values = _numbers(with_first_times_only(point.model), point.derivative_point)
     return Linear(np.asarray(values), np.asarray(slopes))
 
 
@@ -292,16 +292,16 @@ def _numbers(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
 
 
 def _mask(
-    fit: "Fit", names: list[str], changes: Float[np.ndarray, "k M"]
+    point: BestPoint, names: list[str], changes: Float[np.ndarray, "k M"]
 ) -> Bool[np.ndarray, " M"]:
     """Return a mask, true for each number that a report may name as undetermined.
 
     The moments and the tensor components of a body describe the same changes: the components are
     named if one of the undetermined `changes` turns the principal axes, else the moments.
     """
-    rows = bodies_at(fit.model, fit.derivative_point)
+    rows = bodies_at(point.model, point.derivative_point)
     mask = np.ones(len(names), bool)
-    for (where, chart), body in zip(named_charts(fit.model), rows, strict=True):
+    for (where, chart), body in zip(named_charts(point.model), rows, strict=True):
         # A name of a tensor component may occur twice in `names`: a chart, which maps free numbers
         # to a body, may report the components, and `_labels` adds them in any case. The last entry
         # with the name is the one added.
@@ -339,22 +339,33 @@ def _echelon(rows: Float[np.ndarray, "k M"]) -> Float[np.ndarray, "_ M"]:
     return np.where(np.abs(rows) > PART * np.abs(rows).max(axis=1, keepdims=True), rows, 0.0)
 
 
-def describe_identifiability(fit: "Fit") -> tuple[str, ...]:
+def degrees_of_freedom(uncertainty: Uncertainty, slope: np.ndarray) -> np.ndarray:
+    """Return the degrees of freedom (…,) of the variance of functions with derivatives (…, n)."""
+    freedom = uncertainty.freedom
+    return np.full(slope.shape[:-1], np.inf) if freedom is None else freedom.of_variance(slope)
+
+
+def describe_identifiability(
+    point: BestPoint,
+    uncertainty: Uncertainty,
+    assessment: Assessment,
+    quantities: tuple[Quantity, ...],
+) -> tuple[str, ...]:
     """Describe which quantities the data of a fit determine well, weakly, and not at all."""
-    lost = fit.explanation.word == FAILS
-    if lost or fit.search.word == NOT_ENDED:
+    lost = assessment.explanation.word == FAILS
+    if lost or assessment.search.word == NOT_ENDED:
         why = "does not explain the data" if lost else "did not end in a minimum"
         out = [
             f"This fit {why}, so it determines nothing: its numbers and intervals belong to the "
             "best point found, and say nothing about the body."
         ]
         # Undetermined directions are the likely reason why a search did not end: name them.
-        out += [] if lost else _describe_combinations(fit)
-        return (*out, *describe_full_scale(fit.model.records.readings))
+        out += [] if lost else _describe_combinations(point, uncertainty)
+        return (*out, *describe_full_scale(point.model.records.readings))
     out = []
     moments, first = [], 0
-    for _, chart in named_charts(fit.model):
-        moments += fit.quantities[first : first + len(chart.log_names)]
+    for _, chart in named_charts(point.model):
+        moments += quantities[first : first + len(chart.log_names)]
         first += len(chart.log_names) + len(chart.plain_names)
     for quantity in moments:
         wide = _half_width(quantity)
@@ -370,21 +381,21 @@ def describe_identifiability(fit: "Fit") -> tuple[str, ...]:
             )
         else:
             out.append(f"{quantity.name} is well determined, to ±{wide:.2g} of its value.")
-    determined = np.asarray(fit.determined_covariance)
+    determined = np.asarray(uncertainty.determined)
     out += [
         f"A flat body{limit.where} fits as well: (I1 + I2 − I3)/I3 ≤ "
         f"{limit.flatness_upper_bound(determined):.2g} (95 %). Intervals end at the limit of real "
         "bodies."
-        for limit in fit.limits
+        for limit in uncertainty.limits
         if limit.is_flat_within(
-            determined, float(student_quantile(0.95, fit.degrees_of_freedom(limit.slope)))
+            determined, float(student_quantile(0.95, degrees_of_freedom(uncertainty, limit.slope)))
         )
     ]
-    if reports_starts(fit.model):
+    if reports_starts(point.model):
         # Each recording has three components of its initial body rate.
-        shares, count = [], fit.model.count
+        shares, count = [], point.model.count
         for index in range(first, first + 3 * count, 3):
-            rate = fit.quantities[index : index + 3]
+            rate = quantities[index : index + 3]
             length = np.linalg.norm([q.value for q in rate])
             shares.append(np.max([_half_width(q) for q in rate]) / max(length, 1e-300))
         wide = np.max(shares)
@@ -395,19 +406,19 @@ def describe_identifiability(fit: "Fit") -> tuple[str, ...]:
             out.append(f"{many} {grade} determined, to ±{wide:.2g} of {its}.")
         else:
             out.append(f"{many} not determined by these data.")
-    out += _describe_combinations(fit)
-    out += _describe_correlations(fit)
-    if fit.model.torque is None:
+    out += _describe_combinations(point, uncertainty)
+    out += _describe_correlations(point, uncertainty, quantities)
+    if point.model.torque is None:
         out.append(
             "Free motion cannot show the absolute inertia, only ratios of moments; nor the mass or "
             "the centre of mass."
         )
-        if all(isinstance(sensor, Gyro) for sensor in fit.model.records.sensors):
+        if all(isinstance(sensor, Gyro) for sensor in point.model.records.sensors):
             out.append(
                 "Rates of free motion with an axis mirrored or two axes swapped fit another body "
                 "as well: they cannot show such a mistake."
             )
-    out += describe_full_scale(fit.model.records.readings)
+    out += describe_full_scale(point.model.records.readings)
     return tuple(out)
 
 
@@ -416,13 +427,13 @@ def _half_width(quantity: Quantity) -> float:
     return float(student_quantile(0.95, quantity.freedom)) * log_deviation(quantity)
 
 
-def _describe_combinations(fit: "Fit") -> list[str]:
+def _describe_combinations(point: BestPoint, uncertainty: Uncertainty) -> list[str]:
     """Describe, each in a sentence, at most `SEVERAL` combinations that are not determined."""
-    combinations = undetermined_combinations(fit)
+    combinations = undetermined_combinations(point, uncertainty.null_directions)
     if not combinations:
         return []
     out = []
-    if _scale_is_free(fit):
+    if _scale_is_free(point, uncertainty):
         out.append("The data determine the inertia only up to scale.")
     out += [one.in_words for one in combinations[:SEVERAL]]
     if len(combinations) > SEVERAL:
@@ -432,31 +443,33 @@ def _describe_combinations(fit: "Fit") -> list[str]:
     return out
 
 
-def _scale_is_free(fit: "Fit") -> bool:
+def _scale_is_free(point: BestPoint, uncertainty: Uncertainty) -> bool:
     """Return whether a change along undetermined directions multiplies all components of the tensor
     by one factor; false for several bodies.
     """
-    null = np.asarray(fit.null_directions)
-    if not len(null) or isinstance(fit.model.chart, Bodies):
+    null = np.asarray(uncertainty.null_directions)
+    if not len(null) or isinstance(point.model.chart, Bodies):
         return False
-    first = len(labels(fit.model))
-    values, slopes = _numbers_on_host(fit)
+    first = len(labels(point.model))
+    values, slopes = _numbers_on_host(point)
     here, moved = values[first : first + 6], slopes[first : first + 6] @ null.T
     wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)
     return bool(np.linalg.norm(moved @ wanted - here) < 1e-3 * np.linalg.norm(here))
 
 
-def _describe_correlations(fit: "Fit") -> list[str]:
+def _describe_correlations(
+    point: BestPoint, uncertainty: Uncertainty, quantities: tuple[Quantity, ...]
+) -> list[str]:
     """Describe at most five pairs of quantities whose correlation ρ has |ρ| > 0.95.
 
     Components of the inertia tensor are left out, because they follow from the moments and axes.
     """
-    slope = np.asarray(quantities_at(fit.model, fit.derivative_point).slopes)[: len(fit.quantities)]
-    covariance = slope @ np.asarray(fit.determined_covariance) @ slope.T
-    deviation = np.array([log_deviation(quantity) for quantity in fit.quantities])
+    slope = np.asarray(quantities_at(point.model, point.derivative_point).slopes)[: len(quantities)]
+    covariance = slope @ np.asarray(uncertainty.determined) @ slope.T
+    deviation = np.array([log_deviation(quantity) for quantity in quantities])
     good = np.isfinite(deviation) & (deviation > 0)
-    follow = {f"{plain}{name}" for name, c in named_charts(fit.model) for plain in c.plain_names}
-    names = [quantity.name for quantity in fit.quantities]
+    follow = {f"{plain}{name}" for name, c in named_charts(point.model) for plain in c.plain_names}
+    names = [quantity.name for quantity in quantities]
     good &= np.array([name not in follow or name.startswith("com") for name in names])
     scaled = np.where(good, deviation, 1.0)
     rho = np.where(np.outer(good, good), covariance / np.outer(scaled, scaled), 0.0)

@@ -16,6 +16,7 @@ from identify.filtering import records
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.answer.answers import Answer
+from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.filtering.terms import curvature
 from rigidjax.identify.model.terms import errors_and_jacobians
 from rigidjax.identify.uncertainty.covariance import linearise
@@ -41,11 +42,15 @@ def fitted():
     covariance = 1e-4 * (jnp.eye(5) + root @ root.T)
     nothing, noises = jnp.zeros((0, 5)), (jnp.full((1, 3), 0.02),)
     return identify.Fit(
-        model(), at, covariance, covariance, "", noises, (), 0.0, 1, 1.0, 1.0,
-        jnp.ones(5), nothing, (), Answer("found"),
-        Answer("explains the readings"), (),
-        linear=linearise(model(), at, noises, error_jacobians(model(), at)),
+        BestPoint(model(), at, noises),
+        Uncertainty(covariance, covariance, "", jnp.ones(5), nothing),
+        Assessment(Answer("found"), Answer("explains the readings"), (), 0.0, 1, 1.0, 1.0),
+        (), (), linearise(model(), at, noises, errors_and_jacobians(model(), at)),
     )  # fmt: skip
+
+
+def with_uncertainty(fit, **parts):
+    return dataclasses.replace(fit, uncertainty=dataclasses.replace(fit.uncertainty, **parts))
 
 
 def places_of(density, count):
@@ -70,7 +75,7 @@ def test_without_a_process_it_is_normal_about_the_motion(fitted):
 
 
 def test_its_width_is_that_of_white_errors_whatever_the_intervals_allow_for(fitted):
-    wide = dataclasses.replace(fitted, covariance_kind="sandwich: the errors are autocorrelated")
+    wide = with_uncertainty(fitted, kind="sandwich: the errors are autocorrelated")
     density = identify.LogDensity(wide)
     columns, h = [], 1e-5
     for step in h * np.eye(5):
@@ -83,7 +88,7 @@ def test_its_width_is_that_of_white_errors_whatever_the_intervals_allow_for(fitt
     integrated = identify.LogDensity(wide, rj.torques.RandomTorque(1e-4), deviation=None)
     np.testing.assert_allclose(integrated.covariance, fitted.covariance)
     # Unless it is singular, which has no root.
-    flat = dataclasses.replace(wide, covariance=1e-4 * jnp.ones((5, 5)))
+    flat = with_uncertainty(wide, covariance=1e-4 * jnp.ones((5, 5)))
     integrated = identify.LogDensity(flat, rj.torques.RandomTorque(1e-4), deviation=None)
     np.testing.assert_allclose(integrated.covariance, density.covariance)
 
@@ -519,7 +524,7 @@ def test_the_information_is_the_covariance_of_the_gradient(fitted, process):
 
 
 def test_a_fit_that_failed_without_the_torque_is_refused_with_the_way_out(fitted):
-    lost = dataclasses.replace(fitted, covariance=jnp.full((5, 5), jnp.inf))
+    lost = with_uncertainty(fitted, covariance=jnp.full((5, 5), jnp.inf))
     with pytest.raises(ValueError, match=r"fewer free numbers\. *"):
         identify.LogDensity(lost)
     with pytest.raises(ValueError, match="begin from a first guess"):
