@@ -294,7 +294,7 @@ def assess(
     """
     x = best.x
     near = flat_limit.thicken(model, x)
-    thickened = None if near is None else (near, errors_and_slopes(model, near))
+    thickened = None if near is None else (near, blocks_at(model, near))
     linear = uncertainty.linearise(model, x, noise, best.blocks, thickened)
     times = uncertainty.correlation_times(linear)
     white = uncertainty.white_covariance(linear)
@@ -306,7 +306,7 @@ def assess(
     else:
         covariance, hidden = jackknife(stretches, white), stretches.hidden_directions
         remarks = (*remarks, *stretch_remarks(stretches, model, numbers, white))
-    remarks = (*remarks, *describe_delays_outside_windows(model, x))
+    remarks = (*remarks, *late_delays(model, x))
     considered_errors = considered.considerations(model, linear, noise, white.determined)
     shifts = considered.shift_matrix(considered_errors, linear.free_count)
     if considered_errors:

@@ -87,7 +87,7 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None
         for name, change in ATTITUDES.items():
             changed = [(t, change(q)) for t, q in known]
             ratios[name] = _rate_misfit(recordings, changed, _SAME)
-    elif depends_on_rate_only(torque):
+    elif rate_only(torque):
         bound, margin = _euler_residual(recordings, torque, _SAME)
         # The body that fits the uncorrected rates best may be unreal. Sensor errors alone can make
         # it slightly unreal, but not as far as a margin of −0.8. With such a margin the file was
@@ -342,7 +342,7 @@ def _rate_response(
         return np.zeros_like
     width, of = model.index.width, model.body_indices
     flow = linear.raw_slopes[index][..., width - 3 : width]
-    tensors = np.stack([np.asarray(tensor_of(b)) for b in bodies_as_list(model.bodies(x))])
+    tensors = np.stack([np.asarray(tensor_of(b)) for b in body_list(model.bodies(x))])
     back = np.linalg.inv(tensors)[np.zeros(model.count, int) if of is None else np.asarray(of)]
     back = np.linalg.pinv(flow) @ back[:, None]
     steps = np.diff(np.asarray(model.records.t), axis=1)[..., None, None]

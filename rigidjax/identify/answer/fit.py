@@ -187,7 +187,7 @@ def fit(
     rough.clear()
     while (finer := _converged_integrator(best, task, rough)) is not None:
         task = task._replace(model=_with_integrator(task.model, finer))
-        best, task = _noise_in_turn(search_whole_records(Attempt(best.x), task), task)
+        best, task = _noise_in_turn(search_whole(Attempt(best.x), task), task)
         best = _with_blocks(best, task.model)
     shown = model
     if task.model is not padded:

@@ -184,9 +184,7 @@ def _change_of_readings(point: BestPoint, steps: tuple[np.ndarray, np.ndarray]) 
     two steps (n,) from the best point.
     """
     x = point.derivative_point
-    after, before = (
-        errors_and_slopes(point.model, x + jnp.asarray(step, x.dtype))[0] for step in steps
-    )
+    after, before = (blocks_at(point.model, x + jnp.asarray(step, x.dtype))[0] for step in steps)
     parts = zip(after, before, point.noises, strict=True)
     return float(
         np.sqrt(sum(np.sum((np.asarray(a - b) / np.asarray(n)[:, None]) ** 2) for a, b, n in parts))
@@ -256,13 +254,12 @@ def _labels(model: Model) -> list[Label]:
 
 def _numbers_on_host(point: BestPoint) -> Linear:
     """Return all numbers that a report may name, in the order of `_labels`."""
-    slopes, values = _numbers(with_first_times_only(point.model), point.derivative_point)
-    return Linear(np.asarray(values), np.asarray(slopes))
+    return Linear(*map(np.asarray, _numbers(shortened(point.model), point.derivative_point)))
 
 
 @eqx.filter_jit
-def _numbers(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Return the derivatives (M, n) and the values (M,) of all numbers that a report may name.
+def _numbers(model: Model, point: Float[Array, " n"]) -> Linear:
+    """Return all numbers that a report may name.
 
     An initial attitude is a turn from that at `point`; an initial position or velocity is the
     difference from that of the reference state.
@@ -288,7 +285,7 @@ def _numbers(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
             numbers += initial_states(x)
         return jnp.concatenate([part.reshape(-1) for part in numbers])
 
-    return value_and_jacfwd(value, point)[::-1]
+    return Linear(*value_and_jacfwd(value, point))
 
 
 def _mask(

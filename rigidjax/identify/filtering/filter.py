@@ -203,15 +203,15 @@ def scene_and_recording(model: Model, x: Float[Array, " n"] | None) -> tuple[Sce
                 "fit(model).x or model.start(body) makes them"
             )
         x = model.start()
-    scene = _first_scene(model, require_numbers(model, x))
+    scene = _first_scene(model, checked_x(model, x))
     steps.require_sensors(scene.sensors)
     return scene, stacking.pick(model.records, 0)
 
 
 @eqx.filter_jit
 def _first_scene(model: Model, x: Float[Array, " n"]) -> Scene:
-    row = model.index.rows_of_recordings(x)[0]
-    record, reference, body_index = stacking.pick_records(
+    row = model.index.rows(x)[0]
+    record, reference, body_index = stacking.pick(
         (model.records, model.reference, model.body_indices), 0
     )
     scene = scene_at(model, row, record, reference, body_index)

@@ -23,7 +23,7 @@ from rigidjax.identify.filtering.filter import (
 from rigidjax.identify.filtering.roots import LogDensityTerms
 from rigidjax.identify.filtering.steps import require_sensors
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.normal import normal_matrix_of_jacobians
+from rigidjax.identify.model.normal import normal_matrix
 from rigidjax.identify.model.terms import (
     BodyIndex,
     bound_torque,
@@ -53,11 +53,11 @@ def recording_terms(
     scene = scene_at(model, free_numbers, record, reference, body_index)
     if scene.process is None and not model.walks:
         scaled, log_variance = [], []
-        errors = errors_of_scene(model, scene, record)
+        errors = scene_errors(model, scene, record)
         for reading, sensor, error in zip(record.readings, scene.sensors, errors, strict=True):
             limit: Any = getattr(sensor, "limit", None)
             noise: Any = sensor.noise
-            one, full, wider = standardised_errors_and_saturation(
+            one, full, wider = standardise(
                 reading.values, reading.mask, error, noise, limit, reading.jitter_error
             )
             scaled.append(one)
@@ -85,9 +85,7 @@ def log_posterior_density(model: Model, x: Float[Array, " n"]) -> Scalar:
 
     Its derivatives are computed for one recording after another, in forward mode.
     """
-    terms = differentiable_map_over_recordings(
-        model.index.rows_of_recordings(x), model, recording_terms
-    )
+    terms = map_rows(model.index.rows(x), model, recording_terms)
     return terms.total - 0.5 * jnp.sum(prior_residuals(model, x) ** 2)
 
 
@@ -107,7 +105,7 @@ def curvature(model: Model, x: Float[Array, " n"]) -> Curvature:
     variance of ν, and ∂ is the gradient with respect to x (Gupta and Mehra 1974,
     doi:10.1109/TAC.1974.1100714, for the filter).
     """
-    value, slopes = errors_and_jacobians(model, x, recording_terms)
+    value, slopes = error_jacobians(model, x, recording_terms)
     # Compute dν/√s, with the innovation ν of variance s, from the derivative of ν/√s, by d(ν/√s) =
     # dν/√s − ½ ν/√s d(log s).
     moved = slopes.error + 0.5 * value.error[..., None] * slopes.log_variance
@@ -117,6 +115,6 @@ def curvature(model: Model, x: Float[Array, " n"]) -> Curvature:
     each = jnp.einsum("rn,rni->ri", value.error, slopes.error)
     each = each + 0.5 * jnp.sum(slopes.log_variance, 1)
     slope = jnp.zeros(size + 1, x.dtype).at[places].add(each)[:-1]
-    rows, rest = jacobian_and_value(lambda x: prior_residuals(model, x), x)
+    rest, rows = value_and_jacfwd(lambda x: prior_residuals(model, x), x)
     cost = 0.5 * jnp.sum(rest**2) - value.total
     return Curvature(cost, gram + rows.T @ rows, slope + rest @ rows)

@@ -190,7 +190,7 @@ _MARK = object()
 def _noise_factors(model: Model) -> list[_Factor]:
     """Return a factor of the unknown noise of each sensor, for each group of recordings."""
     groups, out = np.asarray(model.noise_groups), []
-    scene = scene_at_starting_values(model, model.records)
+    scene = starting_scene(model, model.records)
     for index, reading in enumerate(model.records.readings):
         if reading.sensor.noise is not None:
             continue

@@ -94,7 +94,7 @@ def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
 
 def _require_known_noise(model: Model, x: Float[Array, " n"]) -> None:
     """Raise an error for unknown noise or jitter, or if x are no parameters of the `model`."""
-    require_numbers(model, x)
+    checked_x(model, x)
     for sensor in model.records.sensors:
         if sensor.noise is None:
             raise ValueError(

@@ -18,7 +18,7 @@ from rigidjax.identify.data.windows import (
 )
 from rigidjax.identify.model.charts import body_places
 from rigidjax.identify.model.index import build_index
-from rigidjax.identify.model.model import require_inputs_of_windows, with_replaced_fields
+from rigidjax.identify.model.model import replaced, require_inputs
 from rigidjax.identify.model.terms import all_errors
 
 
@@ -60,10 +60,10 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
             "value for each window, which other windows do not have"
         )
     _checks.require_instance(windows.starts, type(model.reference.state), "windows.starts")
-    require_inputs_of_windows(model.torque, windows)
+    require_inputs(model.torque, windows)
     # The states at the starts are known, so that the parameters are those that all windows share.
-    reference, _, clusters = window_starts_weights_and_stretches(windows, 1)
-    bodies = indices_of_body_numbers(model.chart, None, windows.count)
+    reference, _, clusters = window_starts(windows, 1)
+    bodies = body_places(model.chart, None, windows.count)
     index, slots = build_index(bodies, model.index.bodies, model.slots, 0)
     parts = dict(
         records=windows.records(),
@@ -76,8 +76,8 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
         clusters=clusters,
         noise_groups=jnp.zeros(windows.count, jnp.int32),
     )
-    errors = _errors(with_replaced_fields(model, **parts), fit.x[: index.size])[0]
-    return average_by_horizon(windows.starts, errors[:, 1:])
+    errors = _errors(replaced(model, **parts), fit.x[: index.size])[0]
+    return by_horizon(windows.starts, errors[:, 1:])
 
 
 _errors = eqx.filter_jit(all_errors)

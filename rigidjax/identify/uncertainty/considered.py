@@ -74,7 +74,7 @@ def considerations(
         tolerance = getattr(sensor, "tolerance", None)
         for kind, member in MEMBERS.items():
             width = getattr(tolerance, kind, None)
-            some = [leaf_and_entries(one.path)[1] for one in sensor_slots(model, index, member)]
+            some = [split_path(one.path)[1] for one in sensor_slots(model, index, member)]
             if width is None or None in some:
                 continue
             # The tolerance of one sensor may differ between recordings. The largest tolerance is
@@ -129,7 +129,7 @@ def unit_shifts(
         direction = np.stack(columns, axis=-1)
     # Make NumPy arrays: single operations of JAX are slow outside of a compiled program.
     scaled = np.asarray(
-        standardised_error_changes(direction, np.asarray(noise[sensor_index]), reading.jitter_error)
+        scaled_slopes(direction, np.asarray(noise[sensor_index]), reading.jitter_error)
     )
     pulls = np.einsum(
         "rtkm,rt,rtkc->rmc",

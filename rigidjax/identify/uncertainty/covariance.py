@@ -155,8 +155,8 @@ def _slopes_as_matrices(
 def _linearised(model: Model, x: Array, noise: Noise, blocks: Blocks) -> dict[str, Any]:
     """Compute those fields of a `Linearisation`, by name, that take one compiled program."""
     errors, slopes = blocks
-    out, slopes = residuals_and_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
-    extra_slopes, extra = jacobian_and_value(lambda x: body_prior_and_pull_residuals(model, x), x)
+    out, slopes = residual_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
+    extra, extra_slopes = value_and_jacfwd(lambda x: joint_residuals(model, x), x)
     prior = prior_weights(model)
     return {
         "errors": out,
@@ -188,7 +188,7 @@ def linearise(
         thick = linearise(model, thickened[0], noise, thickened[1])
         parts |= {"slopes": thick.slopes, "extra_slopes": thick.extra_slopes}
     pairs = zip(model.records.readings, parts["weights"], strict=True)
-    mask = tuple(reading.usable_channel_mask & (weight > 0)[..., None] for reading, weight in pairs)
+    mask = tuple(reading.usable & (weight > 0)[..., None] for reading, weight in pairs)
     return Linearisation(raw=raw, raw_slopes=raw_slopes, mask=mask, **parts)
 
 

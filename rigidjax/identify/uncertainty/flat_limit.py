@@ -110,7 +110,7 @@ def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
 
 def bodies_at(model: Model, x: Float[Array, " n"]) -> list[Any]:
     """Return the bodies of a `model` in the order of its charts."""
-    return bodies_as_list(model.unpack(x).body)
+    return body_list(model.unpack(x).body)
 
 
 def _thicker(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:

@@ -163,7 +163,7 @@ def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
     """Return the quantities that a fit reports, in the order of `labels`: numbers of each body,
     initial body rates (rad/s), and the values of each `Free`; positive ones as logarithms.
     """
-    parts, bodies = [jnp.zeros(0, x.dtype)], bodies_as_list(model.bodies(x))
+    parts, bodies = [jnp.zeros(0, x.dtype)], body_list(model.bodies(x))
     for (_, chart), body in zip(named_charts(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
     if reports_starts(model):
@@ -189,7 +189,7 @@ class Linear(NamedTuple):
 
 def quantities_at(model: Model, x: Float[Array, " n"]) -> Linear:
     """Return the reported quantities of a `model` at the parameters x."""
-    return _quantities_at(with_first_times_only(model), x)
+    return _quantities_at(shortened(model), x)
 
 
 @eqx.filter_jit
@@ -197,8 +197,7 @@ def _quantities_at(model: Model, x: Float[Array, " n"]) -> Linear:
     def value(x: Array) -> Array:
         return jnp.concatenate([quantity_vector(model, x), flat_limit.flatness(model, x)])
 
-    slope, values = jacobian_and_value(value, x)
-    return Linear(values, slope)
+    return Linear(*value_and_jacfwd(value, x))
 
 
 def quantities_on_host(
