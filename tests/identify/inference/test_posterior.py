@@ -18,7 +18,7 @@ from rigidjax import identify
 from rigidjax.identify.answer.answers import Answer
 from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.filtering.terms import curvature
-from rigidjax.identify.model.terms import errors_and_jacobians
+from rigidjax.identify.model.terms import error_jacobians
 from rigidjax.identify.uncertainty.covariance import linearise
 
 # The places of the initial rate among the free numbers of `model`.
@@ -45,7 +45,7 @@ def fitted():
         BestPoint(model(), at, noises),
         Uncertainty(covariance, covariance, "", jnp.ones(5), nothing),
         Assessment(Answer("found"), Answer("explains the readings"), (), 0.0, 1, 1.0, 1.0),
-        (), (), linearise(model(), at, noises, errors_and_jacobians(model(), at)),
+        (), (), linearise(model(), at, noises, error_jacobians(model(), at)),
     )  # fmt: skip
 
 
