@@ -27,9 +27,10 @@ from rigidjax.solve.switching import (
 )
 from rigidjax.solve.traced import trace_program
 
-# The operands are sampled `_A_STEP` times in a mean step of the run, in blocks of `_WINDOWS` times
-# `_SAMPLES` times, of which at most `_BLOCKS` are taken. A block gives one peak of each window.
-_A_STEP, _WINDOWS, _SAMPLES, _BLOCKS = 64, 32, 16, 32
+# The operands are sampled `_A_STEP` times in a mean step of the run (a result of a loop or a table
+# itself: `_OWN` times), in blocks of `_WINDOWS` times `_SAMPLES` times, of which at most `_BLOCKS`
+# are taken. A block gives one peak of each window.
+_A_STEP, _OWN, _WINDOWS, _SAMPLES, _BLOCKS = 16, 64, 32, 16, 32
 _SHORTER, _LARGE = 60, 1e30
 _STEEP = {"tanh", "logistic", "erf", "erfc", "atan", "asinh", "sinh", "cosh", "expm1"}
 
@@ -102,7 +103,7 @@ def times_of_peaks(setup: DiffraxRun, ts: Array, ys: PyTree, num_steps: Array) -
 
     size = float(_WINDOWS * _SAMPLES)
     steps = num_steps.astype(dtype)
-    blocks = jnp.clip(jnp.ceil(_A_STEP / size * steps), 1.0, _BLOCKS)
+    blocks = jnp.clip(jnp.ceil((_OWN if own.any() else _A_STEP) / size * steps), 1.0, _BLOCKS)
 
     def block(i: Array, best: tuple[Array, ...]) -> tuple[Array, ...]:
         share = (i.astype(dtype) * size + np.arange(-1.0, size + 1.0)) / (blocks * size)
