@@ -7,6 +7,7 @@ each counted once, in a call that nothing was compiled for (`sys.setprofile`).
 
 import ast
 import io
+import re
 import sys
 import tokenize
 from pathlib import Path
@@ -35,6 +36,42 @@ def code_lines(text: str) -> set[int]:
             word = node.body[0]
             lines -= set(range(word.lineno, (word.end_lineno or word.lineno) + 1))
     return lines
+
+
+def furniture() -> None:
+    """Print how many statements, private functions and docstring lines of what is not exported."""
+    trees = {file: ast.parse(file.read_text()) for file in ROOT.rglob("*.py")}
+    imports = [n for t in trees.values() for n in ast.walk(t) if isinstance(n, ast.ImportFrom)]
+    exported = {a.name for n in imports for a in n.names if a.asname == a.name}
+    holders = ast.Module | ast.ClassDef | ast.FunctionDef
+    nodes = [node for tree in trees.values() for node in ast.walk(tree)]
+    docs = sum(bool(ast.get_docstring(n)) for n in nodes if isinstance(n, holders))
+    print(f"statements {sum(isinstance(n, ast.stmt) for n in nodes) - docs}")
+    private = once = hidden = things = 0
+    for file, tree in trees.items():
+        used = [n.id for n in ast.walk(tree) if isinstance(n, ast.Name)]
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("_"):
+                private += 1
+                short = sum(isinstance(n, ast.stmt) for n in ast.walk(node)) <= 15
+                once += short and used.count(node.name) <= 1
+            if not isinstance(node, ast.FunctionDef | ast.ClassDef):
+                continue
+            for inner in ast.walk(node):
+                own = isinstance(inner, ast.FunctionDef | ast.ClassDef)
+                if own and ast.get_docstring(inner):
+                    if node.name not in exported or inner.name.startswith("_"):
+                        word = inner.body[0]
+                        hidden += (word.end_lineno or 0) - word.lineno + 1
+        things += len(re.findall(r"\b(?:two|three|four|five|six) things\b", file.read_text()))
+    names = [n.name.strip("_") for n in nodes if isinstance(n, ast.FunctionDef)]
+    names = [n for n in names if n]
+    long = sum(len(n) >= 30 for n in names)
+    print(f"private functions of modules {private}, of these short and named once {once}")
+    print(
+        f"letters of a function's name {sum(map(len, names)) / len(names):.1f}; 30 and more: {long}"
+    )
+    print(f"docstring lines of what is not exported {hidden}; 'two things': {things}")
 
 
 def entered(call: object, part: str = "") -> tuple[int, int]:
@@ -132,6 +169,7 @@ def main() -> None:
         if isinstance(node, ast.FunctionDef)
     ]
     print("longest functions", *sorted(lengths, reverse=True)[:5])
+    furniture()
 
     body = rj.Inertia.from_principal(1.6, 2.0, 3.0)
     top = rj.torques.HeavyTop(1.0, [0.1, 0.2, 0.9], [0.0, 0.0, -9.81])
