@@ -73,13 +73,8 @@ def step_and_two_points(
 
     The values of a function f at the two points give its slope, to be compared with its derivative.
 
-    - `x`: a tree of the numbers at which f is differentiated.
-    - `value`, `value_error`: f(x), and the error of each of its numbers.
-    - `derivative`: df/dx, a tree of arrays whose axes are those of f(x) and then those of x.
-
-    **Returns** two things: the length h () of the step, relative to the sizes of the numbers of
-    `x`; and the two points x − h d and x + h d, where d is the direction of the line, as a tree
-    with the two points in a new first axis of each array.
+    The length h is relative to the sizes of the numbers of `x`; the points x − h d and x + h d,
+    where d is the direction of the line, stand in a new first axis of each array.
     """
     rng = np.random.default_rng(2)
 
@@ -133,7 +128,7 @@ def values_at_two_points(
 
 
 @jax.jit
-def slopes_by_derivative_and_values(
+def slopes_of_both(
     x: PyTree, value_at_x: Array, step: Array, points: PyTree, values: Array, error: Any
 ) -> Slopes:
     """Return the slope of a function by its derivative, and by its values on both sides of `x`.

@@ -251,12 +251,8 @@ def separate_equal_times(times: Array, t0: Array, t1: Array) -> tuple[Array, Arr
     Two stops at the same time are moved apart by some units of round-off. Between two jumps at the
     same time the run then takes a very short step, so that each jump time has its own derivative.
 
-    - `times`: (k,) s, the times of jumps, in any order.
-    - `t0`, `t1`: the start and the end of the run, s. A time outside of the run is replaced by the
-      nearer of the two.
-
-    **Returns** two things: the stops (k,), s, in order; and an array (k,), s, with the stop that
-    belongs to each of the `times`.
+    Times outside of the run become its start or its end. The second result is the stop (k,) of each
+    of the `times`.
     """
     inside = (times > t0) & (times < t1)
     t = jnp.where(inside, times, jnp.where(times <= t0, t0, t1))
