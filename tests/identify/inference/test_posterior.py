@@ -49,8 +49,14 @@ def fitted():
     )  # fmt: skip
 
 
-def with_uncertainty(fit, **parts):
-    return dataclasses.replace(fit, uncertainty=dataclasses.replace(fit.uncertainty, **parts))
+def changed(fit, **fields):
+    """A fit with other fields of its parts, by their names there."""
+    for name in ("point", "uncertainty"):
+        part = getattr(fit, name)
+        own = {key: fields.pop(key) for key in list(fields) if hasattr(part, key)}
+        fit = dataclasses.replace(fit, **{name: dataclasses.replace(part, **own)})
+    assert not fields
+    return fit
 
 
 def places_of(density, count):
@@ -75,7 +81,7 @@ def test_without_a_process_it_is_normal_about_the_motion(fitted):
 
 
 def test_its_width_is_that_of_white_errors_whatever_the_intervals_allow_for(fitted):
-    wide = with_uncertainty(fitted, kind="sandwich: the errors are autocorrelated")
+    wide = changed(fitted, kind="sandwich: the errors are autocorrelated")
     density = identify.LogDensity(wide)
     columns, h = [], 1e-5
     for step in h * np.eye(5):
@@ -88,7 +94,7 @@ def test_its_width_is_that_of_white_errors_whatever_the_intervals_allow_for(fitt
     integrated = identify.LogDensity(wide, rj.torques.RandomTorque(1e-4), deviation=None)
     np.testing.assert_allclose(integrated.covariance, fitted.covariance)
     # Unless it is singular, which has no root.
-    flat = with_uncertainty(wide, covariance=1e-4 * jnp.ones((5, 5)))
+    flat = changed(wide, covariance=1e-4 * jnp.ones((5, 5)))
     integrated = identify.LogDensity(flat, rj.torques.RandomTorque(1e-4), deviation=None)
     np.testing.assert_allclose(integrated.covariance, density.covariance)
 
@@ -97,7 +103,7 @@ def test_a_noise_that_is_unknown_is_one_number_as_in_the_fit(fitted):
     record = model().recordings[0]
     unknown = (identify.Gyro(), record.readings[0].values)
     other = identify.Model(identify.Recording(record.t, unknown), identify.PrincipalRatios())
-    density = identify.LogDensity(dataclasses.replace(fitted, model=other))
+    density = identify.LogDensity(changed(fitted, model=other))
     assert density.size == 6
     (place,) = places_of(density, 1)
     np.testing.assert_allclose(density.covariance[place, place], 1 / (2 * 180))
@@ -163,7 +169,7 @@ def test_a_density_that_is_unknown_is_one_number_more(fitted):
 def test_the_process_of_the_model_is_that_of_the_density(fitted):
     record, chart = model().recording, identify.PrincipalRatios()
     process = rj.torques.RandomTorque(1e-4)
-    other = dataclasses.replace(fitted, model=identify.Model(record, chart, process=process))
+    other = changed(fitted, model=identify.Model(record, chart, process=process))
     ours, wanted = identify.LogDensity(other), identify.LogDensity(fitted, process)
     assert ours.size == 6
     x = wanted.x0 + 0.01
@@ -202,7 +208,7 @@ def test_a_walk_without_drift_is_a_bias_that_is_integrated_out(fitted):
     seen = identify.Recording(record.t, (gyro, record.readings[0].values))
     walk = identify.Walk(lambda s: s.sensors[0].bias, deviation)
     other = identify.Model(seen, identify.PrincipalRatios(), walks=[walk])
-    density = identify.LogDensity(dataclasses.replace(fitted, model=other))
+    density = identify.LogDensity(changed(fitted, model=other))
     x = density.x0 + 0.01
     errors = np.asarray(model().errors(x)[0])
     times = len(errors)
@@ -224,8 +230,8 @@ def test_a_noise_that_is_unknown_moves_no_other_number(fitted):
         at = other.start(records.BODY, omega=records.START.omega)
         at = at.at[other.slots[0].shared[0]].set(jnp.array([1.0, -1.0, 0.5]))
         covariance = 1e-4 * jnp.eye(8)
-        found = dataclasses.replace(
-            fitted, model=other, x=at, covariance=covariance, determined_covariance=covariance,
+        found = changed(
+            fitted, model=other, x=at, covariance=covariance, determined=covariance,
             singular_values=jnp.ones(8), null_directions=jnp.zeros((0, 8)),
         )  # fmt: skip
         with_one = identify.LogDensity(found, rj.torques.RandomTorque(1e-4), deviation=None)
@@ -247,8 +253,8 @@ def test_the_gradient_with_a_process_is_right_recording_by_recording(fitted):
     at = both.start(records.BODY)
     size = at.size
     covariance = 1e-4 * jnp.eye(size)
-    found = dataclasses.replace(
-        fitted, model=both, x=at, covariance=covariance, determined_covariance=covariance,
+    found = changed(
+        fitted, model=both, x=at, covariance=covariance, determined=covariance,
         noises=(jnp.full((2, 3), 0.02),), singular_values=jnp.ones(size),
         null_directions=jnp.zeros((0, size)),
     )  # fmt: skip
@@ -288,8 +294,8 @@ def test_chains_of_many_recordings_are_those_of_their_keys_too(fitted):
     many = identify.Model([model().recordings[0]] * 8, identify.PrincipalRatios())
     at = many.start(records.BODY)
     covariance = jnp.diag(jnp.linspace(1e-4, 1e-2, 26))
-    found = dataclasses.replace(
-        fitted, model=many, x=at, covariance=covariance, determined_covariance=covariance,
+    found = changed(
+        fitted, model=many, x=at, covariance=covariance, determined=covariance,
         noises=(jnp.full((8, 3), 0.02),), singular_values=jnp.ones(26),
         null_directions=jnp.zeros((0, 26)),
     )  # fmt: skip
@@ -366,8 +372,8 @@ def test_several_bodies_go_to_arviz_by_name(fitted):
     size = at.size
     covariance = 1e-4 * jnp.eye(size)
     noises = (jnp.full((2, 3), 0.02),)
-    found = dataclasses.replace(
-        fitted, model=both, x=at, covariance=covariance, determined_covariance=covariance, noises=noises,
+    found = changed(
+        fitted, model=both, x=at, covariance=covariance, determined=covariance, noises=noises,
         singular_values=jnp.ones(size), null_directions=jnp.zeros((0, size)),
     )  # fmt: skip
     density = identify.LogDensity(found)
@@ -501,7 +507,7 @@ def test_the_information_is_the_covariance_of_the_gradient(fitted, process):
     seen = identify.Recording(ts, (identify.Gyro(), jnp.ones((25, 3))))
     other = identify.Model(seen, identify.PrincipalRatios())
     at = other.start(records.BODY, omega=records.START.omega)
-    found = dataclasses.replace(fitted, model=other, x=at)
+    found = changed(fitted, model=other, x=at)
     density = identify.LogDensity(found, process, deviation=50.0)
 
     def one(key):
@@ -524,7 +530,7 @@ def test_the_information_is_the_covariance_of_the_gradient(fitted, process):
 
 
 def test_a_fit_that_failed_without_the_torque_is_refused_with_the_way_out(fitted):
-    lost = with_uncertainty(fitted, covariance=jnp.full((5, 5), jnp.inf))
+    lost = changed(fitted, covariance=jnp.full((5, 5), jnp.inf))
     with pytest.raises(ValueError, match=r"fewer free numbers\. *"):
         identify.LogDensity(lost)
     with pytest.raises(ValueError, match="begin from a first guess"):
