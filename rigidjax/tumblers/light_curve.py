@@ -206,7 +206,7 @@ def fit_light_curve(
     # The result has the readings without the padding that the search added.
     own = eqx.tree_at(lambda m: m.slots, model, best.model.slots)
     linear = best.linear and best.linear.first_times(model.records.t.shape[1])
-    return eqx.tree_at(lambda one: (one.fit.model, one.fit.linear), result, (own, linear))
+    return eqx.tree_at(lambda one: (one.fit.point.model, one.fit.linear), result, (own, linear))
 
 
 def _require_one_brightness(model: Model) -> Reading:

@@ -178,7 +178,7 @@ def test_numbers_that_are_none_are_written_all_the_same(found, tmp_path):
     import equinox as eqx
 
     odd = eqx.tree_at(
-        lambda f: (f.chi2, f.correlation, f.noises),
+        lambda f: (f.assessment.chi2, f.assessment.correlation, f.point.noises),
         found,
         (np.nan, np.inf, (jnp.array([[np.inf, 1.0, 1.0]]),)),
     )
@@ -192,7 +192,7 @@ def test_ctrl_c_is_said_and_is_the_exit_code(folder, found, monkeypatch, capsys)
     import equinox as eqx
 
     search = Answer("found", ("interrupted after 1 of 8 starts",))
-    cut = eqx.tree_at(lambda f: f.search, found, search)
+    cut = eqx.tree_at(lambda f: f.assessment.search, found, search)
     monkeypatch.setattr(rj.identify, "fit", lambda *_, **__: cut)
     assert main(["identify", "log.csv", "--json", "n.json"]) == 130
     out = capsys.readouterr()

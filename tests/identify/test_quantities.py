@@ -73,7 +73,7 @@ def test_an_indefinite_information_is_told():
         np.asarray(found.null_directions),
     )
     wrong = eqx.tree_at(
-        lambda f: (f.determined_covariance, f.quantities), found, (jnp.asarray(seen), numbers)
+        lambda f: (f.uncertainty.determined, f.quantities), found, (jnp.asarray(seen), numbers)
     )
     assert np.isnan(wrong.interval()["Ix/Iz"]).all()
     low, high = wrong.interval_of(lambda point: point.body.moments[:1])
