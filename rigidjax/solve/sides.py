@@ -72,22 +72,22 @@ class Sided(eqx.Module):
         still = lax.stop_gradient(jnp.asarray(t))
         # The oldest supported JAX has no derivative of `nextafter`, not even inside
         # `stop_gradient`: `stop_gradient` is therefore applied to its argument.
-        low, high = (jnp.full_like(still, end) for end in (-jnp.inf, jnp.inf))
+        ahead, behind = (jnp.full_like(still, end) for end in (jnp.inf, -jnp.inf))
         jumps = lax.stop_gradient(self.jumps.astype(still.dtype))
-        # A law may have the value before a jump at the time of the jump, as tables do at their last
-        # row. A step that begins there needs the value after it: in a run backwards that of the
-        # number before, else that of the next number. The step that ends the run needs the value
-        # before a jump.
-        closed = jumps[-1:] if isinstance(self.law, _OWN) else jumps
-        ahead = jnp.where(jnp.any(still == closed), jnp.nextafter(still, high), still)
-        before = jnp.nextafter(still, low)
-        now = jnp.where(still == self.end, before, ahead)
+        # At the time of a jump a law has the value after the jump, or that before it, as tables do
+        # at their last row. A step that begins there in a run backwards needs the number before the
+        # jump, else the next one. The step that ends the run needs the value on its own side.
+        jump = jumps[-1:] if self.sign is None and isinstance(self.law, _OWN) else jumps
         if self.sign is not None:
-            back = jnp.where(still == self.end, still, before)
-            now = jnp.where(self.sign < 0, back, now)
+            ahead, behind = (jnp.where(self.sign < 0, -end, end) for end in (ahead, behind))
+        now = jnp.where(jnp.any(still == jump), jnp.nextafter(still, ahead), still)
+        now = jnp.where(still == self.end, jnp.nextafter(still, behind), now)
         if self.stops is not None:
             stops = self.stops.astype(still.dtype)
-            new, after = now >= stops, jnp.nextafter(jumps, jnp.full_like(jumps, jnp.inf))
+            new = now >= stops
+            if self.sign is not None:
+                new = jnp.where(self.sign < 0, now > stops, new)
+            after = jnp.nextafter(jumps, jnp.full_like(jumps, jnp.inf))
             before = jnp.nextafter(jumps, jnp.full_like(jumps, -jnp.inf))
             now = jnp.maximum(now, jnp.max(jnp.where(new, after, -jnp.inf)))
             now = jnp.minimum(now, jnp.min(jnp.where(new, jnp.inf, before)))

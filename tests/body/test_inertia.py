@@ -210,11 +210,11 @@ REFUSED = {
     "two masses": (lambda: MassProperties([1.0, 2.0], ORIGIN, GOOD), r"mass \(2,\), com \(3,\)"),
     "two centres": (
         lambda: MassProperties(1.0, np.zeros((2, 3)), GOOD),
-        r"com \(2, 3\), second_moment \(3, 3\)$",
+        r"com \(2, 3\), second_moment \(3, 3\);",
     ),
     "two masses, three tensors": (
         lambda: MassProperties(np.ones(2), np.zeros((2, 3)), np.stack([GOOD] * 3)),
-        r"mass \(2,\), com \(2, 3\), second_moment \(3, 3, 3\)$",
+        r"mass \(2,\), com \(2, 3\), second_moment \(3, 3, 3\);",
     ),
     "shape": (lambda: Inertia.from_tensor(np.ones(3)), r"wanted shape \(3, 3\), got \(3,\)"),
     "batch": (lambda: Inertia.from_tensor(np.ones((5, 3, 3))), "jax.vmap"),
