@@ -26,6 +26,7 @@ from rigidjax.identify.search.starts import (
     solve_inertia,
 )
 from rigidjax.identify.sensors import AbstractSensor, Gyro
+from rigidjax.identify.sensors.base import extras
 from rigidjax.identify.uncertainty.considered import slope_in_time
 from rigidjax.identify.uncertainty.covariance import Linearisation
 from rigidjax.motion.torques.base import Torque
@@ -217,8 +218,9 @@ def causes(
             rows = _candidates(model, x, linear, index)
             shares = [_share(model, noise, linear, index, free, row.direction) for row in rows]
             cause = _likeliest(sensor, rows, shares)
-        if cause is None and hasattr(sensor, "suspect"):
-            cause = Cause(sensor.suspect[0], type(sensor).__name__, None, *sensor.suspect[1:])
+        suspect = extras(sensor).suspect
+        if cause is None and suspect is not None:
+            cause = Cause(suspect[0], type(sensor).__name__, None, *suspect[1:])
         out += [] if cause is None else [cause]
     return tuple(out)
 

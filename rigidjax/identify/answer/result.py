@@ -18,6 +18,7 @@ from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
 from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jacobian
 from rigidjax.identify.model.terms import Noise
+from rigidjax.identify.sensors.base import extras
 from rigidjax.identify.uncertainty.considered import Consideration
 from rigidjax.identify.uncertainty.covariance import Linearisation
 from rigidjax.identify.uncertainty.degrees_of_freedom import Freedom, student_quantile
@@ -311,7 +312,7 @@ class Fit(eqx.Module):
         recordings an entry has the shape (R,).
         """
         index = 0 if self.model.count == 1 else slice(None)
-        jitters = (getattr(sensor, "jitter", None) for sensor in self.model.records.sensors)
+        jitters = (extras(sensor).jitter for sensor in self.model.records.sensors)
         return tuple(None if one is None else one.deviation[index] for one in jitters)
 
     @property

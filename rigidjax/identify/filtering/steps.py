@@ -29,6 +29,7 @@ from rigidjax.identify.model.scene import (
 )
 from rigidjax.identify.model.walks import Drift
 from rigidjax.identify.sensors import AbstractSensor, Gyro, SensorInput
+from rigidjax.identify.sensors.base import extras
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.manifold import (
@@ -74,12 +75,12 @@ def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
                 f"{name}: wanted its noise, by which a filter weighs each reading, got None; give "
                 f"{name}(noise=…), such as the noise that identify.fit estimates"
             )
-        if getattr(sensor, "lowpass", None) is not None:
+        if extras(sensor).lowpass is not None:
             raise ValueError(
                 f"{name}: a lowpass has states of its own, which the filter does not estimate; "
                 "leave the lowpass out, and give its lag as offset"
             )
-        if getattr(sensor, "jitter", None) is not None:
+        if extras(sensor).jitter is not None:
             raise ValueError(
                 f"{name}: jitter makes the errors of a reading depend on each other, but the "
                 "filter takes them as independent; leave the jitter out, and give more noise"
@@ -270,7 +271,7 @@ def linearise_readings(dynamics: Dynamics, stop: Stops, x: ExtendedState) -> Lin
                 return dynamics.with_torques(dynamics.field(t, state, args), y.torques)
 
             motion, when = y.motion, t
-            offset = getattr(drifted, "offset", None)
+            offset = extras(drifted).offset
             if offset is not None:
                 motion, when = shifted(field_with_torques, t, motion, offset), t + offset
             return drifted.error(
@@ -280,7 +281,7 @@ def linearise_readings(dynamics: Dynamics, stop: Stops, x: ExtendedState) -> Lin
         value_of_error, push = jax.linearize(reading_error, x)
         matrix = -jax.vmap(push, out_axes=1)(basis)
         mask = jnp.broadcast_to(mask, value_of_error.shape)
-        limit = getattr(sensor, "limit", None)
+        limit = extras(sensor).limit
         if limit is not None:
             mask = mask & (jnp.abs(value) < limit * (1 - 1e-6))
         assert sensor.noise is not None

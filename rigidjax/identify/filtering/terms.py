@@ -35,6 +35,7 @@ from rigidjax.identify.model.terms import (
     standardise,
     value_and_jacfwd,
 )
+from rigidjax.identify.sensors.base import extras
 from rigidjax.motion.manifold import dimension
 
 
@@ -55,7 +56,7 @@ def recording_terms(
         scaled, log_variance = [], []
         errors = scene_errors(model, scene, record)
         for reading, sensor, error in zip(record.readings, scene.sensors, errors, strict=True):
-            limit: Any = getattr(sensor, "limit", None)
+            limit: Any = extras(sensor).limit
             noise: Any = sensor.noise
             one, full, wider = standardise(
                 reading.values, reading.mask, error, noise, limit, reading.jitter_error

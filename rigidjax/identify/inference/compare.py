@@ -24,6 +24,7 @@ from rigidjax.identify.model.terms import (
     whiten,
 )
 from rigidjax.identify.search.stages import blocks_at
+from rigidjax.identify.sensors.base import extras
 
 
 class Comparison(eqx.Module):
@@ -76,7 +77,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     shortest = max(min(one.correlation for one in fits.values()), 1.0)
     rows = []
     for name, one in fits.items():
-        jitters = [getattr(s, "jitter", None) for s in one.model.records.sensors]
+        jitters = [extras(s).jitter for s in one.model.records.sensors]
         groups = int(np.max(one.model.noise_groups)) + 1
         size = one.x.size
         size += groups * sum(jitter is not None and jitter.estimated for jitter in jitters)

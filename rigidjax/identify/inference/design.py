@@ -19,6 +19,7 @@ from rigidjax.identify.model.terms import (
     error_jacobians,
     scaled_slopes,
 )
+from rigidjax.identify.sensors.base import extras
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.covariance import covariance_root
 from rigidjax.identify.uncertainty.quantities import (
@@ -85,7 +86,7 @@ def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
     _, slopes = error_jacobians(model, x)
     rows = []
     for index, (sensor, noise, block) in enumerate(zip(sensors, noises, slopes, strict=True)):
-        jitter, late = getattr(sensor, "jitter", None), None
+        jitter, late = extras(sensor).jitter, None
         if jitter is not None:
             late = jitter.deviation[:, None, None] * delay_slopes(model, x)[index]
         rows.append(scaled_slopes(block, noise, late))
@@ -100,7 +101,7 @@ def _require_known_noise(model: Model, x: Float[Array, " n"]) -> None:
             raise ValueError(
                 f"design: wanted a {type(sensor).__name__} with known noise, got noise=None"
             )
-        if (jitter := getattr(sensor, "jitter", None)) is not None and jitter.estimated:
+        if (jitter := extras(sensor).jitter) is not None and jitter.estimated:
             raise ValueError(
                 f"design: wanted a {type(sensor).__name__} with known jitter, in s, got one "
                 "that is to be estimated"

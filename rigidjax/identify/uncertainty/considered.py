@@ -19,6 +19,7 @@ from rigidjax.identify.model.free import TOLERANCES, Slot, split_path
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, scaled_slopes
 from rigidjax.identify.sensors import AbstractSensor
+from rigidjax.identify.sensors.base import extras
 from rigidjax.identify.sensors.vectors import VectorSensor
 from rigidjax.identify.uncertainty.covariance import Linearisation
 
@@ -71,7 +72,7 @@ def considerations(
     """
     out = []
     for index, sensor in enumerate(model.records.sensors):
-        tolerance = getattr(sensor, "tolerance", None)
+        tolerance = extras(sensor).tolerance
         for kind, member in MEMBERS.items():
             width = getattr(tolerance, kind, None)
             some = [split_path(one.path)[1] for one in sensor_slots(model, index, member)]
