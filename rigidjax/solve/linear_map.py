@@ -55,7 +55,9 @@ def _known(known: Array, recomputed: Array) -> Array:
     return match_batch_axes(known, (known, recomputed))
 
 
-_known.defjvp(lambda primals, tangents: (_known(*primals), tangents[1]))
+@_known.defjvp
+def _known_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> Any:
+    return _known(*primals), tangents[1]
 
 
 def nan_derivatives(tree: PyTree, inputs: PyTree) -> PyTree:

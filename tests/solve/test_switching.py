@@ -296,6 +296,7 @@ class Burn(eqx.Module):
         return AXIS * jnp.where(t < self.end, 2.0, -2.0)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("make", [Burn, lambda end: Burn(end).__call__, lambda end: lambda *a: Burn(end)(*a)],
                          ids=["module", "method", "function"])  # fmt: skip
 def test_crossing_after_a_switch(make):
