@@ -106,7 +106,7 @@ class Error(eqx.Module):
     - `steps`: the error of the steps, one array (T,) for each name (`q`, `omega`, `x`, `v`,
       `own.0`, …). For a quaternion it is the angle of the turn, rad; for other arrays it is the
       length of the difference (rad/s, m, m/s). This error is accurate to some percent; after
-      `simulate(…, accuracy=…)` it is too large by a factor of about five.
+      `simulate(…, accuracy=…)` it is too large by a factor of about six.
     - `round_off`: the error of rounding, three standard deviations, in arrays by name as in
       `steps`. It includes the effect of the last digits of body, torque and initial state (in
       closed form also of the times). If this error is far below `steps`, only an upper bound is
@@ -216,7 +216,7 @@ def estimate_error_of_run(
 
     `search` holds two of the runs that `simulate(…, accuracy=…)` tried: the first one, and the one
     before the given run. The error of the steps is then measured by the latter, not by a more
-    accurate run, and is too large by a factor of about five.
+    accurate run, and is too large by a factor of about six.
     """
     setup, ts, ys, num_steps, search = _without_derivatives((setup, ts, ys, num_steps, search))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
