@@ -25,6 +25,7 @@ from rigidjax.solve.switching import (
     STRAIGHT,
     Interpreter,
 )
+from rigidjax.solve.switching_times import lowest_between
 from rigidjax.solve.traced import trace_program
 
 # The operands are sampled `_A_STEP` times in a mean step of the run (a result of a loop or a table
@@ -124,12 +125,5 @@ def times_of_peaks(setup: DiffraxRun, ts: Array, ys: PyTree, num_steps: Array) -
     _, low, high, element = lax.fori_loop(0, blocks.astype(jnp.int32), block, found)
     at = jax.vmap(lambda t, i: height(t)[i])
 
-    def shorter(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        third = (high - low) / 3
-        rises = at(low + third, element) < at(high - third, element)
-        return jnp.where(rises, low + third, low), jnp.where(rises, high, high - third)
-
     many = jnp.where(jnp.any(high != low), _SHORTER, 0)
-    low, high = lax.fori_loop(0, many, shorter, (low, high))
-    return lax.stop_gradient(0.5 * (low + high))
+    return lax.stop_gradient(lowest_between(lambda t: -at(t, element), low, high, many))

@@ -113,7 +113,8 @@ def simulate(
       round-off), a `UserWarning` says from which time on; under `jit` look at `error.relative`.
     - `dt0`: the length of the first step, s. With `None` it is chosen by the tolerances.
     - `stepsize_controller`: a step controller of diffrax in the place of tolerances. Fixed steps of
-      0.01 s, for example, are `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
+      0.01 s, for example, are `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`; such a
+      step also ends where the torque jumps in time, and steps of full length follow.
     - `max_step`: the longest step, s. Steps could pass over a short change in a torque, such as a
       smooth bump or a switch by the state: give half of the length of the shortest one. The closed
       form takes no steps; a `stepsize_controller` has its own limit.

@@ -103,8 +103,26 @@ def _bisect(
     return lax.fori_loop(0, _HALVINGS[low.dtype.name], half, (low, high))[1]
 
 
+def lowest_between(
+    function: Callable[[Array], Array], low: Array, high: Array, count: int | Array
+) -> Array:
+    """Return the times (k,) between `low` and `high` at which k functions have their minimum.
+
+    Each of `count` steps leaves two thirds of an interval; a function has one minimum in it.
+    """
+
+    def shorter(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        third = (high - low) / 3
+        falls = function(low + third) > function(high - third)
+        return jnp.where(falls, low + third, low), jnp.where(falls, high, high - third)
+
+    low, high = lax.fori_loop(0, count, shorter, (low, high))
+    return 0.5 * (low + high)
+
+
 def _in_chunks(function: Callable[..., Array], count: Array, *arrays: Array) -> Array:
-    """Return a function of the rows of arrays, of which only the first `count` are needed."""
+    """Evaluate a function of the rows of arrays, of which only the first `count` are needed."""
 
     def body(i: Array, out: Array) -> Array:
         rows = [lax.dynamic_slice_in_dim(a, i * _CHUNK, _CHUNK) for a in arrays]
@@ -151,20 +169,13 @@ def _cells_with_one_change(
     side = jnp.sign(height[row + 1, which])
     pick = jax.vmap(lambda t, i, side: side * _at(both(t)[0], i))
 
-    def lowest(low: Array, high: Array, element: Array, side: Array) -> Array:
-        def shorter(_: Any, ends: Any) -> Any:
-            third = (ends[1] - ends[0]) / 3
-            falls = pick(ends[0] + third, element, side) > pick(ends[1] - third, element, side)
-            return jnp.where(falls, ends[0] + third, ends[0]), jnp.where(
-                falls, ends[1], ends[1] - third
-            )
-
-        low, high = lax.fori_loop(0, _HALVINGS[low.dtype.name], shorter, (low, high))
-        return 0.5 * (low + high)
+    def closest(low: Array, high: Array, element: Array, side: Array) -> Array:
+        count = _HALVINGS[low.dtype.name]
+        return lowest_between(lambda t: pick(t, element, side), low, high, count)
 
     low, high = grid[row], grid[row + 2]
     dips = jnp.sum(jnp.isfinite(nearness))
-    at = _in_chunks(lowest, dips, low, high, jnp.asarray(bent)[which], side)
+    at = _in_chunks(closest, dips, low, high, jnp.asarray(bent)[which], side)
     there = jnp.arange(MOST) < dips
     value_at = jax.vmap(lambda t, i: _at(both(t)[1], i))(at, jnp.asarray(bent)[which])
     twice = jnp.where(there, value_at - value[row, which], 0)
