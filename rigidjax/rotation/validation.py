@@ -45,7 +45,7 @@ def require_turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
         raise ValueError(
             f"{name}: a turn by {_largest(v):.3g} rad; beyond {limit:.2g} rad "
             f"neighbouring {v.dtype} numbers are more than half a radian apart: the attitude is "
-            "unknown"
+            "unknown; leave out whole turns before, or check the unit"
         )
     return v
 

@@ -171,7 +171,10 @@ def fit_light_curve(
     **Arguments:**
 
     - `model`: a model of one recording with one `Brightness` sensor and no torque; make the `level`
-      of the sensor a `Free` unless the level is known.
+      of the sensor a `Free` unless the level is known. The search for a start takes fluxes below a
+      thousandth of their median as that thousandth, and a noise that is `None` from the scatter
+      about the best Fourier series; a flux that is negative by more than ten times the noise (with
+      `None`: ten standard deviations of all fluxes) is refused by `Recording`.
     - `shortest`: the shortest period of a line in the spectrum, s; `None` for four times the median
       interval between the samples.
     - `count`: the largest number of pairs of frequencies. If more pairs fit, the answer `search` of
