@@ -92,7 +92,6 @@ TOPICS = {
         "Unknown torques: filter and smoother": "Walk first_belief filter smooth step",
         "Likelihood, simulated motions": "log_likelihood sample",
         "Posterior": "LogDensity refit Refit posterior Posterior Nuts",
-        "Linear models": "LinearModel linear_filter linear_smooth",
         "Log files": "read_table",
     },
 }

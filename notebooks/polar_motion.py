@@ -6,8 +6,8 @@ The table `data/polar_motion.csv` has columns mjd, x_arcsec, x_error_arcsec, y_a
 the excitation χ the pole obeys dp/dt = iσ (p − χ), σ = 2π/T (1 + i/2Q) (Munk and MacDonald, The
 Rotation of the Earth (1960), ch. 6). χ is white noise, or noise with a memory, or both; besides, the
 seasons force turns of a year and half a year, either way, whose amplitudes may wander, and the mean
-pole walks. All of it is a `LinearModel`; whatever is unknown is fitted to the likelihood of the
-innovations.
+pole walks. All of it is linear, so a Kalman filter follows it; whatever is unknown is fitted to the
+likelihood of the innovations.
 
 The numbers are fitted to every 15th day: the published series is smoothed over some weeks in its
 first years, and what a filter sees of it day by day is that smoothing, not the Earth. Its own errors
@@ -15,13 +15,12 @@ are believed.
 """
 
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
-
-from rigidjax import identify
 
 YEAR, STEP, SPARSE = 365.25, 5, 3
 # Chandler and what excites it, turns of the seasons, mean pole: two real numbers each.
@@ -54,8 +53,62 @@ def turn(angle):
     return jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
 
 
+class Linear(NamedTuple):
+    """Steps from z to F z + G u and readings H z + r v; u and v are normal, of unit variance."""
+
+    transition: jax.Array  # F
+    noise: jax.Array  # G
+    matrix: jax.Array  # H
+    deviation: jax.Array  # r, a row for each time
+
+
+class States(NamedTuple):
+    """Mean and covariance of the state at each time, and the log-likelihood of the readings."""
+
+    mean: jax.Array
+    covariance: jax.Array
+    log_likelihood: jax.Array
+
+
+@jax.jit
+def kalman_filter(model, readings, root):
+    """`States` from the readings up to each time; at first the mean is zero, with this root."""
+    f, h, q = model.transition, model.matrix, model.noise @ model.noise.T
+
+    def step(before, row):
+        (z, p), (y, r) = before, row
+        s, off = h @ p @ h.T + jnp.diag(r**2), y - h @ z
+        gain = jnp.linalg.solve(s, h @ p).T
+        log = -0.5 * (off @ jnp.linalg.solve(s, off) + jnp.linalg.slogdet(2 * jnp.pi * s)[1])
+        z, p = z + gain @ off, p - gain @ s @ gain.T
+        return (f @ z, f @ p @ f.T + q), (z, p, log)
+
+    first = jnp.zeros(len(root)), root @ root.T
+    _, (means, covariances, logs) = jax.lax.scan(step, first, (readings, model.deviation))
+    return States(means, covariances, logs.sum())
+
+
+@jax.jit
+def smooth(model, found):
+    """`States` from all readings, from those of the filter (Rauch, Tung and Striebel 1965)."""
+    f, q = model.transition, model.noise @ model.noise.T
+
+    def step(after, filtered):
+        z, p = filtered
+        ahead = f @ p @ f.T + q
+        gain = jnp.linalg.solve(ahead, f @ p).T
+        now = z + gain @ (after[0] - f @ z), p + gain @ (after[1] - ahead) @ gain.T
+        return now, now
+
+    last = found.mean[-1], found.covariance[-1]
+    rows = found.mean[:-1], found.covariance[:-1]
+    _, before = jax.lax.scan(step, last, rows, reverse=True)
+    means, covariances = (jnp.concatenate([a, b[None]]) for a, b in zip(before, last))
+    return States(means, covariances, found.log_likelihood)
+
+
 def model_of(v, errors, step=float(STEP)):
-    """The `LinearModel`, and the root of the first covariance, for the numbers v by name."""
+    """The `Linear` model, and the root of the first covariance, for the numbers v by name."""
     rate = 2 * jnp.pi / v["period"]
     one, quarter = jnp.eye(2), turn(jnp.asarray(jnp.pi / 2))
     pull = rate * quarter - rate * v["damping"] * one
@@ -87,7 +140,7 @@ def model_of(v, errors, step=float(STEP)):
             jnp.full(2, 500.0),
         ]
     )
-    return identify.LinearModel(transition, noise, matrix, deviation), jnp.diag(first)
+    return Linear(transition, noise, matrix, deviation), jnp.diag(first)
 
 
 def named(names, x):
@@ -106,7 +159,7 @@ def fit(names, readings, errors):
 
     def loss(x):
         model, root = model_of(named(names, x), errors, float(STEP * SPARSE))
-        found = identify.linear_filter(model, readings, jnp.zeros(SIZE), root)
+        found = kalman_filter(model, readings, root)
         return -found.log_likelihood + 0.5 * jnp.sum((x / WIDE) ** 2)
 
     slope = jax.jit(jax.jacfwd(loss))
@@ -128,7 +181,7 @@ def fit(names, readings, errors):
 def forecasts(v, t, readings, errors, ahead=(30, 90, 180, 365)):
     """From every 90th day of 1985–1994: errors (n, 2) and predicted deviations, by days ahead."""
     model, root = model_of(v, errors)
-    found = identify.linear_filter(model, readings, jnp.zeros(SIZE), root)
+    found = kalman_filter(model, readings, root)
     first, last = (np.searchsorted(t, mjd) for mjd in (46066, 49718))
     starts = np.arange(first, last, 90 // STEP)
     means, covs = np.asarray(found.mean), np.asarray(found.covariance)
@@ -194,7 +247,7 @@ def main():
     best = max(fits, key=lambda name: fits[name][2] - 0.5 * len(MODELS[name]) * np.log(count))
     print(f"preferred by Schwarz's criterion: {best}")
     model, root = model_of(fits[best][0], errors)
-    found = identify.linear_smooth(model, readings, jnp.zeros(SIZE), root)
+    found = smooth(model, kalman_filter(model, readings, root))
     size = np.hypot(*np.asarray(found.mean)[:, :2].T)
     for begin in (41684, 44239, 47892):
         part = (t >= begin) & (t < begin + 3653)

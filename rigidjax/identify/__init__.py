@@ -20,11 +20,6 @@ from rigidjax.identify.filtering.filter import (
     log_likelihood as log_likelihood,
     step as step,
 )
-from rigidjax.identify.filtering.linear import (
-    LinearModel as LinearModel,
-    linear_filter as linear_filter,
-    linear_smooth as linear_smooth,
-)
 from rigidjax.identify.filtering.smoother import smooth as smooth
 from rigidjax.identify.filtering.steps import sample as sample
 from rigidjax.identify.inference.compare import compare as compare, cross_validate as cross_validate
@@ -87,13 +82,13 @@ from rigidjax.identify.sensors import (
 __all__ = [
     "AbstractBodyChart", "AbstractLoss", "AbstractSensor", "Accelerometer", "Adaptive",
     "AttitudeSensor", "Descent", "Direction", "Entropic", "Fit", "FixedSteps", "Free", "Gyro",
-    "Huber", "Known", "LinearModel", "LogDensity", "LowPass", "Magnetometer", "Marker", "Mass",
-    "Model", "Nuts", "Position", "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios",
-    "Recording", "Refit", "Scene", "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked",
-    "Velocity", "Walk", "Windows", "best_first_rate", "compare", "cross_validate", "descend",
-    "expected_quantities", "filter", "first_belief", "fisher", "fit", "linear_filter",
-    "linear_smooth", "log_likelihood", "posterior", "predict_windows", "profile", "read_table",
-    "refit", "report", "sample", "simulate_readings", "smooth", "step", "windows",
+    "Huber", "Known", "LogDensity", "LowPass", "Magnetometer", "Marker", "Mass", "Model", "Nuts",
+    "Position", "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios", "Recording",
+    "Refit", "Scene", "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity",
+    "Walk", "Windows", "best_first_rate", "compare", "cross_validate", "descend",
+    "expected_quantities", "filter", "first_belief", "fisher", "fit", "log_likelihood", "posterior",
+    "predict_windows", "profile", "read_table", "refit", "report", "sample", "simulate_readings",
+    "smooth", "step", "windows",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

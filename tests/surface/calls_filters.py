@@ -26,11 +26,6 @@ def belief():
     return identify.first_belief(model(), state=rj.Spin(V), rate=0.1)
 
 
-@functools.cache
-def linear():
-    return identify.LinearModel(np.eye(2), 0.1 * np.eye(2), np.eye(2), np.ones(2))
-
-
 row("motion.torques.RandomTorque", dict(density=np.abs(V)))
 row("motion.torques.CorrelatedTorque", dict(density=np.abs(V), time=0.5))
 row(
@@ -71,23 +66,6 @@ row(
     transforms=(),
 )  # fmt: skip
 row(
-    "identify.LinearModel",
-    dict(
-        transition=np.eye(2), noise=np.eye(2), matrix=np.eye(2), deviation=np.ones(2),
-        push=np.ones(2), offset=np.ones(2),
-    ),
-    groups=("stranger", "shape"),
-    arguments=("transition", "noise", "matrix", "deviation"),
-    transforms=(),
-)  # fmt: skip
-for name in ("linear_filter", "linear_smooth"):
-    row(
-        f"identify.{name}",
-        lambda: dict(model=linear(), readings=np.ones((4, 2)), mean=np.zeros(2), root=np.eye(2)),
-        groups=("stranger", "shape"),
-        transforms=("jit", "grad"),
-    )
-row(
     "identify.Nuts",
     dict(samples=10, warmup=10, acceptance=0.8),
     groups=("stranger",),
@@ -100,7 +78,6 @@ leave_out(
         f"identify.{name}"
         for name in ("Filtered", "Smoothed", "Push", "Sampled", "ReadNumbers", "ExtendedState")
     ),
-    "identify.LinearEstimate",
 )
 leave_out("made of a fit, which takes long; see tests/identify/inference", "identify.LogDensity")
 leave_out(

@@ -34,7 +34,6 @@ WITHOUT_EXAMPLE = {
             "lagrangian.LiePoissonWithDirection",
             "identify.Belief",
             "identify.Filtered",
-            "identify.LinearEstimate",
             "identify.Push",
             "identify.Posterior",
             "identify.ReadNumbers",

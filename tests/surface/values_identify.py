@@ -331,73 +331,6 @@ way(
 )  # fmt: skip
 
 
-# A linear model: all states and readings as one Gaussian, conditioned.
-def conditioned(f, g, h, r, y, mean, root, upto):
-    """Mean and covariance of the states given the readings up to a time, and log-density of all."""
-    n, times = len(mean), len(y)
-    means, cov = [mean], [[root @ root.T]]
-    for _ in range(1, times):
-        means.append(f @ means[-1])
-        row = [f @ x for x in cov[-1]]
-        cov.append([*row, row[-1] @ f.T + g @ g.T])
-    full = np.empty((n * times, n * times), object)
-    for i in range(times):
-        for j in range(i + 1):
-            full[i * n : i * n + n, j * n : j * n + n] = cov[i][j]
-            full[j * n : j * n + n, i * n : i * n + n] = cov[i][j].T
-    seen = np.zeros((times * len(h), n * times), object)
-    for i in range(times):
-        seen[i * len(h) : (i + 1) * len(h), i * n : i * n + n] = h
-    stacked = np.concatenate(means)
-    spread = seen @ full @ seen.T + np.diag(np.tile(r * r, times))
-    left = y.ravel() - seen @ stacked
-    rows = upto * len(h)
-    gain = v.solve(spread[:rows, :rows], (seen[:rows] @ full)).T
-    found = stacked + gain @ left[:rows]
-    left_over = full - gain @ seen[:rows] @ full
-    log = (
-        -(v.dot(left, v.solve(spread, left)) + mp.log(v.determinant(spread)) + rows_log(spread)) / 2
-    )
-    return found, left_over, log
-
-
-def rows_log(spread):
-    return len(spread) * mp.log(2 * mp.pi)
-
-
-def filtered(f, g, h, r, y, mean, root):
-    n, times = len(mean), len(y)
-    each = [conditioned(f, g, h, r, y, mean, root, k + 1) for k in range(times)]
-    block = lambda k: slice(k * n, k * n + n)
-    means = np.stack([m[block(k)] for k, (m, _, _) in enumerate(each)])
-    covs = np.stack([c[block(k), block(k)] for k, (_, c, _) in enumerate(each)])
-    m, c, log = each[-1]
-    return [
-        means, covs, log, m.reshape(times, n),
-        np.stack([c[block(k), block(k)] for k in range(times)]), log,
-        v.sqrt(np.stack([np.diag(c) for c in covs])),
-    ]  # fmt: skip
-
-
-def our_filtered(f, g, h, r, y, mean, root):
-    model = identify.LinearModel(f, g, h, r)
-    forth = identify.linear_filter(model, y, mean, root)
-    back = identify.linear_smooth(model, y, mean, root)
-    return [
-        forth.mean, forth.covariance, forth.log_likelihood, back.mean, back.covariance,
-        back.log_likelihood, forth.deviation,
-    ]  # fmt: skip
-
-
-way(
-    "identify.LinearModel identify.linear_filter identify.linear_smooth identify.LinearEstimate "
-    "identify.LinearEstimate.covariance identify.LinearEstimate.deviation",
-    our_filtered,
-    (v.normal(3, 3), v.normal(3, 2), v.normal(2, 3), between(0.1, 1.0, 2), v.normal(4, 2),
-     v.ordinary, v.normal(3, 3)),
-    filtered, norm=True, ulps=64, cost=2,
-)  # fmt: skip
-
 # A ball with a gyro under white torque: its rate is a random walk, read with noise.
 TS = np.arange(4) * 0.5
 
@@ -666,7 +599,7 @@ way(
 )  # fmt: skip
 leave_out(
     "a truth value, a count, a kind, a name or words",
-    "identify.Filtered.words", "identify.Smoothed.words", "identify.LinearModel.size",
+    "identify.Filtered.words", "identify.Smoothed.words",
     "identify.LogDensity.size", "identify.Accelerometer.feels", "identify.Marker.feels",
     "identify.Combination.in_words", "identify.Fit.ok", "tumblers.LightCurve.ok",
     "identify.Fit.status", "tumblers.LightCurve.status", "identify.Fit.advice", "identify.Fit.causes",

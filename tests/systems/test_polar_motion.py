@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from once import once
 
-from rigidjax import identify
-
 ROOT = Path(__file__).parents[2]
 
 
@@ -63,7 +61,7 @@ def test_the_likelihood_knows_the_period_of_a_made_pole(polar):
 
     def score(period):
         there, first = polar.model_of(v | {"period": period}, np.ones((count, 2)), step)
-        return identify.linear_filter(there, readings, jnp.zeros(polar.SIZE), first).log_likelihood
+        return polar.kalman_filter(there, readings, first).log_likelihood
 
     many = once(jax.vmap(score))
     periods = jnp.array([305.0, 400.0, 425.0, 429.0, 433.0, 437.0, 441.0, 470.0])

@@ -21,7 +21,7 @@ from rigidjax.identify.filtering.filter import (
     require_followed,
     scan_filter,
 )
-from rigidjax.identify.filtering.linear import LinearEstimate, linear_estimate
+from rigidjax.identify.filtering.linear import LinearEstimate, Moves, linear_smooth
 from rigidjax.identify.filtering.steps import Dynamics, ExtendedState, ReadNumbers, Stops
 from rigidjax.identify.model.model import Model
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -217,7 +217,7 @@ def _iteration(
 
     def linearise(
         row: tuple[Array, Stops, ExtendedState, ExtendedState, Array],
-    ) -> tuple[tuple[Array, Array, Array], steps.LinearReadings]:
+    ) -> tuple[Moves, steps.LinearReadings]:
         """Return a step from the state x of the path to its state y, and the readings there, both
         linearised.
 
@@ -231,7 +231,7 @@ def _iteration(
         off = minus(after, y)
         grown, noise = (steps.recentred_root(y, off, part, inverse=True) for part in (grown, noise))
         push = off - jnp.sum(noise[:, : dynamics.normals_per_step] * kick[None], 1)
-        return (grown, noise, push), steps.linearise_readings(dynamics, stop, y)
+        return Moves(grown, noise, push), steps.linearise_readings(dynamics, stop, y)
 
     before = jnp.concatenate([belief.t[None], stops.t[:-1]])
     x0, earlier, later = (
@@ -240,17 +240,8 @@ def _iteration(
     moves, rows = lax.map(linearise, (before, stops, earlier, later, kicks))
     # The first row belongs to the time of the belief before the first reading; nothing is read at
     # this time.
-    matrix, error, deviation, mask = (jnp.pad(a, [(1, 0)] + [(0, 0)] * (a.ndim - 1)) for a in rows)
-    parts = dict(zip(("transition", "noise", "push"), moves, strict=True))
-    parts |= {"matrix": matrix, "deviation": deviation, "offset": None}
+    rows = jax.tree.map(lambda a: jnp.pad(a, [(1, 0)] + [(0, 0)] * (a.ndim - 1)), rows)
     off = minus(x0, belief.x)
-    out = linear_estimate(
-        parts,
-        error,
-        -off,
-        steps.recentred_root(x0, off, belief.root),
-        mask,
-        smooth=True,
-    )
+    out = linear_smooth(moves, rows, -off, steps.recentred_root(x0, off, belief.root))
     change = jnp.max(jnp.abs(out.mean) * roots.inverse_sqrt(jnp.sum(out.root**2, -1)))
     return _Iteration(jax.vmap(plus)(path, out.mean), out, change)
