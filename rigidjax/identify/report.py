@@ -130,10 +130,6 @@ def verdict(fit: Fit) -> str:
         f"starts: {len(good)} of {len(fit.starts)} reached a motion that fits as well as the best"
         + (", all the same one" if fit.ok and len(good) > 1 else "")
     )
-    for sensor, tau in zip(fit.model.records.sensors, fit.jitter, strict=True):
-        if tau is not None:
-            size = " or ".join(f"{1e3 * each:.3g}" for each in np.unique(np.asarray(tau)))
-            lines.append(f"time stamps of the {type(sensor).__name__} scatter by {size} ms")
     lines += [f"- {line}" for line in fit.identifiability]
     lines += [fit.place] if fit.place else []
     if fit.x.dtype == np.float32:
@@ -187,7 +183,6 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
             np.where(np.isfinite(noise), noise, None).tolist()  # pyright: ignore
             for noise in map(np.asarray, fit.noise)
         ],
-        "jitter": [None if tau is None else np.asarray(tau).tolist() for tau in fit.jitter],
         "chi2": plain(fit.chi2),
         "degrees_of_freedom": fit.dof,
         "correlation_samples": plain(fit.correlation),

@@ -621,7 +621,7 @@ leave_out(
         "singular_values", "null_directions", "hidden_directions", "limits", "freedom",
         "considered", "allowance", "search", "explanation", "left", "chi2", "dof", "correlation",
         "independent")),
-    "identify.Fit.spreads", "identify.Fit.noise", "identify.Fit.jitter", "identify.Fit.rms", "tumblers.Alias",
+    "identify.Fit.spreads", "identify.Fit.noise", "identify.Fit.rms", "tumblers.Alias",
     "tumblers.LightCurve", "tumblers.LightCurve.rivals", "identify.Comparison",
 )  # fmt: skip
 leave_out(

@@ -251,10 +251,12 @@ def time_stamp_cause(model: Model, noise: Noise, linear: Linearisation, index: i
     chance, share = float(ways @ channels / channels.sum()), float(along / channels.sum())
     if not share > chance + 0.5 * (1.0 - chance) + 1.0 / np.sqrt(moving.sum()):
         return None
-    scatter = 1e3 * np.sqrt(along / moved[moving].sum())
+    # Noise across dy/dt, two of the three components, shows how much of it lies along dy/dt.
+    across = (float(np.sum(error[moving] ** 2)) - float(along)) / 2
+    scatter = np.sqrt(max(float(along) - across, 0.0) / moved[moving].sum())
     return _cause_with_share(
-        "clock", sensor, share, f"time stamps that scatter by {scatter:.2g} ms",
-        "take times from the sensor's own count of samples, or give it jitter=\"estimated\"",
+        "clock", sensor, share, f"time stamps that scatter by {1e3 * scatter:.2g} ms",
+        f"take times from the sensor's own count of samples, or give it jitter={scatter:.2g}",
     )  # fmt: skip
 
 

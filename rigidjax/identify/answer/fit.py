@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from types import NoneType
-from typing import Any, cast
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -192,12 +192,13 @@ def fit(
     shown = model
     if task.model is not padded:
         # The model that is shown has no masked readings at the end of recordings. It keeps the
-        # scatter of the time stamps (jitter) that the fit estimated.
+        # errors that the scatter of the time stamps (jitter) makes.
         records = model.records
         for index, r in enumerate(task.model.records.readings):
             if r.jitter_error is not None:
-                one, jitter = records.readings[index], cast(Any, r.sensor).jitter
-                one = one.with_jitter(r.jitter_error[:, : one.mask.shape[1]], jitter.deviation)
+                one = records.readings[index]
+                late = r.jitter_error[:, : one.mask.shape[1]]
+                one = dataclasses.replace(one, jitter_error=late)
                 records = eqx.tree_at(lambda a, i=index: a.readings[i], records, one)
         shown = eqx.tree_at(lambda m: m.records, task.model, records)
     return assess(task.model, best, task.noise, attempts, lowest, shown, interrupts, rough)

@@ -18,7 +18,6 @@ from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
 from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jacobian
 from rigidjax.identify.model.terms import Noise
-from rigidjax.identify.sensors.base import extras
 from rigidjax.identify.uncertainty.considered import Consideration
 from rigidjax.identify.uncertainty.covariance import Linearisation
 from rigidjax.identify.uncertainty.degrees_of_freedom import Freedom, student_quantile
@@ -302,18 +301,6 @@ class Fit(eqx.Module):
         Here k is the number of components of an error. For R > 1 recordings the shape is (R, k).
         """
         return tuple(n[0] for n in self.noises) if self.model.count == 1 else self.noises
-
-    @property
-    def jitter(self) -> tuple[Float[Array, "*records"] | None, ...]:
-        """Return the standard deviation, in seconds, of the time stamps of each sensor, given or
-        estimated.
-
-        The entry of a sensor without jitter (random errors of its time stamps) is `None`. For R > 1
-        recordings an entry has the shape (R,).
-        """
-        index = 0 if self.model.count == 1 else slice(None)
-        jitters = (extras(sensor).jitter for sensor in self.model.records.sensors)
-        return tuple(None if one is None else one.deviation[index] for one in jitters)
 
     @property
     def residuals(self) -> tuple[Float[Array, "*records times _"], ...]:

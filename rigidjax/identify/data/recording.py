@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks, _show
 from rigidjax._types import NumbersLike
@@ -50,21 +50,9 @@ class Reading(eqx.Module):
             return mask
         return mask & (np.abs(self.values) < np.asarray(limit)[..., None, :] * (1 - 1e-6))
 
-    def with_jitter(self, jitter_error: Array, deviation: Array) -> "Reading":
-        """Return these readings with another jitter; `deviation` is in s.
-
-        A search holds `jitter_error` constant. If it changed it, errors would count less wherever a
-        motion changes quickly, and the search would prefer quick motions.
-        """
-
-        def parts(reading: PyTree) -> Any:
-            return reading.jitter_error, reading.sensor.jitter.deviation
-
-        return eqx.tree_at(parts, self, (jitter_error, deviation))
-
     @property
     def has_known_noise(self) -> bool:
-        """Return whether a fit estimates neither the noise of the sensor nor its jitter."""
+        """Return whether the noise is given, and no jitter adds errors that depend on the fit."""
         return self.sensor.noise is not None and self.jitter_error is None
 
 

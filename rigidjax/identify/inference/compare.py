@@ -24,7 +24,6 @@ from rigidjax.identify.model.terms import (
     whiten,
 )
 from rigidjax.identify.search.stages import blocks_at
-from rigidjax.identify.sensors.base import extras
 
 
 class Comparison(eqx.Module):
@@ -77,19 +76,15 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     shortest = max(min(one.correlation for one in fits.values()), 1.0)
     rows = []
     for name, one in fits.items():
-        jitters = [extras(s).jitter for s in one.model.records.sensors]
-        groups = int(np.max(one.model.noise_groups)) + 1
-        size = one.x.size
-        size += groups * sum(jitter is not None and jitter.estimated for jitter in jitters)
         independent_readings = np.array(counts[name]) / shortest
         misfit = independent_readings @ _log_mean_squares(one)
-        penalty = size * np.log(max(independent_readings.sum(), 2.0))
-        rows.append((misfit + penalty, name, size, one))
+        penalty = one.x.size * np.log(max(independent_readings.sum(), 2.0))
+        rows.append((misfit + penalty, name, one))
     rows.sort(key=lambda row: row[0])
     best = rows[0][0]
     return tuple(
-        Comparison(name, size, one.rms, one.correlation, float(total - best))
-        for total, name, size, one in rows
+        Comparison(name, one.x.size, one.rms, one.correlation, float(total - best))
+        for total, name, one in rows
     )
 
 

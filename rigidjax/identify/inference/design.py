@@ -88,23 +88,18 @@ def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
     for index, (sensor, noise, block) in enumerate(zip(sensors, noises, slopes, strict=True)):
         jitter, late = extras(sensor).jitter, None
         if jitter is not None:
-            late = jitter.deviation[:, None, None] * delay_slopes(model, x)[index]
+            late = jitter[:, None, None] * delay_slopes(model, x)[index]
         rows.append(scaled_slopes(block, noise, late))
     return normal_matrix(rows, model.index.places, model.size).core
 
 
 def _require_known_noise(model: Model, x: Float[Array, " n"]) -> None:
-    """Raise an error for unknown noise or jitter, or if x are no parameters of the `model`."""
+    """Raise an error for unknown noise, or if x are no parameters of the `model`."""
     checked_x(model, x)
     for sensor in model.records.sensors:
         if sensor.noise is None:
             raise ValueError(
                 f"design: wanted a {type(sensor).__name__} with known noise, got noise=None"
-            )
-        if (jitter := extras(sensor).jitter) is not None and jitter.estimated:
-            raise ValueError(
-                f"design: wanted a {type(sensor).__name__} with known jitter, in s, got one "
-                "that is to be estimated"
             )
 
 

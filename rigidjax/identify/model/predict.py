@@ -391,11 +391,9 @@ def simulate_readings(
             raise ValueError(
                 f"{name}: noise=None gives no size of the noise to draw; give noise, or key=None"
             )
-        jitter, lowpass = extras(one).jitter, extras(one).lowpass
-        if key is not None and jitter is not None and (jitter.estimated or lowpass is not None):
+        if key is not None and extras(one).jitter is not None and extras(one).lowpass is not None:
             raise ValueError(
-                f"{name}: wanted a jitter in s, and no lowpass beside it, to draw times; or "
-                "key=None"
+                f"{name}: wanted no lowpass beside a jitter, to draw times; or key=None"
             )
         if extras(one).reading_of is None and math.prod(one.reading_shape) != one.components:
             raise ValueError(
@@ -428,7 +426,7 @@ def _readings(
     members, late = extras(sensor), None
     if key is not None and members.jitter is not None:
         key, own = jax.random.split(key)
-        late = members.jitter.deviation * jax.random.normal(own, ts.shape, ts.dtype)
+        late = members.jitter * jax.random.normal(own, ts.shape, ts.dtype)
     along = sensor_inputs(sensor, body, torque, ts, state0, states, late)
     error = jnp.zeros((ts.shape[0], sensor.components), ts.dtype)
     if key is not None:

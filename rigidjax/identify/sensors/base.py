@@ -147,34 +147,17 @@ def positive_numbers(
     return _checks.error_if(numbers, ~(numbers > 0), f"{name}: wanted {requirement}")
 
 
-class Jitter(eqx.Module):
-    """Hold the scatter of time stamps."""
-
-    # The standard deviation of a time stamp, s.
-    deviation: Scalar
-    # Whether a fit estimates the deviation.
-    estimated: bool = eqx.field(static=True)
-
-
-def jitter_of(jitter: object) -> Jitter | None:
-    """Return the `Jitter` of a positive number of seconds, or of `"estimated"`; `None` stays
-    `None`.
-    """
-    if jitter is None or isinstance(jitter, Jitter):
+def _jitter_field(jitter: object) -> Array | None:
+    if jitter is None or isinstance(jitter, Array):
         return jitter
-    wanted = 'a positive number of seconds or "estimated"'
-    if isinstance(jitter, str):
-        if jitter != "estimated":
-            raise ValueError(f"jitter: wanted {wanted}, got {jitter!r}")
-        return Jitter(jnp.zeros(()), True)
-    return Jitter(jnp.asarray(_checks.positive_float(jitter, "jitter", wanted)), False)
+    return jnp.asarray(_checks.positive_float(jitter, "jitter", "a positive number of seconds"))
 
 
 class Extras(NamedTuple):
     """Hold the optional members of a sensor, as `AbstractSensor` describes them, or `None`."""
 
     offset: Scalar | None
-    jitter: Jitter | None
+    jitter: Float[Array, "*records"] | None
     limit: Float[Array, "*records k"] | None
     lowpass: Any
     tolerance: Any
@@ -207,4 +190,4 @@ class ClockedSensor(AbstractSensor):
     components: ClassVar[int] = 3
     _: dataclasses.KW_ONLY
     offset: Scalar | None = eqx.field(converter=optional_array_field("offset", ()), default=None)
-    jitter: Jitter | None = eqx.field(converter=jitter_of, default=None)
+    jitter: Scalar | None = eqx.field(converter=_jitter_field, default=None)

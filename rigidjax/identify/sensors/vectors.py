@@ -66,7 +66,7 @@ class Gyro(VectorSensor):
     - `limit`: the full scale, rad/s, one number or (3,). A reading at full scale says only that the
       true value is at least this large. `None` finds the full scale from the readings.
     - `offset`: the clock offset, s: the reading with the time stamp t was taken at t + offset.
-    - `jitter`: the standard deviation of the time stamps, s, or `"estimated"`. The errors of time
+    - `jitter`: the standard deviation of the time stamps, s. The errors of time
       stamps are independent. An error of a time stamp changes the reading; this change is computed
       as the error times the time derivative of the prediction. The result is right if the body
       turns little in a time as long as the jitter.
