@@ -83,7 +83,7 @@ TOPICS = {
         "What is fitted of the body": "PrincipalRatios Ratios Principal Tensor Mass Known "
         "AbstractBodyChart",
         "Sensors": "Gyro Accelerometer AttitudeSensor Direction Magnetometer Marker Position "
-        "Velocity Range LowPass AbstractSensor SensorInput",
+        "Velocity Range AbstractSensor SensorInput",
         "The fit and its result": "fit Fit Unpacked",
         "How it searches": "SoftL1 Huber AbstractLoss FixedSteps Adaptive Descent descend Entropic",
         "Uncertainty, comparison": "profile compare cross_validate",

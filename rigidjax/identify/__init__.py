@@ -69,7 +69,6 @@ from rigidjax.identify.sensors import (
     AttitudeSensor as AttitudeSensor,
     Direction as Direction,
     Gyro as Gyro,
-    LowPass as LowPass,
     Magnetometer as Magnetometer,
     Marker as Marker,
     Position as Position,
@@ -82,7 +81,7 @@ from rigidjax.identify.sensors import (
 __all__ = [
     "AbstractBodyChart", "AbstractLoss", "AbstractSensor", "Accelerometer", "Adaptive",
     "AttitudeSensor", "Descent", "Direction", "Entropic", "Fit", "FixedSteps", "Free", "Gyro",
-    "Huber", "Known", "LogDensity", "LowPass", "Magnetometer", "Marker", "Mass", "Model", "Nuts",
+    "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass", "Model", "Nuts",
     "Position", "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios", "Recording",
     "Refit", "Scene", "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity",
     "Walk", "Windows", "best_first_rate", "compare", "cross_validate", "descend",

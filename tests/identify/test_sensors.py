@@ -274,3 +274,23 @@ def test_a_recording_under_a_trace_is_refused_in_words():
     ):
         with pytest.raises(TypeError, match=r"Recording: wanted known numbers.*outside of jit"):
             jax.jit(traced)(0.0)
+
+
+def test_a_gyro_that_feels_acceleration():
+    state = rj.Attitude(rj.quaternion.exp(jnp.array([0.3, -0.2, 0.5])), [1.0, 2.0, -0.5])
+    body = rj.Inertia.from_principal(1.0, 2.0, 2.7)
+    field = rj.solve.equations_of_motion(body, state, None)
+    matrix = 1e-3 * np.array([[1.0, 0.2, 0.0], [0.0, -2.0, 0.3], [0.1, 0.0, 0.5]])
+    place, gravity = [0.1, 0.0, -0.05], [0.0, 0.0, -9.81]
+    gyro = rj.identify.Gyro(0.01, g_sensitivity=matrix, place=place, gravity=gravity)
+    felt = rj.identify.Accelerometer(0.1, place=place, gravity=gravity)
+    now = SensorInput(jnp.asarray(0.0), state, body, field)
+    force = -felt.error(now, jnp.zeros(3))
+    np.testing.assert_allclose(
+        -gyro.error(now, jnp.zeros(3)), state.omega + matrix @ force, rtol=1e-14
+    )
+    assert gyro.feels is not rj.identify.Gyro(0.01, g_sensitivity=matrix).feels
+    with pytest.raises(ValueError, match="place and gravity need a g_sensitivity"):
+        rj.identify.Gyro(0.1, place=[0, 0, 0])
+    with pytest.raises(ValueError, match=r"g_sensitivity: wanted shape \(3, 3\)"):
+        rj.identify.Gyro(0.1, g_sensitivity=[0.0, 0, 0])

@@ -17,19 +17,12 @@ HOST = dict(host=True, transforms=())
 vectors = dict(bias=V, scale=np.ones(3) + 0.1 * V, mounting=0.1 * W, limit=np.array([5.0, 6, 7]))
 
 # Sensors.
-filtered = dict(offset=0.01, lowpass=rj.identify.LowPass(20.0))
 row(
     "identify.Gyro",
-    dict(noise=0.1, **vectors, **filtered, g_sensitivity=1e-3 * M, place=Y, gravity=W),
+    dict(noise=0.1, **vectors, offset=0.01, g_sensitivity=1e-3 * M, place=Y, gravity=W),
 )
-row("identify.Accelerometer", dict(noise=0.1, place=Y, gravity=W, **vectors, **filtered))
-row("identify.Magnetometer", dict(noise=0.1, field=Y, **vectors, **filtered))
-row("identify.LowPass", dict(cutoff=20.0, order=2))
-row(
-    "identify.LowPass.__call__",
-    dict(t=np.linspace(0.0, 1.0, 9), values=np.sin(np.linspace(0.0, 18.0, 18)).reshape(9, 2)),
-    run=lambda **given: rj.identify.LowPass(5.0, 2)(**given),
-)
+row("identify.Accelerometer", dict(noise=0.1, place=Y, gravity=W, **vectors, offset=0.01))
+row("identify.Magnetometer", dict(noise=0.1, field=Y, **vectors, offset=0.01))
 row("identify.AttitudeSensor", dict(noise=np.array([0.1, 0.2, 0.3]), mounting=V, offset=0.01))
 row(
     "identify.Direction", dict(world=Y, noise=np.array([0.1, 0.2]), mounting=V, offset=0.01), **HOST

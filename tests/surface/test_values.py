@@ -16,7 +16,6 @@ SAMPLE = (
     "body.divergence",
     "motion.torques.GravityGradient motion.torques.GravityGradient.energy",
     "orbits.ThreeBody.lagrange_points",
-    "identify.LowPass",
 )
 # Draws of a row of the sample, and of one of all; how many calls these are to be, a public function
 # and a set of arguments each.

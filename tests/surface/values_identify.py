@@ -275,26 +275,6 @@ leave_out(
 )  # fmt: skip
 
 
-# What a low-pass filter makes of a parabola: the parabola's own answer, whatever the samples.
-def lagged(t, a, w):
-    u, du, ddu = a[0] + a[1] * t + a[2] * t * t, a[1] + 2 * a[2] * t, 2 * a[2]
-    rate = 2 * mp.pi * w
-    return [
-        (u - du / rate + ddu / rate**2)[:, None],
-        (u - mp.sqrt(2) * du / rate + ddu / rate**2)[:, None],
-    ]  # fmt: skip
-
-
-way(
-    "identify.LowPass",
-    lambda t, a, w: [
-        identify.LowPass(w, order)(t, (a[0] + a[1] * t + a[2] * t * t)[:, None]) for order in (1, 2)
-    ],
-    (lambda rng, i: np.cumsum(rng.uniform(0.5, 1.4, 9)), v.ordinary, scale(-1, 1)), lagged,
-    norm=True, ulps=64,
-)  # fmt: skip
-
-
 # Readings of attitudes: conversions.
 def our_readings(ms):
     return [

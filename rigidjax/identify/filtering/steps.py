@@ -75,11 +75,6 @@ def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
                 f"{name}: wanted its noise, by which a filter weighs each reading, got None; give "
                 f"{name}(noise=…), such as the noise that identify.fit estimates"
             )
-        if extras(sensor).lowpass is not None:
-            raise ValueError(
-                f"{name}: a lowpass has states of its own, which the filter does not estimate; "
-                "leave the lowpass out, and give its lag as offset"
-            )
         if extras(sensor).jitter is not None:
             raise ValueError(
                 f"{name}: jitter makes the errors of a reading depend on each other, but the "

@@ -323,12 +323,7 @@ def errors_along(
         return error
 
     times, states, _ = along
-    lowpass = extras(sensor).lowpass
-    if lowpass is None:
-        return jax.vmap(error)(times, states, values)
-    # The error of a reading of zero is minus the prediction. The low-pass filter smooths this
-    # prediction, not the reading.
-    return values + lowpass(times, jax.vmap(error)(times, states, jnp.zeros_like(values)))
+    return jax.vmap(error)(times, states, values)
 
 
 def simulate_readings(
@@ -342,8 +337,8 @@ def simulate_readings(
 ) -> Any:
     """Return the readings of a sensor along a known motion, with noise, as data to test a fit.
 
-    `rigidjax.simulate` computes the motion. Bias, scale, mounting, clock offset, low-pass filter
-    and full scale are those of the sensor. The function may be differentiated, jitted and batched.
+    `rigidjax.simulate` computes the motion. Bias, scale, mounting, clock offset and full scale are
+    those of the sensor. The function may be differentiated, jitted and batched.
 
     **Arguments:**
 
@@ -390,10 +385,6 @@ def simulate_readings(
         if key is not None and one.noise is None:
             raise ValueError(
                 f"{name}: noise=None gives no size of the noise to draw; give noise, or key=None"
-            )
-        if key is not None and extras(one).jitter is not None and extras(one).lowpass is not None:
-            raise ValueError(
-                f"{name}: wanted no lowpass beside a jitter, to draw times; or key=None"
             )
         if extras(one).reading_of is None and math.prod(one.reading_shape) != one.components:
             raise ValueError(

@@ -53,9 +53,6 @@ TOLERANCES, ROUGH = 500.0, 1.0
 # Levenberg and Marquardt, and is left out if its part of a window has fewer than SHORTEST time
 # steps.
 PARTS, SHORTEST, FEW = (9, 3), 5, 10
-# The motion is integrated for this many samples beyond the last sample with a weight, since a
-# low-pass filter computes the slope at a sample from later samples, too.
-_BEYOND = 2
 
 
 class Evaluation(NamedTuple):
@@ -109,7 +106,7 @@ def marquardt(
         # No states are computed long after the last reading with a weight.
         counts = jnp.any(weights > 0, axis=0)
         place = jnp.arange(counts.size, dtype=jnp.int32)
-        last = jnp.minimum(jnp.max(jnp.where(counts, place, 0)) + _BEYOND, counts.size - 1)
+        last = jnp.max(jnp.where(counts, place, 0))
         shorter = eqx.tree_at(
             lambda s: s.last, model.integrator, last, is_leaf=lambda node: node is None
         )

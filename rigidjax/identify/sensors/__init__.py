@@ -13,7 +13,6 @@ from rigidjax.identify.sensors.base import (
     AbstractSensor as AbstractSensor,
     SensorInput as SensorInput,
 )
-from rigidjax.identify.sensors.lowpass import LowPass as LowPass
 from rigidjax.identify.sensors.tolerance import Tolerance as Tolerance
 from rigidjax.identify.sensors.vectors import (
     Accelerometer as Accelerometer,
@@ -22,7 +21,7 @@ from rigidjax.identify.sensors.vectors import (
 )
 
 __all__ = [
-    "AbstractSensor", "Accelerometer", "AttitudeSensor", "Direction", "Gyro", "LowPass",
+    "AbstractSensor", "Accelerometer", "AttitudeSensor", "Direction", "Gyro",
     "Magnetometer", "Marker", "Position", "Range", "SensorInput", "Tolerance", "Velocity",
 ]  # fmt: skip
 

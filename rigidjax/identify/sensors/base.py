@@ -75,7 +75,6 @@ class AbstractSensor(eqx.Module):
 
     - `offset`: the clock offset, s: the reading with the time stamp t was taken at t + offset.
     - `limit`: (k,) the full scale of each channel, in the unit of the error.
-    - `lowpass`: a `LowPass`; it is allowed only if the error is reading minus prediction.
     - `refusal(values)`: a method that returns for T rows of values a mask (T,), true for a row that
       cannot be a reading, and the reason in words.
     - `typical_rate(t, values)`: a method that returns the rough rate of the body, rad/s, from the
@@ -159,7 +158,6 @@ class Extras(NamedTuple):
     offset: Scalar | None
     jitter: Float[Array, "*records"] | None
     limit: Float[Array, "*records k"] | None
-    lowpass: Any
     tolerance: Any
     refusal: Callable[[np.ndarray], tuple[np.ndarray, str]] | None
     typical_rate: Callable[[np.ndarray, np.ndarray], float] | None

@@ -10,7 +10,6 @@ from jaxtyping import Array, Float
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Vec3
 from rigidjax.identify.sensors import base
 from rigidjax.identify.sensors.base import ClockedSensor, SensorInput
-from rigidjax.identify.sensors.lowpass import LowPass, lowpass_of
 from rigidjax.identify.sensors.tolerance import Tolerance, tolerance_of
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross
@@ -32,7 +31,6 @@ class VectorSensor(ClockedSensor):
         converter=lambda limit: base.positive_numbers(limit, "limit", "a positive full scale", 3),
         default=None,
     )
-    lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
     tolerance: Tolerance | None = eqx.field(converter=tolerance_of, default=None)
 
     def _read(self, vector: Vec3) -> Vec3:
@@ -70,7 +68,6 @@ class Gyro(VectorSensor):
       stamps are independent. An error of a time stamp changes the reading; this change is computed
       as the error times the time derivative of the prediction. The result is right if the body
       turns little in a time as long as the jitter.
-    - `lowpass`: the `LowPass` filter through which the readings passed.
     - `tolerance`: a `Tolerance` for scale, axes, bias and clock.
     - `g_sensitivity`: (3, 3) the matrix G, in rad/s per m/s², whose product with f is added to the
       reading. The vector f is the specific force at the gyro, in the body's axes.
@@ -147,7 +144,7 @@ class Accelerometer(VectorSensor):
       in the frame of the `MassProperties`.
     - `gravity`: (3,) m/s², world frame; `None` for a body in free fall (`Spin`, `Attitude`). A body
       on a pivot and a `Rigid` need it.
-    - `bias`, `scale`, `mounting`, `skew`, `limit`, `offset`, `jitter`, `lowpass`, `tolerance`: as
+    - `bias`, `scale`, `mounting`, `skew`, `limit`, `offset`, `jitter`, `tolerance`: as
       for `Gyro`.
 
     **Raises** `ValueError` for a noise, limit or jitter that is not positive, a wrong shape, NaN.
@@ -182,7 +179,7 @@ class Magnetometer(VectorSensor):
       estimates the noise.
     - `field`: (3,) b, world frame, any unit.
     - `bias`: (3,) the body's own magnetism, in the field's unit.
-    - `scale`, `mounting`, `skew`, `limit`, `offset`, `jitter`, `lowpass`, `tolerance`: as for
+    - `scale`, `mounting`, `skew`, `limit`, `offset`, `jitter`, `tolerance`: as for
       `Gyro`.
 
     **Raises** `ValueError` for a noise, limit or jitter that is not positive, a wrong shape, NaN.
