@@ -114,7 +114,7 @@ def _interval(texts: list[str]) -> str:
 
 def verdict(fit: Fit) -> str:
     """Return in words whether the search of a fit found the best point, whether the model explains
-    the readings, what to try, and how well the data determine each quantity.
+    the readings, what to try, and what the data do not determine.
 
     **Arguments:** `fit` a result of `rigidjax.identify.fit`.
 

@@ -142,7 +142,6 @@ def test_priors_hold_what_the_data_cannot_see(records):
     low, high = found.interval(0.95)["wheel"]
     # The scale of everything hangs on the wheel: its prior is all that is known of it.
     np.testing.assert_allclose(np.log(high / low) / (2 * 1.96), 0.1, rtol=0.1)
-    assert any("are strongly correlated" in line for line in found.identifiability)
 
 
 def test_the_entropic_prior_is_the_divergence():

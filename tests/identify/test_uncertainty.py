@@ -37,8 +37,6 @@ def test_a_real_flat_body_has_intervals_with_a_width(toss):
         assert low < high
     values = np.linalg.eigvalsh(np.asarray(found.determined_covariance))
     assert values.min() > -1e-15 * values.max()
-    words = " ".join(found.identifiability)
-    assert "±0 " not in words and "I1/I3 is well determined" not in words
     # In principal axes nothing is so weakly seen: deviations of the same ratios, same order.
     other = identify.fit(identify.Model(toss, identify.PrincipalRatios()))
     wide, wanted = (q.deviation / q.value for q in (found.quantities[0], other.quantities[1]))

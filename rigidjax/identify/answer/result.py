@@ -392,7 +392,7 @@ class Fit(eqx.Module):
 
     @property
     def identifiability(self) -> tuple[str, ...]:
-        """Describe which quantities the data of this fit determine well, weakly, and not at all."""
+        """Describe what the data of this fit do not determine, and what they cannot show."""
         return undetermined.describe_identifiability(
             self.point, self.uncertainty, self.assessment, self.quantities
         )

@@ -1,4 +1,4 @@
-"""Describe in words which numbers a fit determines, and which numbers it leaves undetermined."""
+"""Describe in words which numbers a fit leaves undetermined."""
 
 import dataclasses
 
@@ -27,7 +27,6 @@ from rigidjax.identify.uncertainty.quantities import (
     labels,
     log_deviation,
     named_charts,
-    quantities_at,
     quantity_vector,
     recording_suffixes,
     reports_starts,
@@ -348,7 +347,7 @@ def describe_identifiability(
     assessment: Assessment,
     quantities: tuple[Quantity, ...],
 ) -> tuple[str, ...]:
-    """Describe which quantities the data of a fit determine well, weakly, and not at all."""
+    """Describe which quantities the data of a fit do not determine, and what they cannot show."""
     lost = assessment.explanation.word == FAILS
     if lost or assessment.search.word == NOT_ENDED:
         why = "does not explain the data" if lost else "did not end in a minimum"
@@ -359,25 +358,16 @@ def describe_identifiability(
         # Undetermined directions are the likely reason why a search did not end: name them.
         out += [] if lost else _describe_combinations(point, uncertainty)
         return (*out, *describe_full_scale(point.model.records.readings))
-    out = []
     moments, first = [], 0
     for _, chart in named_charts(point.model):
         moments += quantities[first : first + len(chart.log_names)]
         first += len(chart.log_names) + len(chart.plain_names)
-    for quantity in moments:
-        wide = _half_width(quantity)
-        # `wide` is half the width of the interval of the logarithm. If it is small, it is the
-        # relative half-width; if it is large, the ends of the interval are exp(±wide) times the
-        # value.
-        if not np.isfinite(wide) or wide > 1.5:
-            out.append(f"{quantity.name} is not determined by these data.")
-        elif wide > 0.05:
-            out.append(
-                f"{quantity.name} is weakly determined: its 95 % interval is "
-                f"{2 * np.sinh(wide):.0%} of its value."
-            )
-        else:
-            out.append(f"{quantity.name} is well determined, to ±{wide:.2g} of its value.")
+    # The ends of an interval of a logarithm with the half-width w are exp(±w) times the value.
+    out = [
+        f"{quantity.name} is not determined by these data."
+        for quantity in moments
+        if not _half_width(quantity) <= 1.5
+    ]
     determined = np.asarray(uncertainty.determined)
     out += [
         f"A flat body{limit.where} fits as well: (I1 + I2 − I3)/I3 ≤ "
@@ -390,21 +380,12 @@ def describe_identifiability(
     ]
     if reports_starts(point.model):
         # Each recording has three components of its initial body rate.
-        shares, count = [], point.model.count
-        for index in range(first, first + 3 * count, 3):
-            rate = quantities[index : index + 3]
-            length = np.linalg.norm([q.value for q in rate])
-            shares.append(np.max([_half_width(q) for q in rate]) / max(length, 1e-300))
-        wide = np.max(shares)
-        many = "The initial body rate is" if count == 1 else "The initial body rates are"
-        if wide < 1.0:
-            grade = "well" if wide < 0.1 else "weakly"
-            its = "its length" if count == 1 else "their lengths"
-            out.append(f"{many} {grade} determined, to ±{wide:.2g} of {its}.")
-        else:
-            out.append(f"{many} not determined by these data.")
+        rates = quantities[first : first + 3 * point.model.count]
+        size = np.array([(q.value, _half_width(q)) for q in rates]).reshape(-1, 3, 2)
+        if not (size[..., 1].max(axis=1) < np.linalg.norm(size[..., 0], axis=1)).all():
+            many = "rate is" if point.model.count == 1 else "rates are"
+            out.append(f"The initial body {many} not determined by these data.")
     out += _describe_combinations(point, uncertainty)
-    out += _describe_correlations(point, uncertainty, quantities)
     if point.model.torque is None:
         out.append(
             "Free motion cannot show the absolute inertia, only ratios of moments; nor the mass or "
@@ -452,32 +433,3 @@ def _scale_is_free(point: BestPoint, uncertainty: Uncertainty) -> bool:
     here, moved = values[first : first + 6], slopes[first : first + 6] @ null.T
     wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)
     return bool(np.linalg.norm(moved @ wanted - here) < 1e-3 * np.linalg.norm(here))
-
-
-def _describe_correlations(
-    point: BestPoint, uncertainty: Uncertainty, quantities: tuple[Quantity, ...]
-) -> list[str]:
-    """Describe at most five pairs of quantities whose correlation ρ has |ρ| > 0.95.
-
-    Components of the inertia tensor are left out, because they follow from the moments and axes.
-    """
-    slope = np.asarray(quantities_at(point.model, point.derivative_point).slopes)[: len(quantities)]
-    covariance = slope @ np.asarray(uncertainty.determined) @ slope.T
-    deviation = np.array([log_deviation(quantity) for quantity in quantities])
-    good = np.isfinite(deviation) & (deviation > 0)
-    follow = {f"{plain}{name}" for name, c in named_charts(point.model) for plain in c.plain_names}
-    names = [quantity.name for quantity in quantities]
-    good &= np.array([name not in follow or name.startswith("com") for name in names])
-    scaled = np.where(good, deviation, 1.0)
-    rho = np.where(np.outer(good, good), covariance / np.outer(scaled, scaled), 0.0)
-    pairs = [
-        (i, j)
-        for i in range(len(rho))
-        for j in range(i)
-        if np.isfinite(rho[i, j]) and abs(rho[i, j]) > 0.95
-    ]
-    pairs.sort(key=lambda pair: -abs(rho[pair]))
-    return [
-        f"{names[j]} and {names[i]} are strongly correlated (ρ = {rho[i, j]:+.3f})."
-        for i, j in pairs[:5]
-    ]
