@@ -1,4 +1,4 @@
-"""Intervals where noise and widths are estimated from few errors: Welch's and Student's."""
+"""Intervals where noise and widths are estimated from few errors: Student's."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,8 +34,10 @@ def two_gyros(few, *, count=60, noises=(0.02, 0.1), given=(False, False)):
 @pytest.mark.parametrize(
     ("few", "given"), [(2, (False, False)), (30, (False, False)), (4, (True, False))]
 )
-def test_few_readings_of_unknown_noise_give_the_interval_of_welch(few, given):
-    """The bias is the difference of two means; a sensor has one noise for its three channels."""
+def test_few_readings_of_unknown_noise_give_the_interval_of_student(few, given):
+    """The bias is the difference of two means; a sensor has one noise for its three channels. The
+    noise that is known worst counts: Welch's interval is a little narrower.
+    """
     found, first, second = two_gyros(few, given=given)
     assert found.correlation <= 1.5
     parts, degrees = [], []
@@ -44,8 +46,9 @@ def test_few_readings_of_unknown_noise_give_the_interval_of_welch(few, given):
         square = 0.02**2 if known else np.sum((rows - rows.mean(axis=0)) ** 2) / freedom
         parts.append(square / len(rows))
         degrees.append(freedom)
-    freedom = sum(parts) ** 2 / sum(p**2 / d for p, d in zip(parts, degrees, strict=True))
-    half = scipy.stats.t.ppf(0.975, freedom) * np.sqrt(sum(parts))
+    welch = sum(parts) ** 2 / sum(p**2 / d for p, d in zip(parts, degrees, strict=True))
+    half = scipy.stats.t.ppf(0.975, min(degrees)) * np.sqrt(sum(parts))
+    assert 1.0 <= half / (scipy.stats.t.ppf(0.975, welch) * np.sqrt(sum(parts))) < 1.1
     middle = second.mean(axis=0) - first.mean(axis=0)
     np.testing.assert_allclose(found.noise[1], np.sqrt(parts[1] * len(second)), rtol=1e-3)
     for axis, wanted in zip("xyz", middle, strict=True):
@@ -53,16 +56,6 @@ def test_few_readings_of_unknown_noise_give_the_interval_of_welch(few, given):
         np.testing.assert_allclose(ends, [wanted - half, wanted + half], rtol=2e-3, atol=1e-4)
     low, high = found.interval_of(lambda point: point.values["bias"])
     np.testing.assert_allclose([low, high], [middle - half, middle + half], rtol=2e-3, atol=1e-4)
-
-
-def test_a_noise_has_no_part_in_numbers_of_other_sensors():
-    """The rate hangs on the first gyro alone: two readings of the second do not widen it."""
-    found, first, _ = two_gyros(2)
-    freedom = 3 * (len(first) - 1)
-    size = np.sqrt(np.sum((first - first.mean(axis=0)) ** 2) / freedom / len(first))
-    low, high = found.interval()["Ωx"]
-    wanted = 2 * scipy.stats.t.ppf(0.975, freedom) * size
-    np.testing.assert_allclose(high - low, wanted, rtol=2e-3)
 
 
 def test_a_shared_number_of_few_recordings_has_the_interval_of_student():

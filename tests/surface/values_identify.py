@@ -616,7 +616,6 @@ leave_out(
     "errors that are considered, against refits of readings that are off: "
     "tests/identify/uncertainty/test_considered.py",
     "identify.Consideration",
-    "identify.Freedom.of_estimated_variance",
 )
 leave_out(
     "the errors and derivatives of a fit, from which its covariance follows: "
@@ -629,7 +628,7 @@ leave_out(
         "misfit_gradient", "rows_for_all_numbers")),
 )  # fmt: skip
 leave_out(
-    "compared with the intervals of Welch and Student: tests/identify/test_freedom.py",
+    "compared with the intervals of Student: tests/identify/test_freedom.py",
     "identify.Fit.degrees_of_freedom", "identify.Freedom", "identify.Freedom.of_variance",
 )  # fmt: skip
 leave_out(

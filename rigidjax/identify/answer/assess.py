@@ -318,7 +318,7 @@ def assess(
             determined=covariance.determined + added,
             kind=f"{covariance.kind}; considered: {words}",
         )
-    freedom = prepare_freedom(model, linear, times, white.determined, shifts)
+    freedom = prepare_freedom(model, linear, times, white.determined)
     limits = flat_limit.limits(
         model, numbers, -white.determined @ linear.misfit_gradient, [one.suffix for one in charts]
     )
