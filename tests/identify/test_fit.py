@@ -11,7 +11,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 import rigidjax as rj
@@ -186,7 +185,7 @@ def test_interrupting_keeps_what_was_found(tumble):
 
 @pytest.mark.parametrize("good", [True, False])
 def test_interrupting_is_said_whatever_else_is(tumble, good):
-    """Of the starts, of a descent before them, of a motion that explains nothing."""
+    """Of the starts, of a motion that explains nothing."""
     _, ts, ys = tumble
     read = ys.omega if good else np.random.default_rng(3).normal(size=ys.omega.shape)
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), read))
@@ -200,16 +199,6 @@ def test_interrupting_is_said_whatever_else_is(tumble, good):
     found = rj.identify.fit(problem, starts=4, progress=stop)
     assert not found.ok and found.explanation.word == model
     assert "interrupted after 2 of 4 starts" in found.search.reasons
-
-    def in_descent(line):
-        if line.startswith("descent"):
-            raise KeyboardInterrupt
-
-    how = rj.identify.Descent(optax.sgd(1e-9), steps=2, batch=1)
-    found = rj.identify.fit(problem, starts=3, descent=how, progress=in_descent)
-    assert not found.ok and found.explanation.word == model
-    assert "interrupted in the descent of start 1 of 3" in found.search.reasons
-    assert len(found.starts) == 1
 
 
 def test_two_numbers_of_one_name_are_refused(tumble):

@@ -10,7 +10,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.search.stages import cost_of
-from rigidjax.identify.search.stochastic_gradient import chosen, descend_from, misfit_of
+from rigidjax.identify.search.stochastic_gradient import chosen, misfit_of
 
 TS = jnp.linspace(0.0, 4.0, 25)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -74,25 +74,25 @@ def test_a_batch_holds_the_recordings_it_names(problem):
 @pytest.mark.slow
 def test_descent_alone_comes_near_and_a_fit_ends_at_the_bottom(problem):
     how = identify.Descent(optax.adam(optax.cosine_decay_schedule(3e-2, 4000)), steps=4000, batch=6)
-    start = identify.fit(problem, starts=1, descent=how, max_steps=50)
-    assert start.ok
-    plain = identify.fit(problem, starts=1)
-    np.testing.assert_allclose(start.body.moments, plain.body.moments, rtol=1e-6)
     blind = problem.start().at[:2].add(0.8)
     said = []
-    near, _ = descend_from(blind, problem, NOISE, how, jax.random.key(3), said.append)
+    key = jax.random.key(3)
+    near = identify.descend(problem, how, initial=blind, key=key, progress=said.append)
     before, after = (cost_of(problem, x, NOISE) for x in (blind, near))
     # 1800 readings: the bottom is at 900; descent in noise of its own stays a little above.
     assert after < 1.5 * 900 < 0.01 * before
     assert said[-1].startswith("descent 4000/4000")
+    start = identify.fit(problem, starts=1, initial=near, max_steps=50)
+    assert start.ok
+    plain = identify.fit(problem, starts=1)
+    np.testing.assert_allclose(start.body.moments, plain.body.moments, rtol=1e-6)
 
 
 @pytest.mark.slow
 def test_where_the_misfit_is_lost_the_point_before_is_kept(problem):
     how = identify.Descent(optax.sgd(1e300), steps=100, batch=2)
     start = problem.start(BODY)
-    kept, whole = descend_from(start, problem, NOISE, how, jax.random.key(0))
-    assert whole
+    kept = identify.descend(problem, how, initial=start)
     assert np.isfinite(kept).all()
 
 
@@ -102,9 +102,9 @@ def test_mistakes_are_told(problem):
     with pytest.raises(ValueError, match="at least 1"):
         identify.Descent(optax.sgd(1.0), steps=0, batch=1)
     with pytest.raises(ValueError, match="at most 24 recordings, got 25"):
-        identify.fit(problem, starts=1, descent=identify.Descent(optax.sgd(1.0), steps=1, batch=25))
+        identify.descend(problem, identify.Descent(optax.sgd(1.0), steps=1, batch=25))
     with pytest.raises(TypeError, match="Descent"):
-        identify.fit(problem, starts=1, descent=optax.sgd(1.0))
+        identify.descend(problem, optax.sgd(1.0))
 
 
 def test_too_many_numbers_for_least_squares_are_named():

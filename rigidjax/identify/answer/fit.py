@@ -5,7 +5,6 @@ between recordings.
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from types import NoneType
 from typing import Any
 
 import equinox as eqx
@@ -41,7 +40,6 @@ from rigidjax.identify.search.stages import (
     search_whole,
 )
 from rigidjax.identify.search.starts import starting_points
-from rigidjax.identify.search.stochastic_gradient import Descent, descend_from
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 
 # At most this number of free numbers may be shared by all recordings, because the normal equations
@@ -74,7 +72,6 @@ def fit(
     key: PRNGKeyArray | None = None,
     tolerance: float = 1e-4,
     max_steps: int = 200,
-    descent: Descent | None = None,
     checkpoint: str | Path | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> Fit:
@@ -95,9 +92,6 @@ def fit(
       number by less than `tolerance` standard deviations of this number, computed with all other
       numbers fixed.
     - `max_steps`: the largest number of Levenberg–Marquardt steps.
-    - `descent`: a `Descent(optimiser, steps=…, batch=…)` with an optimiser of optax, which first
-      improves each starting point on a few recordings at a time. It pays for many recordings, where
-      a step of least squares is expensive.
     - `checkpoint`: a file in which the end of the search from each starting point is saved. A
       second call with the same model and options continues after the last saved search, and ends at
       the same point to the last bit on the same machine with the same versions.
@@ -142,8 +136,6 @@ def fit(
         _checks.require_function(progress, "progress", "of a line of text, such as print")
     if checkpoint is not None:
         require_folder(checkpoint)
-    wanted = "a Descent(optimiser, …) or None"
-    _checks.require_instance(descent, (Descent, NoneType), "fit", requirement=wanted)
     shared = model.size - len(model.index.alone) * model.count
     if shared > MOST_SHARED:
         raise ValueError(
@@ -156,7 +148,7 @@ def fit(
         with jax.default_device(cpu):
             result = fit(
                 model, starts=starts, initial=initial, key=key, tolerance=tolerance,
-                max_steps=max_steps, descent=descent, checkpoint=checkpoint, progress=progress,
+                max_steps=max_steps, checkpoint=checkpoint, progress=progress,
             )  # fmt: skip
         return dataclasses.replace(result, place=_ON_CPU)
     if model.index.bodies:
@@ -176,8 +168,6 @@ def fit(
         first = Attempt(points[0], blocks=blocks_at(padded, points[0]))
         finer = _converged_integrator(first, task, rough)
         task = task if rough else task._replace(model=_with_integrator(padded, finer))
-    if descent is not None:
-        points = _descend(points, task, descent, key, progress, interrupts)
     attempts = _search(points, task, checkpoint, progress, interrupts)
     best = min(attempts, key=_finite_cost)
     lowest = float(best.cost)
@@ -246,29 +236,6 @@ def _noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
             break
         best = search_whole(Attempt(best.x), task)
     return best, task
-
-
-def _descend(
-    points: list[Array],
-    task: Task,
-    descent: Descent,
-    key: PRNGKeyArray | None,
-    progress: Callable[[str], Any] | None,
-    interrupts: list[str],
-) -> list[Array]:
-    """Return where stochastic gradient descent leads from each starting point.
-
-    After an interrupt (Ctrl-C) a line is added to `interrupts`, and further starts are left out.
-    """
-    keys = jax.random.split(jax.random.key(1) if key is None else key, len(points))
-    out: list[Array] = []
-    for point, own in zip(points, keys, strict=True):
-        near, ended = descend_from(point, task.model, task.noise, descent, own, progress)
-        out.append(near)
-        if not ended:
-            interrupts.append(f"interrupted in the descent of start {len(out)} of {len(points)}")
-            break
-    return out
 
 
 def _search(

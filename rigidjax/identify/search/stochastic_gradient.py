@@ -1,7 +1,7 @@
 """Fit by stochastic gradient descent with optax, for more recordings than `fit` can use."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -67,23 +67,6 @@ class Descent(eqx.Module):
         self.batch = _checks.integer(batch, "batch", 1)
 
 
-class Descended(NamedTuple):
-    """Hold the result of a descent."""
-
-    x: Float[Array, " n"]
-    # False after an interrupt (Ctrl-C).
-    finished: bool
-
-
-class Steps(NamedTuple):
-    """Hold the result of some steps of a descent."""
-
-    x: Float[Array, " n"]
-    optimiser_state: Any
-    # The cost before each step.
-    costs: Float[Array, " steps"]
-
-
 def descend(
     model: Model,
     descent: Descent,
@@ -132,31 +115,15 @@ def descend(
     random: Any = jax.random.key(0) if key is None else _checks.random_key(key)
     if progress is not None:
         _checks.require_function(progress, "progress", "of a line of text, such as print")
-    return descend_from(x, model, initial_noise(model), descent, random, progress).x
-
-
-def descend_from(
-    start: Float[Array, " n"],
-    model: Model,
-    noise: Noise,
-    descent: Descent,
-    key: PRNGKeyArray,
-    progress: Callable[[str], Any] | None = None,
-) -> Descended:
-    """Return the last parameters of a descent; the arguments are as for `descend`.
-
-    If a cost becomes infinite or NaN, they are those before the `STRIDE` steps in which this
-    happens.
-    """
     if descent.batch > model.count:
         raise ValueError(
             f"Descent: wanted a batch of at most {model.count} recordings, got {descent.batch}"
         )
     init: Any = descent.optimiser.init
-    x, memory = start, init(start)
+    noise, memory = initial_noise(model), init(x)
     try:
         for first in range(0, descent.steps, STRIDE):
-            key, own = jax.random.split(key)
+            random, own = jax.random.split(random)
             keys = jax.random.split(own, min(STRIDE, descent.steps - first))
             after, memory, costs = _descent_steps(x, memory, model, noise, descent, keys)
             if not np.isfinite(np.asarray(costs)).all():
@@ -166,8 +133,8 @@ def descend_from(
             line = f"descent {done}/{descent.steps}: misfit {float(costs.mean()):.6g}"
             report_progress(progress, line)
     except KeyboardInterrupt:
-        return Descended(x, False)
-    return Descended(x, True)
+        pass
+    return x
 
 
 @eqx.filter_jit
@@ -178,8 +145,10 @@ def _descent_steps(
     noise: Noise,
     descent: Descent,
     keys: Array,
-) -> Steps:
-    """Return the result of a step for each of the `keys`, which draw the recordings of a batch."""
+) -> tuple[Array, Any, Array]:
+    """Return x, the state of the optimiser and the cost before each step, after a step for each of
+    the `keys`, which draw the recordings of a batch.
+    """
 
     def descent_step(carry: tuple, key: Array) -> tuple[tuple, Array]:
         x, optimiser_state = carry
@@ -193,7 +162,7 @@ def _descent_steps(
         return (x + move, optimiser_state), cost
 
     (x, optimiser_state), costs = jax.lax.scan(descent_step, (x, optimiser_state), keys)
-    return Steps(x, optimiser_state, costs)
+    return x, optimiser_state, costs
 
 
 def misfit_of(
