@@ -86,7 +86,7 @@ TOPICS = {
         "Velocity Range AbstractSensor SensorInput",
         "The fit and its result": "fit Fit Unpacked",
         "How it searches": "SoftL1 Huber AbstractLoss FixedSteps Adaptive Descent descend Entropic",
-        "Uncertainty, comparison": "profile compare cross_validate",
+        "Uncertainty, comparison": "compare cross_validate",
         "Before the experiment": "simulate_readings expected_quantities best_first_rate fisher",
         "Short windows of driven bodies": "windows Windows predict_windows",
         "Unknown torques: filter and smoother": "Walk first_belief filter smooth step",

@@ -37,7 +37,6 @@ from rigidjax.identify.inference.draws import (
     refit as refit,
 )
 from rigidjax.identify.inference.horizons import predict_windows as predict_windows
-from rigidjax.identify.inference.profile import profile as profile
 from rigidjax.identify.model.charts import (
     AbstractBodyChart as AbstractBodyChart,
     Known as Known,
@@ -81,13 +80,12 @@ from rigidjax.identify.sensors import (
 __all__ = [
     "AbstractBodyChart", "AbstractLoss", "AbstractSensor", "Accelerometer", "Adaptive",
     "AttitudeSensor", "Descent", "Direction", "Entropic", "Fit", "FixedSteps", "Free", "Gyro",
-    "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass", "Model", "Nuts",
-    "Position", "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios", "Recording",
-    "Refit", "Scene", "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity",
-    "Walk", "Windows", "best_first_rate", "compare", "cross_validate", "descend",
-    "expected_quantities", "filter", "first_belief", "fisher", "fit", "log_likelihood", "posterior",
-    "predict_windows", "profile", "read_table", "refit", "report", "sample", "simulate_readings",
-    "smooth", "step", "windows",
+    "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass", "Model", "Nuts", "Position",
+    "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios", "Recording", "Refit", "Scene",
+    "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity", "Walk", "Windows",
+    "best_first_rate", "compare", "cross_validate", "descend", "expected_quantities", "filter",
+    "first_belief", "fisher", "fit", "log_likelihood", "posterior", "predict_windows", "read_table",
+    "refit", "report", "sample", "simulate_readings", "smooth", "step", "windows",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

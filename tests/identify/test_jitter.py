@@ -95,14 +95,6 @@ def test_a_known_jitter_widens_what_is_expected():
     assert 1.05 * deviation(None) < deviation(TAU)
 
 
-def test_a_profile_has_the_jitter_of_the_fit():
-    found = fitted(identify.Gyro(SIGMA, jitter=TAU), throw(0))
-    for name in ("Ix/Iz", "Iy/Iz"):
-        low, high = found.interval()[name]
-        ends = identify.profile(found, name)
-        np.testing.assert_allclose(ends, (low, high), atol=0.05 * (high - low))
-
-
 def test_channels_at_full_scale_beside_a_jitter():
     rates = np.clip(throw(0), -6.0, 6.0)
     assert (np.abs(rates).max(axis=1) == 6.0).mean() > 0.9

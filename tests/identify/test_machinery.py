@@ -1,4 +1,4 @@
-"""Several recordings, priors, profiles, comparison, design, checkpoints, reports."""
+"""Several recordings, priors, comparison, design, checkpoints, reports."""
 
 import json
 import os
@@ -174,16 +174,6 @@ def short_record():
     omega = rj.simulate(BODY, rj.Spin([0.4, 1.2, -0.3]), ts).ys.omega
     read = np.asarray(omega) + 0.01 * np.random.default_rng(9).normal(size=omega.shape)
     return identify.Recording(ts, (identify.Gyro(0.01), read))
-
-
-@pytest.mark.slow
-def test_profile_agrees_with_the_covariance_where_the_misfit_is_quadratic(free_record):
-    problem = identify.Model(free_record, identify.PrincipalRatios())
-    found = identify.fit(problem, starts=1)
-    low, high = identify.profile(found, "Ix/Iz")
-    np.testing.assert_allclose([low, high], found.interval()["Ix/Iz"], rtol=2e-3)
-    with pytest.raises(ValueError, match=r"profile: wanted one of Ix/Iz.*got 'mass'"):
-        identify.profile(found, "mass")
 
 
 @pytest.mark.oldest

@@ -8,7 +8,6 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.model.model import AbstractPull, replaced
 from rigidjax.identify.model.normal import NormalMatrix, OwnBlocks, normal_matrix
 from rigidjax.identify.search.stages import blocks_at
 from rigidjax.identify.uncertainty import covariance as uncertainty
@@ -197,24 +196,6 @@ def test_what_is_not_determined_is_found_in_the_shared_numbers_and_in_those_of_o
         blind[third].all()
         and blind[:6].any()
         and not blind[np.asarray(linear.places[3])[-3:]].any()
-    )
-
-
-class Joints(AbstractPull):
-    """The initial rate of a recording is near that of the next one."""
-
-    def __call__(self, model, x):
-        return jnp.diff(x[model.index.start], axis=0).reshape(-1) / 0.1
-
-
-def test_numbers_that_rows_tie_together_stay_in_the_core():
-    linear = linear_at(replaced(identify.Model(records(9), identify.Ratios()), pull=Joints()))
-    rows = jacobian(linear)
-    wanted = np.linalg.pinv(rows) @ np.linalg.pinv(rows).T
-    size = np.sqrt(np.diag(wanted))
-    found = uncertainty.white_covariance(linear).determined
-    np.testing.assert_allclose(
-        found / np.outer(size, size), wanted / np.outer(size, size), atol=1e-7
     )
 
 

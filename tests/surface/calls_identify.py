@@ -139,13 +139,6 @@ row(
     groups=("stranger",),
     **HOST,
 )  # fmt: skip
-row(
-    "identify.profile",
-    lambda: dict(fit=s.found(), name="Ix/Iz", level=0.9),
-    groups=("stranger", "shape"),
-    dear=True,
-    **HOST,
-)
 row("identify.compare", lambda: dict(fits={"a": s.found(), "b": s.found()}), transforms=())
 row(
     "identify.cross_validate",

@@ -653,6 +653,6 @@ leave_out(
 leave_out(
     "searches of many fits, tens of seconds each: tests/identify hold them against motions known",
     "identify.best_first_rate", "identify.compare", "identify.cross_validate",
-    "identify.profile", "tumblers.fit_light_curve", "identify.Fit.identifiability",
+    "tumblers.fit_light_curve", "identify.Fit.identifiability",
     "identify.Fit.undetermined_combinations",
 )  # fmt: skip

@@ -1,1 +1,1 @@
-"""Compute posterior densities and profiles, compare models, and design experiments."""
+"""Compute posterior densities, compare models, and design experiments."""

@@ -1,6 +1,5 @@
 """Map the free numbers of a fit to the scene of each recording, by a model."""
 
-import abc
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
@@ -80,20 +79,6 @@ TURN_OF_A_FILTER_STEP = 0.05
 # Times count as evenly spaced if no step differs from the first step by more than this fraction of
 # the first step.
 EVEN = 1e-3
-
-
-class AbstractPull(eqx.Module):
-    """Compute residuals that pull parameters, or quantities that depend on them, towards chosen
-    values.
-
-    A fit adds these residuals to the residuals of the readings and priors.
-    """
-
-    @abc.abstractmethod
-    def __call__(self, model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-        """Return residuals in standard deviations; half the sum of their squares is added to the
-        cost.
-        """
 
 
 class Unpacked(eqx.Module):
@@ -192,7 +177,6 @@ class Model(eqx.Module):
     noise_groups: Int[Array, " records"]
     loss: AbstractLoss | None
     prior: Entropic | None
-    pull: AbstractPull | None
     start_weight: Float[Array, "records n"] | None
     clusters: Int[Array, " records"] | None
     integrator: AbstractIntegrator | None
@@ -255,7 +239,7 @@ class Model(eqx.Module):
         self.start_weight, self.clusters = data.start_weight, data.clusters
         self.chart, self.torque, self.process = charts, torque, process
         self.loss, self.prior = loss, prior
-        self.body_names, self.body_indices, self.pull = names, None, None
+        self.body_names, self.body_indices = names, None
         if isinstance(charts, Bodies):
             self.body_indices = jnp.asarray([charts.names.index(name) for name in names], jnp.int32)
             if prior is not None:

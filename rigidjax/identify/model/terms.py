@@ -387,19 +387,12 @@ def prior_weights(model: "Model") -> Float[Array, " n"]:
 
 
 def joint_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-    """Return the residuals of the prior of the body and of the `AbstractPull`, if the model has
-    them.
-
-    Such a residual depends on several parameters at once.
-    """
-    out = [jnp.zeros(0, x.dtype)]
-    if model.prior is not None:
-        assert not isinstance(model.chart, Bodies)
-        body = model.chart.body(x[: model.index.bodies])
-        out.append(model.prior.residuals(body, to_scale=model.chart.unit != "").reshape(-1))
-    if model.pull is not None:
-        out.append(model.pull(model, x))
-    return jnp.concatenate(out)
+    """Return the residuals of the prior of the body, if the model has one."""
+    if model.prior is None:
+        return jnp.zeros(0, x.dtype)
+    assert not isinstance(model.chart, Bodies)
+    body = model.chart.body(x[: model.index.bodies])
+    return model.prior.residuals(body, to_scale=model.chart.unit != "").reshape(-1)
 
 
 def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]:
