@@ -87,7 +87,7 @@ TOPICS = {
         "The fit and its result": "fit Fit Unpacked",
         "How it searches": "SoftL1 Huber AbstractLoss FixedSteps Adaptive Descent descend Entropic",
         "Uncertainty, comparison": "compare cross_validate",
-        "Before the experiment": "simulate_readings expected_quantities best_first_rate fisher",
+        "Before the experiment": "simulate_readings expected_quantities fisher",
         "Short windows of driven bodies": "windows Windows predict_windows",
         "Unknown torques: filter and smoother": "Walk first_belief filter smooth step",
         "Likelihood, simulated motions": "log_likelihood sample",

@@ -25,7 +25,6 @@ from rigidjax.identify.filtering.steps import sample as sample
 from rigidjax.identify.inference.compare import compare as compare, cross_validate as cross_validate
 from rigidjax.identify.inference.density import LogDensity as LogDensity
 from rigidjax.identify.inference.design import (
-    best_first_rate as best_first_rate,
     expected_quantities as expected_quantities,
     fisher as fisher,
 )
@@ -83,9 +82,9 @@ __all__ = [
     "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass", "Model", "Nuts", "Position",
     "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios", "Recording", "Refit", "Scene",
     "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity", "Walk", "Windows",
-    "best_first_rate", "compare", "cross_validate", "descend", "expected_quantities", "filter",
-    "first_belief", "fisher", "fit", "log_likelihood", "posterior", "predict_windows", "read_table",
-    "refit", "report", "sample", "simulate_readings", "smooth", "step", "windows",
+    "compare", "cross_validate", "descend", "expected_quantities", "filter", "first_belief",
+    "fisher", "fit", "log_likelihood", "posterior", "predict_windows", "read_table", "refit",
+    "report", "sample", "simulate_readings", "smooth", "step", "windows",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

@@ -332,15 +332,17 @@ def _widened(best: Fit) -> Fit:
         np.asarray(c) + shift @ shift.T for c in (best.covariance, best.determined_covariance)
     )
     null = np.asarray(best.null_directions)
-    numbers = quantities_on_host(best.model, best.x, best.near)
-    freedom = best.degrees_of_freedom(numbers[1])
+    numbers = quantities_on_host(best.model, best.x, best.point.near)
+    freedom = best.uncertainty.degrees_of_freedom(numbers[1])
     uncertain = dataclasses.replace(
         best.uncertainty,
         covariance=jnp.asarray(covariance),
         determined=jnp.asarray(seen),
         kind=f"sandwich: a shape {SHAPE:.0%} off the ellipsoid; {best.covariance_kind}",
     )
-    reported = reported_quantities(best.model, numbers, seen, null, best.limits, freedom)
+    reported = reported_quantities(
+        best.model, numbers, seen, null, best.uncertainty.limits, freedom
+    )
     return dataclasses.replace(best, uncertainty=uncertain, quantities=reported)
 
 
@@ -350,7 +352,7 @@ def _result(
     """Return the result that holds the fit of the best motion, and all motions, the best first;
     more pairs of frequencies may fit if `is_incomplete`.
     """
-    slopes = np.asarray(_slopes(best.derivative_point, best.model))
+    slopes = np.asarray(_slopes(best.point.derivative_point, best.model))
     wider = _widened(best)
     own, deviations = (
         standard_deviations(

@@ -113,7 +113,7 @@ def test_a_plate_in_any_axes_is_found_and_told(thin):
     assert all(holds(found, BODIES["plate"]))
     (told,) = [line for line in found.identifiability if "flat" in line]
     assert "(I1 + I2 − I3)/I3 ≤" in told
-    (limit,) = found.limits
+    (limit,) = found.uncertainty.limits
     bound = limit.flatness_upper_bound(np.asarray(found.determined_covariance))
     assert 0 <= limit.flatness <= bound < 0.1
 
@@ -131,7 +131,7 @@ def test_a_plate_in_any_axes_is_found_and_told(thin):
 
 def test_a_thick_body_has_no_limit_near():
     found = fitted((0.5, 0.8, 1.0), 1, noise=0.005)
-    assert found.ok and found.near is None
+    assert found.ok and found.point.near is None
     assert not any("flat" in line for line in found.identifiability)
 
 
@@ -141,7 +141,7 @@ def test_windows_say_that_a_body_is_flat_and_what_is_not_known():
     spin = rj.simulate(body, rj.Spin([1.0, 2.0, 0.5]), jnp.asarray(t)).ys
     cut = identify.windows(t, spin, length=10, stride=2)
     found = identify.fit(identify.Model(cut, identify.Tensor()), starts=1)
-    (limit,) = found.limits
+    (limit,) = found.uncertainty.limits
     assert 0 <= limit.flatness < 1e-3
     assert any(
         "A flat body fits as well: (I1 + I2 − I3)/I3 ≤" in one for one in found.identifiability

@@ -190,17 +190,6 @@ def test_a_design_expects_what_a_fit_then_finds(short_record):
         identify.expected_quantities(identify.Model(silent, identify.PrincipalRatios()), plan)
 
 
-@pytest.mark.slow
-def test_the_best_first_rate_shows_more(free_record):
-    problem = identify.Model(free_record, identify.PrincipalRatios())
-    start = [0.05, 0.1, 1.3]
-    rate, promise = identify.best_first_rate(problem, BODY, start)
-    poor = identify.expected_quantities(problem, problem.start(BODY, start))
-    np.testing.assert_allclose(jnp.linalg.norm(rate), np.linalg.norm(start), rtol=1e-9)
-    doubts = [np.prod([q.deviation / q.value for q in qs[:2]]) for qs in (promise, poor)]
-    assert doubts[0] < 0.5 * doubts[1]
-
-
 def test_a_fit_killed_after_any_start_ends_at_the_same_bits(short_record, tmp_path, monkeypatch):
     """The starts to come depend on those that were, not on the process."""
     problem = identify.Model(short_record, identify.PrincipalRatios())

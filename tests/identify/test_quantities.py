@@ -202,6 +202,6 @@ def test_value_and_interval_of_a_later_rate():
     shifts = 1e-5 * jnp.eye(found.x.size)
     slope = np.stack([(at(found.x + d) - at(found.x - d)) / 2e-5 for d in shifts], axis=-1)
     deviation = np.sqrt(np.einsum("in,nm,im->i", slope, found.covariance, slope))
-    reach = scipy.stats.t.ppf(0.95, found.degrees_of_freedom(slope))
+    reach = scipy.stats.t.ppf(0.95, found.uncertainty.degrees_of_freedom(slope))
     np.testing.assert_allclose(high - value, reach * deviation, rtol=1e-6)
     np.testing.assert_allclose(value - low, reach * deviation, rtol=1e-6)

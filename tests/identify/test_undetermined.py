@@ -35,8 +35,8 @@ def fit_with(chart, directions, search="found", model="explains the readings", m
     like = jnp.eye(n)
     return identify.Fit(
         BestPoint(problem, here, tuple(jnp.ones((1, k)) for k in (3, 3))),
-        Uncertainty(like, like, "none", jnp.ones(n), jnp.asarray(null)),
-        Assessment(Answer(search), Answer(model), (), 1.0, 1, 1.0, 1.0), (), (),
+        Uncertainty(like, like, "none", jnp.asarray(null)),
+        Assessment(Answer(search), Answer(model), (), 1.0, 1, 1.0), (), (),
     )  # fmt: skip
 
 
@@ -135,8 +135,8 @@ def test_a_number_that_switches_a_torque_is_named():
     like = jnp.eye(null.shape[1])
     fit = identify.Fit(
         BestPoint(problem, here, (jnp.full((1, 3), 1e-3),)),
-        Uncertainty(like, like, "none", jnp.ones(null.shape[1]), jnp.asarray(null)),
-        Assessment(Answer("found"), Answer("explains the readings"), (), 1.0, 1, 1.0, 1.0), (), (),
+        Uncertainty(like, like, "none", jnp.asarray(null)),
+        Assessment(Answer("found"), Answer("explains the readings"), (), 1.0, 1, 1.0), (), (),
     )  # fmt: skip
     words = [one.in_words for one in fit.undetermined_combinations]
     assert words[0].startswith("Readings change with end, but derivatives do not see it: a torque")

@@ -111,7 +111,6 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
         for name in ("choose", "table")
         for empty in ("dict", "empty list")
     ),
-    ("identify.best_first_rate", "body: None", "taken*", "None is documented: a sphere"),
     ("identify.Recording", "inputs: dict", "taken*", "no input at all is documented: none is read"),
     ("identify.windows", "inputs: dict", "taken*", "no input at all is documented: none is read"),
     *(

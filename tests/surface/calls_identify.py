@@ -124,13 +124,6 @@ row(
     **HOST,
 )
 row(
-    "identify.best_first_rate",
-    lambda: dict(model=s.model(), body=s.inertia(), omega=W, max_steps=2),
-    groups=("stranger",),
-    dear=True,
-    **HOST,
-)
-row(
     "identify.fit",
     lambda: dict(
         model=s.model(), starts=1, initial=plan(), key=jax.random.key(0), tolerance=1e-4,

@@ -49,7 +49,6 @@ WITHOUT_EXAMPLE = {
         ),
         "is given by a function or is part of what is given, whose example is it",
     ),
-    "identify.best_first_rate": "compiles for most of a minute, second derivatives of a motion",
     "plot.player": "viser writes a page of megabytes: the notebook on the Dzhanibekov effect has it",
 }
 

@@ -386,7 +386,6 @@ def assess(
             covariance=jnp.asarray(covariance.covariance),
             determined=jnp.asarray(covariance.determined),
             kind=covariance.kind,
-            singular_values=jnp.asarray(covariance.singular_values),
             null_directions=jnp.asarray(covariance.null_directions),
             hidden_directions=jnp.asarray(hidden),
             limits=limits,
@@ -394,9 +393,7 @@ def assess(
             considered=considered_errors,
             allowance=words,
         ),
-        assessment=Assessment(
-            search, explanation, left, chi2, dof, times.longest_span, times.independent
-        ),
+        assessment=Assessment(search, explanation, left, chi2, dof, times.longest_span),
         quantities=quantities,
         starts=tuple(starts),
         linear=linear.first_times(original.records.t.shape[1]),

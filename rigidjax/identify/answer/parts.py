@@ -1,6 +1,7 @@
 """Hold the parts of a fit: its best point, its uncertainty, and its answers."""
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax.identify.answer.answers import Answer
@@ -44,8 +45,6 @@ class Uncertainty(eqx.Module):
     - `covariance`: (n, n) the covariance; infinite for parameters that the data do not determine.
     - `determined`: (n, n) the covariance within the directions that the data determine.
     - `kind`: the method by which the covariance was computed, in words.
-    - `singular_values`: (n,) the singular values of the Jacobian of all residuals, with columns of
-      length one. The parameters that belong to one recording alone are eliminated first.
     - `null_directions`: (k, n) the directions of x that the data do not determine.
     - `hidden_directions`: (k, n) for a fit of windows the directions of x that only one stretch (a
       run of neighbouring windows) shows. The variance along these directions is infinite.
@@ -60,13 +59,18 @@ class Uncertainty(eqx.Module):
     covariance: Float[Array, "n n"]
     determined: Float[Array, "n n"]
     kind: str
-    singular_values: Float[Array, " n"]
     null_directions: Float[Array, "unseen n"]
     hidden_directions: Float[Array, "hidden n"] | None = None
     limits: tuple[Limit, ...] = ()
     freedom: Freedom | None = None
     considered: tuple[Consideration, ...] = ()
     allowance: str = ""
+
+    def degrees_of_freedom(self, slope: np.ndarray) -> np.ndarray:
+        """Return the degrees of freedom (…,) of variances of functions with slopes (…, n)."""
+        if self.freedom is None:
+            return np.full(slope.shape[:-1], np.inf)
+        return self.freedom.of_variance(slope)
 
 
 class Assessment(eqx.Module):
@@ -82,7 +86,6 @@ class Assessment(eqx.Module):
     - `dof`: the degrees of freedom of χ².
     - `correlation`: the number of samples over which the errors are autocorrelated; 1 for white
       errors.
-    - `independent`: the number of independent errors.
     """
 
     search: Answer
@@ -91,4 +94,3 @@ class Assessment(eqx.Module):
     chi2: float
     dof: int
     correlation: float
-    independent: float

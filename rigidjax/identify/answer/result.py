@@ -18,10 +18,8 @@ from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
 from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jacobian
 from rigidjax.identify.model.terms import Noise
-from rigidjax.identify.uncertainty.considered import Consideration
 from rigidjax.identify.uncertainty.covariance import Linearisation
-from rigidjax.identify.uncertainty.degrees_of_freedom import Freedom, student_quantile
-from rigidjax.identify.uncertainty.flat_limit import Limit
+from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 from rigidjax.identify.uncertainty.quantities import Quantity, interval_about
 
 
@@ -52,8 +50,8 @@ class Fit(eqx.Module):
 
     **Fields:**
 
-    - `point`: the best point, a `BestPoint`. Of its fields `fit.model`, `fit.x`, `fit.noises` and
-      `fit.near` are short forms.
+    - `point`: the best point, a `BestPoint`. Of its fields `fit.model`, `fit.x` and
+      `fit.noises` are short forms.
     - `uncertainty`: the `Uncertainty` of x. Of its fields `fit.covariance`,
       `fit.determined_covariance`, `fit.covariance_kind` and others are short forms.
     - `assessment`: the answers on the search and on the model, an `Assessment`. Of its fields
@@ -93,11 +91,6 @@ class Fit(eqx.Module):
         return self.point.noises
 
     @property
-    def near(self) -> Float[Array, " n"] | None:
-        """Return the parameters of a slightly thicker body if a body is flat at x, else `None`."""
-        return self.point.near
-
-    @property
     def covariance(self) -> Float[Array, "n n"]:
         """Return the covariance (n, n) of x, infinite where the data do not determine x."""
         return self.uncertainty.covariance
@@ -113,39 +106,9 @@ class Fit(eqx.Module):
         return self.uncertainty.kind
 
     @property
-    def singular_values(self) -> Float[Array, " n"]:
-        """Return the singular values (n,) of the Jacobian, with columns of length one."""
-        return self.uncertainty.singular_values
-
-    @property
     def null_directions(self) -> Float[Array, "unseen n"]:
         """Return the directions (k, n) of x that the data do not determine."""
         return self.uncertainty.null_directions
-
-    @property
-    def hidden_directions(self) -> Float[Array, "hidden n"] | None:
-        """Return the directions (k, n) of x that only one stretch of windows shows."""
-        return self.uncertainty.hidden_directions
-
-    @property
-    def limits(self) -> tuple[Limit, ...]:
-        """Return for each body with free moments its distance from a flat body."""
-        return self.uncertainty.limits
-
-    @property
-    def freedom(self) -> Freedom | None:
-        """Return what gives the degrees of freedom of variances."""
-        return self.uncertainty.freedom
-
-    @property
-    def considered(self) -> tuple[Consideration, ...]:
-        """Return the sensor errors that the covariance allows for by a `Tolerance`."""
-        return self.uncertainty.considered
-
-    @property
-    def allowance(self) -> str:
-        """Return the sentences on the sensor errors that the intervals allow for."""
-        return self.uncertainty.allowance
 
     @property
     def search(self) -> Answer:
@@ -156,11 +119,6 @@ class Fit(eqx.Module):
     def explanation(self) -> Answer:
         """Return the answer on the model, such as `explains the readings`."""
         return self.assessment.explanation
-
-    @property
-    def left(self) -> tuple[int, ...]:
-        """Return the indices of the sensors whose errors the model does not explain."""
-        return self.assessment.left
 
     @property
     def chi2(self) -> float:
@@ -176,11 +134,6 @@ class Fit(eqx.Module):
     def correlation(self) -> float:
         """Return the number of samples over which the errors are autocorrelated."""
         return self.assessment.correlation
-
-    @property
-    def independent(self) -> float:
-        """Return the number of independent errors."""
-        return self.assessment.independent
 
     @property
     def status(self) -> str:
@@ -202,24 +155,15 @@ class Fit(eqx.Module):
         return self.status == "ok"
 
     @property
-    def derivative_point(self) -> Float[Array, " n"]:
-        """Return the free numbers (n,) at which the derivatives of this fit are taken.
-
-        They are the best point x. But if a body is flat at x (I1 + I2 = I3), they are the field
-        `near`, which describes a slightly thicker body.
-        """
-        return self.point.derivative_point
-
-    @property
     def causes(self) -> tuple[Cause, ...]:
         """Return the most likely causes of the errors of this fit that the model does not explain.
 
         The tuple is empty if the readings show no cause. Each cause has the fields `name`,
         `sensor`, `share`, `words` and `remedy`.
         """
-        if not self.left or self.linear is None:
+        if not self.assessment.left or self.linear is None:
             return ()
-        return causes(self.model, self.x, self.noises, self.linear, self.left)
+        return causes(self.model, self.x, self.noises, self.linear, self.assessment.left)
 
     @property
     def advice(self) -> str:
@@ -234,7 +178,7 @@ class Fit(eqx.Module):
             self.causes,
             self.covariance_kind,
             error_ratio,
-            self.allowance,
+            self.uncertainty.allowance,
         )
         lost = ["the unknown torque as zero"] if self.model.process is not None else []
         lost += ["the walks as constant"] if self.model.walks else []
@@ -372,14 +316,6 @@ class Fit(eqx.Module):
         _, low, high = value_and_interval_of(self, function, level)
         return low, high
 
-    def degrees_of_freedom(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom (…,) of the variance of each of several functions.
-
-        `slope` (…, n) holds the derivative of each function with respect to the n free numbers of
-        this fit. The result is infinite if the field `freedom` is `None`.
-        """
-        return undetermined.degrees_of_freedom(self.uncertainty, slope)
-
     @property
     def undetermined_combinations(self) -> tuple[Combination, ...]:
         """Return the combinations of numbers that the data of this fit do not determine at all.
@@ -418,20 +354,21 @@ def value_and_interval_of(
         point = dataclasses.replace(point, noise=fit.noises)
         return _checks.differentiable_array(function(point), "function(point)")
 
-    point, slopes = unpack_jacobian(shortened(fit.model), fit.derivative_point)
+    point, slopes = unpack_jacobian(shortened(fit.model), fit.point.derivative_point)
 
     def value_and_change(step: Unpacked) -> tuple[Array, Array]:
         return jax.jvp(value, (point,), (step,))
 
     # Under `vmap` the value may come once for each of the n derivatives; all of these are equal.
     values, slope = jax.vmap(value_and_change, in_axes=-1, out_axes=(0, -1))(slopes)
-    best = values[0] if fit.near is None else value(fit.model.unpack(fit.x))
+    best = values[0] if fit.point.near is None else value(fit.model.unpack(fit.x))
     middle, slope = np.asarray(_checks.require_finite(best, "function(point)")), np.asarray(slope)
     determined, null = np.asarray(fit.determined_covariance), np.asarray(fit.null_directions)
-    if fit.hidden_directions is not None:
-        null = np.concatenate([null, np.asarray(fit.hidden_directions)])
-    reach = student_quantile(level, fit.degrees_of_freedom(slope))
-    return middle, *interval_about(middle, slope, determined, null, reach, fit.limits)
+    uncertainty = fit.uncertainty
+    if uncertainty.hidden_directions is not None:
+        null = np.concatenate([null, np.asarray(uncertainty.hidden_directions)])
+    reach = student_quantile(level, uncertainty.degrees_of_freedom(slope))
+    return middle, *interval_about(middle, slope, determined, null, reach, uncertainty.limits)
 
 
 def require_one_fit(fit: PyTree, name: str = "fit") -> Fit:

@@ -335,12 +335,6 @@ def _echelon(rows: Float[np.ndarray, "k M"]) -> Float[np.ndarray, "_ M"]:
     return np.where(np.abs(rows) > PART * np.abs(rows).max(axis=1, keepdims=True), rows, 0.0)
 
 
-def degrees_of_freedom(uncertainty: Uncertainty, slope: np.ndarray) -> np.ndarray:
-    """Return the degrees of freedom (…,) of the variance of functions with derivatives (…, n)."""
-    freedom = uncertainty.freedom
-    return np.full(slope.shape[:-1], np.inf) if freedom is None else freedom.of_variance(slope)
-
-
 def describe_identifiability(
     point: BestPoint,
     uncertainty: Uncertainty,
@@ -375,7 +369,7 @@ def describe_identifiability(
         "bodies."
         for limit in uncertainty.limits
         if limit.is_flat_within(
-            determined, float(student_quantile(0.95, degrees_of_freedom(uncertainty, limit.slope)))
+            determined, float(student_quantile(0.95, uncertainty.degrees_of_freedom(limit.slope)))
         )
     ]
     if reports_starts(point.model):

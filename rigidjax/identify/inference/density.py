@@ -277,7 +277,7 @@ def _white_covariance(fit: Fit, has_deterministic_motion: bool) -> Float[np.ndar
     covariance is singular, autocorrelation.
     """
     covariance = np.asarray(fit.covariance)
-    if fit.considered and fit.linear is not None:
+    if fit.uncertainty.considered and fit.linear is not None:
         covariance = white_covariance(fit.linear).covariance
     elif fit.covariance_kind.startswith("sandwich"):
         # The sandwich covariance of a fit is larger than the covariance of a density with white

@@ -1,18 +1,13 @@
-"""Compute the uncertainty to expect from a planned recording, and find the best initial rate."""
+"""Compute the uncertainty to expect from a planned recording."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import Scalar, Vec3, Vector
-from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.identify.model.model import Model, checked_x, require_single
+from rigidjax.identify.model.model import Model, checked_x
 from rigidjax.identify.model.normal import normal_matrix
 from rigidjax.identify.model.terms import (
     delay_slopes,
@@ -109,76 +104,3 @@ def _require_not_traced(model: Model, motion: PyTree) -> None:
             "model, x, body, omega: wanted known numbers, got traced ones; call it outside of "
             "jax.jit, jax.grad and jax.vmap, or differentiate identify.fisher"
         )
-
-
-def best_first_rate(
-    model: Model,
-    body: Inertia | MassProperties | Mapping[str, Inertia | MassProperties] | None,
-    omega: Vector,
-    *,
-    max_steps: int = 60,
-) -> tuple[Vec3, tuple[Quantity, ...]]:
-    """Return the initial body rate, of the same length as `omega`, that determines the body best.
-
-    The direction of the rate minimises the determinant of the covariance of the free numbers of the
-    body (D-optimality), where all other numbers are free as well. The BFGS method of optimistix
-    finds a minimum near the direction of `omega`: try several directions.
-
-    **Arguments:**
-
-    - `model`, `body`: a model with the planned recordings, and the expected body; several bodies as
-      a dict by name, as for `Model.start`.
-    - `omega`: (3,) rad/s, body frame. Its direction is the start of the search, and its length is
-      the length of the result: how fast the body can be thrown.
-    - `max_steps`: the largest number of steps of the search.
-
-    **Returns** the rate (3,), and the result of `expected_quantities` for this rate. **Raises** the
-    errors of `fisher`.
-    """
-    require_single(model)
-    max_steps = _checks.integer(max_steps, "max_steps", 1)
-    _require_not_traced(model, (body, omega))
-    _require_known_noise(model, model.start(body, omega))
-    start = _checks.array_of_shape(omega, (3,), "omega").astype(model.records.t.dtype)
-    size = jnp.sqrt(jnp.sum(start**2))
-    best = _best_direction(model, body, start / size, size, max_steps)
-    rate = size * best / jnp.sqrt(jnp.sum(best**2))
-    return rate, expected_quantities(model, model.start(body, rate))
-
-
-@eqx.filter_jit
-def _best_direction(
-    model: Model, body: PyTree, initial_direction: Array, rate_size: Array, max_steps: int
-) -> Vec3:
-    """Return the direction of the initial rate that determines the body best; its length is only
-    near 1.
-    """
-
-    def uncertainty(direction: Array, args: tuple[Model, PyTree, Array]) -> Scalar:
-        """Return ½ log det C / n for the covariance C of the body's n parameters, with a penalty
-        that keeps the length near 1.
-        """
-        model, body, size = args
-        length = jnp.sqrt(jnp.sum(direction**2))
-        information = fisher(model, model.start(body, size * direction / length))
-        n = model.index.bodies
-        # The information on the body, if the other parameters are free as well, is the Schur
-        # complement of their block in the information matrix.
-        mine, across, rest = information[:n, :n], information[:n, n:], information[n:, n:]
-        scale = jnp.sqrt(jnp.diagonal(rest))
-        rest = rest / (scale[:, None] * scale[None, :]) + 1e-12 * jnp.eye(rest.shape[0])
-        half = jnp.linalg.solve(rest, (across / scale[None, :]).T)
-        left = mine - (across / scale[None, :]) @ half
-        return -0.5 * jnp.linalg.slogdet(left)[1] / n + (length - 1.0) ** 2
-
-    minimise: Any = optx.minimise
-    out = minimise(
-        uncertainty,
-        optx.BFGS(rtol=1e-4, atol=1e-4),
-        initial_direction,
-        (model, body, rate_size),
-        options={"autodiff_mode": "fwd"},
-        max_steps=max_steps,
-        throw=False,
-    )
-    return out.value

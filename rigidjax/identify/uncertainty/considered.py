@@ -54,7 +54,7 @@ class Consideration(eqx.Module):
     >>> gyro = rj.identify.Gyro(0.01, tolerance=rj.identify.Tolerance(scale=0.01))
     >>> record = rj.identify.Recording(t, (gyro, rates))
     >>> result = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()), starts=1)
-    >>> [(part.kind, part.deviation, part.shifts.shape) for part in result.considered]
+    >>> [(part.kind, part.deviation, part.shifts.shape) for part in result.uncertainty.considered]
     [('scale', 0.01, (5, 3))]
     """
 

@@ -269,7 +269,6 @@ class Covariance(eqx.Module):
     covariance: Float[np.ndarray, "n n"]
     determined: Float[np.ndarray, "n n"]  # within the directions that the data determine
     kind: str  # the method, in words
-    singular_values: Float[np.ndarray, " n"]  # of the weighted Jacobian with columns of length one
     null_directions: Float[np.ndarray, "k n"]
     # The covariance for white errors; `None` if the motion is not finite, with NaN covariances.
     root: Root | None
@@ -285,7 +284,7 @@ def white_covariance(linear: Linearisation) -> Covariance:
     n, dense = linear.free_count, linear.weighted_jacobian
     if not (np.isfinite(dense).all() and np.isfinite(linear.extra_slopes).all()):
         lost, kind = np.full((n, n), np.nan), "none: the motion is not finite"
-        return Covariance(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)), None)
+        return Covariance(lost, lost, kind, np.zeros((0, n)), None)
     triangles, owner = np.linalg.qr(dense, mode="r"), _owners(linear)
     shared = np.flatnonzero(owner < 0)
     # Divide the columns of the Jacobian by their lengths (`size`), so that a bias in rad/s does not
@@ -307,7 +306,7 @@ def white_covariance(linear: Linearisation) -> Covariance:
     columns = np.broadcast_to(linear.places[all_shared][:, None, :], triangles[all_shared].shape)
     np.put_along_axis(wide, columns, triangles[all_shared], axis=2)
     rows = (wide[..., :-1] / size).reshape(-1, n)
-    rest, own, values, null = [ties, np.linalg.qr(rows[:, shared], mode="r")], [], [], []
+    rest, own, null = [ties, np.linalg.qr(rows[:, shared], mode="r")], [], []
     for record, (triangle, columns) in enumerate(zip(triangles, linear.places, strict=True)):
         if all_shared[record]:
             own.append(no_own)
@@ -317,15 +316,14 @@ def white_covariance(linear: Linearisation) -> Covariance:
         wide[:, columns], held[np.arange(mine.size), mine] = triangle, prior[mine]
         priors = np.concatenate([extra[of == record], held])
         rows = np.concatenate([wide[:, :-1] / size, priors])
-        range_, root, blind, singular = _range_and_null(rows[:, mine])
+        range_, root, blind = _range_and_null(rows[:, mine])
         taken = range_.T @ rows[:, shared]
         lift[mine] = -root @ taken
         rest.append(np.linalg.qr(rows[:, shared] - range_ @ taken, mode="r"))
         own.append(_Own(mine, root, np.concatenate([priors[:, mine], priors[:, shared]], axis=1)))
-        values.append(singular)
         null.append(np.zeros((len(blind), n)))
         null[-1][:, mine] = blind
-    _, core, blind, singular = _range_and_null(np.concatenate(rest))
+    _, core, blind = _range_and_null(np.concatenate(rest))
     null.append(blind @ lift.T)
     root = Root(size, lift, core, tuple(own), ties, np.linalg.qr(np.concatenate(null).T)[0].T)
     directions = root.null / size
@@ -335,7 +333,6 @@ def white_covariance(linear: Linearisation) -> Covariance:
         with_infinite_variance(directions, covariance),
         covariance,
         "Gauss–Newton",
-        np.concatenate([singular, *values]),
         directions,
         root,
     )
@@ -362,7 +359,6 @@ class _RangeAndNull(NamedTuple):
     range: Float[np.ndarray, "q r"]  # an orthonormal basis
     root: Float[np.ndarray, "k r"]  # of the inverse of `rowsᵀ rows`, within determined directions
     null: Float[np.ndarray, "j k"]
-    singular: Float[np.ndarray, " k"]
 
 
 def _range_and_null(rows: Float[np.ndarray, "q k"]) -> _RangeAndNull:
@@ -370,7 +366,7 @@ def _range_and_null(rows: Float[np.ndarray, "q k"]) -> _RangeAndNull:
     u, singular, directions = np.linalg.svd(rows, full_matrices=False)
     determined = singular > BLIND * singular.max(initial=1.0)
     root = directions[determined].T / singular[determined]
-    return _RangeAndNull(u[:, determined], root, directions[~determined], singular)
+    return _RangeAndNull(u[:, determined], root, directions[~determined])
 
 
 def robust_covariance(

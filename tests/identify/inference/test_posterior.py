@@ -43,8 +43,8 @@ def fitted():
     nothing, noises = jnp.zeros((0, 5)), (jnp.full((1, 3), 0.02),)
     return identify.Fit(
         BestPoint(model(), at, noises),
-        Uncertainty(covariance, covariance, "", jnp.ones(5), nothing),
-        Assessment(Answer("found"), Answer("explains the readings"), (), 0.0, 1, 1.0, 1.0),
+        Uncertainty(covariance, covariance, "", nothing),
+        Assessment(Answer("found"), Answer("explains the readings"), (), 0.0, 1, 1.0),
         (), (), linearise(model(), at, noises, error_jacobians(model(), at)),
     )  # fmt: skip
 
@@ -232,7 +232,7 @@ def test_a_noise_that_is_unknown_moves_no_other_number(fitted):
         covariance = 1e-4 * jnp.eye(8)
         found = changed(
             fitted, model=other, x=at, covariance=covariance, determined=covariance,
-            singular_values=jnp.ones(8), null_directions=jnp.zeros((0, 8)),
+            null_directions=jnp.zeros((0, 8)),
         )  # fmt: skip
         with_one = identify.LogDensity(found, rj.torques.RandomTorque(1e-4), deviation=None)
         values.append(float(with_one(with_one.x0)))
@@ -255,8 +255,7 @@ def test_the_gradient_with_a_process_is_right_recording_by_recording(fitted):
     covariance = 1e-4 * jnp.eye(size)
     found = changed(
         fitted, model=both, x=at, covariance=covariance, determined=covariance,
-        noises=(jnp.full((2, 3), 0.02),), singular_values=jnp.ones(size),
-        null_directions=jnp.zeros((0, size)),
+        noises=(jnp.full((2, 3), 0.02),), null_directions=jnp.zeros((0, size)),
     )  # fmt: skip
     density = identify.LogDensity(found, rj.torques.RandomTorque(1e-3))
     assert density.size == size + 2 + 1
@@ -296,8 +295,7 @@ def test_chains_of_many_recordings_are_those_of_their_keys_too(fitted):
     covariance = jnp.diag(jnp.linspace(1e-4, 1e-2, 26))
     found = changed(
         fitted, model=many, x=at, covariance=covariance, determined=covariance,
-        noises=(jnp.full((8, 3), 0.02),), singular_values=jnp.ones(26),
-        null_directions=jnp.zeros((0, 26)),
+        noises=(jnp.full((8, 3), 0.02),), null_directions=jnp.zeros((0, 26)),
     )  # fmt: skip
 
     def laplace(key, density, start):
@@ -374,7 +372,7 @@ def test_several_bodies_go_to_arviz_by_name(fitted):
     noises = (jnp.full((2, 3), 0.02),)
     found = changed(
         fitted, model=both, x=at, covariance=covariance, determined=covariance, noises=noises,
-        singular_values=jnp.ones(size), null_directions=jnp.zeros((0, size)),
+        null_directions=jnp.zeros((0, size)),
     )  # fmt: skip
     density = identify.LogDensity(found)
     x = density.x0[None, None] + 0.01 * jax.random.normal(jax.random.key(0), (2, 8, size))

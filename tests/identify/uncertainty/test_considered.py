@@ -69,7 +69,7 @@ def test_a_free_scale_has_the_tolerance_as_prior_and_is_not_considered_again():
     model = identify.Model(record, identify.PrincipalRatios(), free=[free])
     np.testing.assert_allclose(model.slots[0].prior, 0.5)
     found = identify.fit(model, starts=1)
-    assert found.considered == ()
+    assert found.uncertainty.considered == ()
     # Free motion does not show a common scale: the mean of the three is as uncertain as its prior.
     low, high = found.interval_of(lambda point: jnp.mean(point.values["scale"]))
     np.testing.assert_allclose((high - low) / 2 / 1.96, 0.01 / np.sqrt(3), rtol=0.05)
@@ -155,7 +155,7 @@ def test_an_entry_that_is_estimated_is_not_considered_once_more():
     ]
     model = identify.Model(record, identify.PrincipalRatios(), free=free)
     found = identify.fit(model, starts=1)
-    scale, skew = (np.abs(part.shifts).max(axis=0) > 0 for part in found.considered)
+    scale, skew = (np.abs(part.shifts).max(axis=0) > 0 for part in found.uncertainty.considered)
     np.testing.assert_array_equal(scale, [True, False, True])
     np.testing.assert_array_equal(skew, [False, True, True, True, True, True])
     assert all(slot.prior is not None for slot in model.slots)
