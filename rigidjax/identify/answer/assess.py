@@ -308,9 +308,8 @@ def assess(
         remarks = (*remarks, *stretch_remarks(stretches, model, numbers, white))
     remarks = (*remarks, *late_delays(model, x))
     considered_errors = considered.considerations(model, linear, noise, white.determined)
-    shifts = considered.shift_matrix(considered_errors, linear.free_count)
     if considered_errors:
-        added = shifts @ shifts.T
+        added = sum(part.shifts @ part.shifts.T for part in considered_errors)
         words = considered.describe(considered_errors, model.records.sensors)
         covariance = dataclasses.replace(
             covariance,

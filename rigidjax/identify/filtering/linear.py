@@ -35,14 +35,6 @@ class LinearEstimate(NamedTuple):
     kick_covariance: Float[Array, "steps m m"]
 
 
-class _Joint(NamedTuple):
-    """Hold the matrices of one forward step that the backward pass needs."""
-
-    predicted: Float[Array, "n n"]  # a root of the covariance of the predicted state
-    gain: Float[Array, "n n"]  # maps a change after the step to the change before it
-    rest: Float[Array, "n n"]  # a root of the covariance before, for a known state after the step
-
-
 def linear_smooth(
     moves: Moves, readings: LinearReadings, mean: Float[Array, " n"], root: Float[Array, "n n"]
 ) -> LinearEstimate:
@@ -64,36 +56,35 @@ def linear_smooth(
         whole = jnp.concatenate([upper, jnp.pad(root, ((0, 0), (0, m)))])
         whole = roots.triangular_root(jnp.pad(whole, ((0, 0), (0, max(0, n - m)))))
         before, cross = whole[:n, :n], whole[n:, :n]
-        joint = _Joint(before, roots.right_divide(cross, before), whole[n:, n:])
+        # The gain maps a change after the step to the change before it; `rest` is a root of the
+        # covariance before the step, for a known state after it.
+        gain, rest = roots.right_divide(cross, before), whole[n:, n:]
         update = update_by(later, predicted, before)
-        return (update.step, update.root), (update, predicted, joint)
+        return (update.step, update.root), (update, (mean, predicted, before, gain, rest))
 
     def step_back(after: tuple[Array, Array], row: tuple) -> tuple[Any, Any]:
-        joint, mean, predicted, noise = row
+        noise, (mean, predicted, before, gain, rest) = row
         off, m = after[0] - predicted, noise.shape[1]
         # The covariance of u is `I − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ` with the unit matrix I, `Z = L⁻¹
         # G`, the root L of the predicted covariance and the root S of the smoothed one.
-        both = roots.left_divide(
-            joint.predicted, jnp.concatenate([noise, off[:, None], after[1]], 1)
-        )
+        both = roots.left_divide(before, jnp.concatenate([noise, off[:, None], after[1]], 1))
         whitened = both[:, :m]
         left = jnp.eye(m, dtype=noise.dtype) - roots.matrix_product(whitened.T, whitened)
         known = roots.matrix_product(whitened.T, both[:, m + 1 :])
         kicks = jnp.sum(whitened * both[:, m : m + 1], 0)
         covariance = left + roots.matrix_product(known, known.T)
-        mean = mean + jnp.sum(joint.gain * off[None], 1)
-        out = mean, roots.predicted_root(joint.gain, after[1], joint.rest)
+        mean = mean + jnp.sum(gain * off[None], 1)
+        out = mean, roots.predicted_root(gain, after[1], rest)
         return out, (*out, kicks, covariance)
 
     first_row, later = (
         jax.tree.map(lambda leaf, at=at: leaf[at], readings) for at in (0, slice(1, None))
     )
     first = update_by(first_row, mean, root)
-    last, (rest, predicted, joint) = lax.scan(advance, (first.step, first.root), (moves, later))
+    last, (rest, steps) = lax.scan(advance, (first.step, first.root), (moves, later))
     updates = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
-    means, _, innovation, variance = updates
-    rows = joint, means[:-1], predicted, moves.noise
-    _, (*before, kicks, covariance) = lax.scan(step_back, last, rows, reverse=True)
+    _, _, innovation, variance = updates
+    _, (*before, kicks, covariance) = lax.scan(step_back, last, (moves.noise, steps), reverse=True)
     means, all_roots = (jnp.concatenate([a, b[None]]) for a, b in zip(before, last, strict=True))
     total = roots.density_terms(innovation, variance, readings.mask).total
     return LinearEstimate(means, all_roots, innovation, variance, total, kicks, covariance)

@@ -28,7 +28,6 @@ from rigidjax.identify.model.terms import (
     BodyIndex,
     bound_torque,
     error_jacobians,
-    map_rows,
     prior_residuals,
     scene_at,
     scene_errors,
@@ -79,15 +78,6 @@ def recording_terms(
     run = FilterInput(scene, model.walks, record, first, grid)
     _, _, read = scan_filter(run, lambda _, read: read)
     return jax.tree.map(jnp.ravel, roots.density_terms(*read))
-
-
-def log_posterior_density(model: Model, x: Float[Array, " n"]) -> Scalar:
-    """Return the logarithm of the posterior density at the parameters x, up to a constant.
-
-    Its derivatives are computed for one recording after another, in forward mode.
-    """
-    terms = map_rows(model.index.rows(x), model, recording_terms)
-    return terms.total - 0.5 * jnp.sum(prior_residuals(model, x) ** 2)
 
 
 class Curvature(NamedTuple):

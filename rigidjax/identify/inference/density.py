@@ -15,7 +15,7 @@ from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
-from rigidjax.identify.filtering.terms import log_posterior_density
+from rigidjax.identify.filtering.terms import recording_terms
 from rigidjax.identify.model.charts import body_places
 from rigidjax.identify.model.free import Slot
 from rigidjax.identify.model.index import build_index
@@ -28,7 +28,7 @@ from rigidjax.identify.model.model import (
     unpack_at,
 )
 from rigidjax.identify.model.scene import Process, Scene, require_unknown_torque
-from rigidjax.identify.model.terms import Noise, starting_scene
+from rigidjax.identify.model.terms import Noise, map_rows, prior_residuals, starting_scene
 from rigidjax.identify.uncertainty.covariance import white_covariance
 from rigidjax.motion.torques.composite import parts_of
 
@@ -148,7 +148,10 @@ class LogDensity(eqx.Module):
         return self.x0.size
 
     def __call__(self, x: Float[Array, " n"]) -> Scalar:
-        return log_posterior_density(self.model, _checks.array_of_shape(x, self.x0.shape, "x"))
+        # Derivatives are computed for one recording after another, in forward mode.
+        x = _checks.array_of_shape(x, self.x0.shape, "x")
+        terms = map_rows(self.model.index.rows(x), self.model, recording_terms)
+        return terms.total - 0.5 * jnp.sum(prior_residuals(self.model, x) ** 2)
 
     def unpack(self, x: Float[Array, " n"]) -> Unpacked:
         """Return the quantities that the argument x (n,) of this density represents, as an

@@ -4,7 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax.identify.model.model import Model, checked_x
@@ -44,7 +44,11 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
     >>> bool(expected_quantities(model, plan)[0].deviation < 1.0)
     True
     """
-    _require_not_traced(model, x)
+    if not _checks.is_known((model, x)):
+        raise TypeError(
+            "model, x: wanted known numbers, got traced ones; call it outside of jax.jit, jax.grad "
+            "and jax.vmap, or differentiate identify.fisher"
+        )
     _require_known_noise(model, x)
     near = flat_limit.thicken(model, x)
     information = np.asarray(_fisher(model, x if near is None else near))
@@ -96,11 +100,3 @@ def _require_known_noise(model: Model, x: Float[Array, " n"]) -> None:
             raise ValueError(
                 f"design: wanted a {type(sensor).__name__} with known noise, got noise=None"
             )
-
-
-def _require_not_traced(model: Model, motion: PyTree) -> None:
-    if not _checks.is_known((model, motion)):
-        raise TypeError(
-            "model, x, body, omega: wanted known numbers, got traced ones; call it outside of "
-            "jax.jit, jax.grad and jax.vmap, or differentiate identify.fisher"
-        )

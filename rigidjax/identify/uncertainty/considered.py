@@ -166,17 +166,6 @@ def slope_in_time(
     return np.where(inside[..., None], out, 0.0)
 
 
-def shift_matrix(
-    considered_errors: tuple[Consideration, ...], count: int
-) -> Float[np.ndarray, "n ways"]:
-    """Return the matrix S of all shifts, a column for each independent component: S Sᵀ is the
-    covariance that the considered errors add to a fit.
-    """
-    return np.concatenate(
-        [np.zeros((count, 0)), *(part.shifts for part in considered_errors)], axis=1
-    )
-
-
 def describe(
     considered_errors: tuple[Consideration, ...], sensors: Sequence[AbstractSensor]
 ) -> str:

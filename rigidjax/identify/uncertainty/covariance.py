@@ -204,8 +204,7 @@ class Root(eqx.Module):
     """Hold a root of the covariance of n parameters for white errors, recording by recording.
 
     A root of a matrix A is a matrix B with B Bᵀ = A. An own parameter of a recording is one on
-    which no other recording depends, and which no prior ties to another recording. All others, s
-    in number, are called shared.
+    which no other recording depends. All others, s in number, are called shared.
     """
 
     # Parameters are multiplied by their `size` here, so that derivatives are of order one.
@@ -339,19 +338,12 @@ def white_covariance(linear: Linearisation) -> Covariance:
 
 
 def _owners(linear: Linearisation) -> Int[np.ndarray, " n"]:
-    """Return for each parameter the only recording that depends on it.
-
-    The index is −1 for none or several, and where one prior ties parameters of several recordings.
-    """
+    """Return for each parameter the only recording that depends on it, −1 for none or several."""
     records, n = len(linear.places), linear.free_count
     owner, used = np.full(n + 1, -1), np.zeros((records, n + 1), bool)
     used[np.arange(records)[:, None], linear.places] = True
     alone = used.sum(axis=0) == 1
     owner[alone] = used.argmax(axis=0)[alone]
-    for row in linear.extra_slopes != 0:
-        tied = np.flatnonzero(row)
-        if np.unique(owner[tied][owner[tied] >= 0]).size > 1:
-            owner[tied] = -1
     return owner[:-1]
 
 
