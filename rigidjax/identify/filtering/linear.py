@@ -1,4 +1,4 @@
-"""Smooth a linear model with normal noise, in square-root form."""
+"""Compute the smoother of a linear model with normal noise, in square-root form."""
 
 from typing import Any, NamedTuple
 
