@@ -76,7 +76,7 @@ def _samples(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
     if isinstance(body.body, dict):
         words = "wanted one body, got a Fit of several: give fit.body[name]"
         raise ValueError(f"inertia_ellipsoid: {words}")
-    x = body.derivative_point
+    x = body.point.derivative_point
     values, vectors = np.linalg.eigh(np.asarray(body.determined_covariance))
     # The seed is fixed, so that the same fit always gives the same picture.
     steps = np.random.default_rng(0).standard_normal((samples, values.size))

@@ -183,7 +183,7 @@ def stand_in():
         residuals=(errors,),
         noise=(np.full(3, 0.01),),
         x=jnp.zeros(3),
-        derivative_point=jnp.zeros(3),
+        point=SimpleNamespace(derivative_point=jnp.zeros(3)),
         determined_covariance=0.01 * np.eye(3),
         body=shaped(jnp.zeros(3)),
     )
