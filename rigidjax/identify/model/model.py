@@ -38,6 +38,7 @@ from rigidjax.identify.model.charts import (
     has_mass,
     marked_body,
 )
+from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
 from rigidjax.identify.model.free import (
     Free,
     Slot,
@@ -57,13 +58,11 @@ from rigidjax.identify.model.scene import (
     require_unknown_torque,
 )
 from rigidjax.identify.model.terms import (
-    FirstOrder,
     all_errors,
     map_recordings,
     motion_in,
     scene_at,
     starting_scene,
-    value_and_jacfwd,
 )
 from rigidjax.identify.model.walks import Drift, Walk, find_drifts
 from rigidjax.identify.sensors import AbstractSensor

@@ -14,6 +14,7 @@ from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, input_functions
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.model.charts import Bodies, body_at
+from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
 from rigidjax.identify.model.free import with_steps
 from rigidjax.identify.model.predict import (
     HeldSteps,
@@ -40,14 +41,6 @@ BodyIndex = Array | None
 SensorErrors = tuple[Array | np.ndarray, ...]
 # `Noise` holds the standard deviations (R, k) of each sensor.
 Noise = tuple[Float[Array, "records _"], ...]
-
-
-class FirstOrder(NamedTuple):
-    """Hold the value of a function and its Jacobian, both arrays or pytrees of arrays."""
-
-    value: Any
-    # The parameters are the last axis of each array.
-    jacobian: Any
 
 
 # `Blocks` holds for each sensor the errors (R, T, k), and their Jacobian (R, T, k, m) with respect
@@ -250,17 +243,6 @@ def delay_slopes(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, ".
         return jax.jvp(lambda s: sensor_errors(model, row, *rest, delay=s), (now,), (now + 1,))[1]
 
     return map_recordings(derivative_of_recording, model, model.index.rows(x))
-
-
-def value_and_jacfwd(function: Callable[[Array], Any], x: Float[Array, " n"]) -> FirstOrder:
-    """Return the value of a `function` at x and its Jacobian, by forward mode."""
-
-    def value_and_aux(x: Array) -> tuple[PyTree, PyTree]:
-        value = function(x)
-        return value, value
-
-    jacobian, value = jax.jacfwd(value_and_aux, has_aux=True)(x)
-    return FirstOrder(value, jacobian)
 
 
 def whiten(model: "Model", errors: SensorErrors, noise: Noise) -> tuple[Float[Array, "..."], ...]:

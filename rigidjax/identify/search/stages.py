@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from rigidjax.identify.data.recording import Reading, numbers_read
 from rigidjax.identify.model import terms
 from rigidjax.identify.model.charts import chart_list, split_numbers
+from rigidjax.identify.model.first_order import value_and_jacfwd
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.normal import NormalMatrix, normal_matrix
 from rigidjax.identify.model.predict import FixedSteps, HeldSteps
@@ -134,7 +135,7 @@ def marquardt(
         slope = jnp.zeros(number + 1, kind).at[places].add(pulls)
         normal = normal_matrix(rows, places, number, alone).add_diagonal(prior**2)
         total, slope = total + jnp.sum((prior * x) ** 2), slope[:-1] + prior**2 * x
-        e, row = terms.value_and_jacfwd(lambda x: terms.joint_residuals(model, x), x)
+        e, row = value_and_jacfwd(lambda x: terms.joint_residuals(model, x), x)
         if e.size:
             total, slope = total + jnp.sum(e**2), slope + e @ row
             normal = normal.add_rows(row)

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from rigidjax.identify.model.first_order import value_and_jacfwd
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import (
     Blocks,
@@ -17,7 +18,6 @@ from rigidjax.identify.model.terms import (
     prior_weights,
     reading_weights,
     residual_jacobians,
-    value_and_jacfwd,
     whiten,
 )
 

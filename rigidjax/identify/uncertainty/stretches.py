@@ -13,6 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from rigidjax.identify.model.first_order import FirstOrder
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.uncertainty.covariance import (
     Covariance,
@@ -20,7 +21,7 @@ from rigidjax.identify.uncertainty.covariance import (
     covariance_root,
     with_infinite_variance,
 )
-from rigidjax.identify.uncertainty.quantities import Linear, labels
+from rigidjax.identify.uncertainty.quantities import labels
 
 # A quantity depends on one stretch of windows if this stretch causes more than the fraction HANGS
 # of the variance of the quantity. This is not tested if there are fewer than FEWEST stretches.
@@ -119,7 +120,7 @@ def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
 
 
 def stretch_remarks(
-    stretches: Stretches, model: Model, quantities: Linear, white: Covariance
+    stretches: Stretches, model: Model, quantities: FirstOrder, white: Covariance
 ) -> list[str]:
     """Return a remark on each quantity whose value or deviation depends on a single stretch."""
     count, names = len(stretches.steps), labels(model)
