@@ -9,7 +9,7 @@ from scipy import signal
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.data.stacking import pick
-from rigidjax.identify.model.terms import sensor_errors
+from rigidjax.identify.model.model import sensor_errors
 from rigidjax.identify.sensors import SensorInput
 
 BODY = rj.Inertia.from_principal(1.0, 2.0, 2.7)

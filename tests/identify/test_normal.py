@@ -8,7 +8,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.model.model import AbstractPull, replaced
+from rigidjax.identify.model.model import AbstractPull
 from rigidjax.identify.model.normal import NormalMatrix, OwnBlocks, normal_matrix
 from rigidjax.identify.search.stages import blocks_at
 from rigidjax.identify.uncertainty import covariance as uncertainty
@@ -208,7 +208,9 @@ class Joints(AbstractPull):
 
 
 def test_numbers_that_rows_tie_together_stay_in_the_core():
-    linear = linear_at(replaced(identify.Model(records(9), identify.Ratios()), pull=Joints()))
+    linear = linear_at(
+        dataclasses.replace(identify.Model(records(9), identify.Ratios()), pull=Joints())
+    )
     rows = jacobian(linear)
     wanted = np.linalg.pinv(rows) @ np.linalg.pinv(rows).T
     size = np.sqrt(np.diag(wanted))

@@ -13,7 +13,7 @@ from rigidjax.identify.answer.answers import FAILS, NOT_ENDED
 from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.data.full_scale import describe_full_scale
 from rigidjax.identify.data.reference_states import ReferenceStates
-from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, body_list
+from rigidjax.identify.model.charts import BASIS, COMPONENTS, Tensor, body_list
 from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
 from rigidjax.identify.model.model import Model, shortened
 from rigidjax.identify.search.stages import blocks_at
@@ -444,7 +444,7 @@ def _scale_is_free(point: BestPoint, uncertainty: Uncertainty) -> bool:
     by one factor; false for several bodies.
     """
     null = np.asarray(uncertainty.null_directions)
-    if not len(null) or isinstance(point.model.chart, Bodies):
+    if not len(null) or point.model.body_indices is not None:
         return False
     first = len(labels(point.model))
     values, slopes = _numbers_on_host(point)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.terms import Blocks, Noise, delay_slopes, reading_weights
+from rigidjax.identify.model.model import Model, delay_slopes
+from rigidjax.identify.model.terms import Blocks, Noise, reading_weights
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 from rigidjax.identify.uncertainty.degrees_of_freedom import effective_parameters
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax.identify.model.charts import AbstractBodyChart, Bodies, Ratios, body_list
+from rigidjax.identify.model.charts import AbstractBodyChart, Ratios, body_list
 from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
 from rigidjax.identify.model.model import Model, shortened, values_of
 from rigidjax.identify.uncertainty import flat_limit
@@ -127,8 +127,8 @@ def labels(model: Model) -> list[Label]:
 
 
 def reports_starts(model: Model) -> bool:
-    """Return whether a fit reports initial states, of which windows have too many."""
-    return model.clusters is None
+    """Return whether a fit reports initial states: those that are free and have no prior."""
+    return model.index.start.size > 0 and model.start_weight is None
 
 
 class NamedChart(NamedTuple):
@@ -138,10 +138,8 @@ class NamedChart(NamedTuple):
 
 def named_charts(model: Model) -> list[NamedChart]:
     """Return the chart of each body of a `model`."""
-    if not isinstance(model.chart, Bodies):
-        return [NamedChart("", model.chart)]
-    named = zip(model.chart.names, model.chart.charts, strict=True)
-    return [NamedChart(f" [{name}]", chart) for name, chart in named]
+    named = zip(dict.fromkeys(model.body_names), model.charts, strict=True)
+    return [NamedChart(f" [{name}]" if name else "", chart) for name, chart in named]
 
 
 def recording_suffixes(model: Model) -> list[str]:
