@@ -18,11 +18,11 @@ from rigidjax._names import define_dir_and_getattr
 from rigidjax.body import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify.answer.result import Fit, value_and_interval_of
+from rigidjax.identify.answer.table import Row
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.model.charts import PrincipalRatios
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.priors import SoftL1
-from rigidjax.identify.report import Row
 from rigidjax.identify.sensors import AttitudeSensor, Gyro
 from rigidjax.motion import Attitude
 from rigidjax.rotation import euler
@@ -89,7 +89,7 @@ def model() -> Model:
 
     The loss grows linearly with the size of an outlier, not quadratically.
 
-    >>> model().chart.log_names
+    >>> model().charts[0].log_names
     ('Ix/Iz', 'Iy/Iz')
     """
     return Model(recording(), PrincipalRatios(), loss=SoftL1())

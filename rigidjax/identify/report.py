@@ -5,140 +5,27 @@ import dataclasses
 import html
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidjax import _checks, _show
+from rigidjax import _show
 from rigidjax._names import define_dir_and_getattr
-from rigidjax.identify.answer.result import Fit, require_one_fit
-
-Row = tuple[str, float, float, float, str]
-
-
-def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
-    """Return all results of a fit as rows (name, value, low, high, unit), where low and high are
-    the ends of the 95 % interval.
-
-    **Arguments:**
-
-    - `fit`: a result of `rigidjax.identify.fit`.
-    - `rate_unit`: the unit of all angular rates, such as initial rates and biases of gyros:
-      `rad/s`, `deg/s` or `deg/day`.
-
-    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
-    >>> name, value, low, high, unit = rows(result)[0]
-    >>> name, round(value, 1), low < value < high
-    ('Ix/Iz', 3.1, True)
-    """
-    require_one_fit(fit)
-    bounds = fit.interval(0.95)
-    out: list[Row] = []
-    for quantity in fit.quantities:
-        low, high = bounds[quantity.name]
-        scale, unit = _show.shown_unit(quantity.unit, rate_unit)
-        name = quantity.name
-        if name.startswith("Ω"):
-            axis, *where = name.split(" ", 1)
-            name = " ".join([axis, "at the start", *where])
-        out.append((name, quantity.value * scale, low * scale, high * scale, unit))
-    return out
-
-
-def table(lines: list[Row]) -> str:
-    """Return `lines` as a table of text, with each number rounded by the width of its interval.
-
-    **Arguments:** `lines` one or more rows (name, value, low, high, unit), such as those that
-    `rows` returns.
-
-    >>> print(table([("I1", 1.23456, 1.2, 1.27, "kg m²")]))
-                 value  95 % interval
-    I1          1.2346  1.2000 … 1.2700 kg m²
-    """
-    for line in _checks.require_instance(
-        lines, (list, tuple), "lines", requirement="a list of rows"
-    ):
-        if not isinstance(line, tuple) or len(line) != 5:
-            raise TypeError(f"lines: wanted rows (name, value, low, high, unit), got {line!r}")
-    if not lines:
-        raise ValueError("lines: wanted at least one row, got none")
-    wide = max(len(name) for name, *_ in lines)
-    out = [f"{'':{wide}}  {'value':>14}  95 % interval"]
-    for name, value, low, high, unit in lines:
-        shown = numbers(value, low, high)
-        out.append(f"{name:{wide}}  {shown[0]:>14}  {_interval(shown)} {unit}".rstrip())
-    return "\n".join(out)
-
-
-def numbers(value: float, low: float, high: float) -> list[str]:
-    """Return three texts: `value`, `low` and `high`, rounded by the width of the interval.
-
-    **Arguments:** `value` the number; `low` and `high` the ends of the interval of this number, in
-    the same unit.
-
-    >>> numbers(1.23456, 1.2, 1.27)
-    ['1.2346', '1.2000', '1.2700']
-    """
-    value = _checks.python_float(value, "value")
-    low, high = _checks.python_float(low, "low"), _checks.python_float(high, "high")
-    wholes = [abs(number) for number in (value, low, high) if np.isfinite(number)]
-    size, gaps = max(wholes, default=0.0), (value - low, high - value)
-    fixed = size == 0 or 1e-3 <= size < 1e6
-    near = min((gap for gap in gaps if 0 < gap < np.inf), default=0.0)
-
-    def shown(number: float, gap: float) -> str:
-        if not np.isfinite(number):
-            return str(number)
-        top = _power_of_ten(size if fixed else number)
-        # The number is shown to two digits after the first digit of the uncertainty, or with six
-        # digits if there is no uncertainty.
-        last = _power_of_ten(2 * min(gap, 8e307)) - 2 if 0 < gap < np.inf else top - 5
-        last = min(max(last, top - 12), top - 2)
-        return f"{number:.{max(-last, 0)}f}" if fixed else f"{number:.{top - last}e}"
-
-    ends = (near, near, near) if fixed else (near, *gaps)
-    return [shown(number, gap) for number, gap in zip((value, low, high), ends, strict=True)]
-
-
-def _power_of_ten(number: float) -> int:
-    """Return the power of ten of the first digit of `number`, such as 2 for 345; 0 for zero."""
-    return int(np.floor(np.log10(abs(number)))) if number else 0
-
-
-def _interval(texts: list[str]) -> str:
-    """Return "low … high" of the texts (value, low, high), or "not determined" for NaN."""
-    return "not determined" if "nan" in texts[1:] else f"{texts[1]} … {texts[2]}"
-
-
-def verdict(fit: Fit) -> str:
-    """Return in words whether the search of a fit found the best point, whether the model explains
-    the readings, what to try, and what the data do not determine.
-
-    **Arguments:** `fit` a result of `rigidjax.identify.fit`.
-
-    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
-    >>> verdict(result).splitlines()[0]
-    'status: ok'
-    """
-    require_one_fit(fit)
-    good = [start for start in fit.starts if start.converged and start.fits]
-    lines = ["status: ok"] if fit.ok else [f"search: {fit.search}", f"model: {fit.explanation}"]
-    lines += [str(cause) for cause in fit.causes] + [fit.advice]
-    lines.append(
-        f"starts: {len(good)} of {len(fit.starts)} reached a motion that fits as well as the best"
-        + (", all the same one" if fit.ok and len(good) > 1 else "")
-    )
-    lines += [f"- {line}" for line in fit.identifiability]
-    lines += [fit.place] if fit.place else []
-    if fit.x.dtype == np.float32:
-        lines.append(
-            "A fit is better in float64: this one was computed in float32, with seven digits. "
-            "jax.config.update('jax_enable_x64', True) at the start of the program, before any "
-            "array is made, gives float64."
-        )
-    return "\n".join(lines)
+from rigidjax.identify.answer.result import (
+    Fit,
+    as_html as as_html,
+    require_one_fit,
+    rows as rows,
+    verdict as verdict,
+)
+from rigidjax.identify.answer.table import (
+    Row,
+    html_rows,
+    numbers as numbers,
+    table as table,
+)
 
 
 def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> dict[str, Any]:
@@ -284,7 +171,7 @@ def write_html(
     for name, axes, unit in _component_rms(fit):
         scale, shown = _show.shown_unit(unit, rate_unit)
         sizes.append((name, " ".join(f"{scale * x:.3g}" for x in axes), shown))
-    starts = _html_rows(
+    starts = html_rows(
         (
             str(number),
             f"{start.cost:.6g}",
@@ -311,45 +198,12 @@ img {{ max-width: 100%; margin: 1rem 0 }}
 <h1>{html.escape(title)}</h1>
 <p>{read}</p>
 {as_html(fit, rate_unit, more)}
-<table><tr><th>sensor</th><th>rms error an axis</th><th>unit</th></tr>{_html_rows(sizes)}</table>
+<table><tr><th>sensor</th><th>rms error an axis</th><th>unit</th></tr>{html_rows(sizes)}</table>
 <table><tr><th>start</th><th>misfit</th><th></th><th></th></tr>{starts}</table>
 {pictures}
 </html>
 """
     Path(path).write_text(page, encoding="utf-8", errors="backslashreplace")
-
-
-def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str:
-    """Return a fit as HTML, for a page or a notebook: its status, a table of its quantities, and
-    the verdict, which says in words whether the fit can be trusted, and what to try.
-
-    **Arguments:**
-
-    - `fit`: a result of `rigidjax.identify.fit`.
-    - `rate_unit`: the unit of all angular rates: `rad/s`, `deg/s` or `deg/day`.
-    - `more`: rows (name, value, low, high, unit) of further quantities.
-
-    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
-    >>> as_html(result).startswith("<p") and "Ix/Iz" in as_html(result)
-    True
-    """
-    lines = _html_rows(
-        (name, (shown := numbers(*three))[0], _interval(shown), unit)
-        for name, *three, unit in (*rows(fit, rate_unit), *more)
-    )
-    head, *words = verdict(fit).splitlines()
-    said = "".join(f"<li>{html.escape(line.removeprefix('- '))}</li>" for line in words)
-    colour = "#009E73" if fit.ok else "#D55E00"
-    return f"""<p style="color: {colour}; font-weight: 600">{html.escape(head)}</p>
-<table><tr><th></th><th>value</th><th>95 % interval</th><th>unit</th></tr>{lines}</table>
-<p>Covariance: {html.escape(fit.covariance_kind)}.</p>
-<ul>{said}</ul>"""
-
-
-def _html_rows(lines: Iterable[tuple[str, ...]]) -> str:
-    """Return lines of cells as rows (`tr`) of a table of HTML."""
-    cells = ("".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in lines)
-    return "".join(f"<tr>{line}</tr>" for line in cells)
 
 
 __all__ = [

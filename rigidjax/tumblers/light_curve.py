@@ -21,7 +21,6 @@ from rigidjax.identify.answer.fit import fit
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Reading
-from rigidjax.identify.model.charts import Bodies
 from rigidjax.identify.model.model import Model, require_single
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.identify.uncertainty import covariance as uncertainty
@@ -229,7 +228,7 @@ def _require_one_brightness(model: Model) -> Reading:
             f"fit_light_curve: wanted one recording, got {model.count}; fit the longest alone, "
             "then all of them with rigidjax.identify.fit, starting from the result"
         )
-    if isinstance(model.chart, Bodies):
+    if model.body_indices is not None:
         raise ValueError("fit_light_curve: wanted one body, got several by name")
     if model.torque is not None:
         raise ValueError("fit_light_curve: wanted a free body, got a model with a torque")

@@ -14,9 +14,9 @@ from rigidjax._types import Mat3, Quat, Vec3
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.free import leaf_at
-from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.model import Model, starting_scene
 from rigidjax.identify.model.normal import NormalMatrix
-from rigidjax.identify.model.terms import Noise, starting_scene
+from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.search.least_squares import CAREFUL, Settings, minimise
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.rotation import quaternion

@@ -65,13 +65,13 @@ def test_one_outlying_observation_does_not_move_the_result(found):
         (problem.recording.readings[1].sensor, problem.recording.readings[1].values),
     )
     moved = rj.identify.fit(
-        rj.identify.Model(recording, problem.chart, loss=problem.loss),
+        rj.identify.Model(recording, problem.charts[0], loss=problem.loss),
         starts=1,
         initial=found.x,
     )
-    middle = np.exp(np.asarray(found.model.chart.logs(found.body)))
-    shifted = np.exp(np.asarray(moved.model.chart.logs(moved.body)))
-    for name, a, b in zip(found.model.chart.log_names, middle, shifted, strict=True):
+    middle = np.exp(np.asarray(found.model.charts[0].logs(found.body)))
+    shifted = np.exp(np.asarray(moved.model.charts[0].logs(moved.body)))
+    for name, a, b in zip(found.model.charts[0].log_names, middle, shifted, strict=True):
         low, high = found.interval(0.95)[name]
         assert abs(a - b) < 0.25 * (high - low) / 2
 
@@ -82,7 +82,7 @@ def test_intervals_hold_the_truth_in_ninety_of_a_hundred_records(found):
     motion = problem.motion(found.x)
     attitude, gyro = (reading.sensor for reading in problem.recording.readings)
     truth = np.concatenate(
-        [np.exp(np.asarray(problem.chart.logs(found.body))), np.asarray(found.state0.omega)]
+        [np.exp(np.asarray(problem.charts[0].logs(found.body))), np.asarray(found.state0.omega)]
     )
     held, plain = np.zeros(5), 0
     for number in range(100):
@@ -93,7 +93,7 @@ def test_intervals_hold_the_truth_in_ninety_of_a_hundred_records(found):
         rates = motion.omega + np.radians(10.0) / 86400 * rng.normal(size=(17, 3))
         record = rj.identify.Recording(problem.recording.t, (attitude, read), (gyro, rates))
         again = rj.identify.fit(
-            rj.identify.Model(record, problem.chart, loss=problem.loss),
+            rj.identify.Model(record, problem.charts[0], loss=problem.loss),
             starts=16,
             key=jax.random.key(number),
         )

@@ -40,7 +40,7 @@ jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.model.terms import error_jacobians
+from rigidjax.identify.model.model import error_jacobians
 
 COUNT, STEP, SIGMA, WHEEL = 700, 1e-3, 0.02, 1.7e-6
 T = np.arange(COUNT) * STEP

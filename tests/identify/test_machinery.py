@@ -1,5 +1,6 @@
 """Several recordings, priors, comparison, design, checkpoints, reports."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -7,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -297,6 +299,17 @@ def test_a_damaged_checkpoint_is_told_in_words(short_record, tmp_path, kind):
     assert path.read_bytes() == before
 
 
+def test_a_model_is_a_value(short_record):
+    problem = identify.Model(short_record, identify.PrincipalRatios(), loss=identify.Huber())
+    plain = dataclasses.replace(problem, loss=None)
+    assert plain.loss is None and problem.loss is not None and plain.torque is None
+    other = identify.Model(short_record, identify.PrincipalRatios())
+    assert eqx.tree_equal(plain, other)
+    assert eqx.tree_equal(dataclasses.replace(plain, loss=problem.loss), problem)
+    with pytest.raises(TypeError, match="'torqe' is no argument of a Model"):
+        identify.Model(short_record, identify.PrincipalRatios(), torqe=None)
+
+
 def test_a_checkpoint_needs_its_folder_before_the_search_begins(short_record, tmp_path):
     problem = identify.Model(short_record, identify.PrincipalRatios())
     with pytest.raises(ValueError, match=r"there is no folder .*absent"):
@@ -378,7 +391,7 @@ def _asks_for(asked, wanted):
     """What was written is read: readings, wheel speeds, the model, what is free."""
     ((problem, how),) = asked
     assert how["starts"] == 1 and how["checkpoint"] is None
-    assert isinstance(problem.chart, identify.Tensor) and problem.chart.typical == 1.5
+    assert isinstance(problem.charts[0], identify.Tensor) and problem.charts[0].typical == 1.5
     assert {slot.name: slot.each for slot in problem.slots} == {"drag": False, "gyro bias": True}
     for found, given in zip(problem.recordings, wanted.recordings, strict=True):
         np.testing.assert_array_equal(found.t, given.t)

@@ -35,7 +35,7 @@ def linear_at(model, x, noise):
 
 def off(found):
     """Error of the two log ratios, the larger one."""
-    return np.abs(np.asarray(found.model.chart.logs(found.body)) - RATIOS).max()
+    return np.abs(np.asarray(found.model.charts[0].logs(found.body)) - RATIOS).max()
 
 
 def test_i1_only_ratios_from_free_motion_and_it_says_so():
@@ -113,7 +113,7 @@ def test_i3_no_start_is_called_right_that_is_wrong():
     for first in np.linspace(-2.0, 1.5, 41):
         # The first second moment, over the others, off by e to the power of `first`.
         second = BODY.second_moment.at[0, 0].multiply(jnp.exp(first))
-        body = problem.chart.vector(rj.Inertia.from_second_moment(second))
+        body = problem.charts[0].vector(rj.Inertia.from_second_moment(second))
         start = truth.at[: problem.index.bodies].set(body)
         found = identify.fit(problem, starts=1, initial=start)
         if found.ok:

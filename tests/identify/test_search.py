@@ -11,8 +11,8 @@ from jaxtyping import Array
 
 import rigidjax as rj
 from rigidjax import identify
+from rigidjax.identify.model.model import all_errors
 from rigidjax.identify.model.normal import NormalMatrix
-from rigidjax.identify.model.terms import all_errors
 from rigidjax.identify.search import least_squares, stages
 from rigidjax.identify.search.least_squares import LMState, Settings
 from rigidjax.identify.search.stages import (

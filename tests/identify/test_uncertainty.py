@@ -74,12 +74,13 @@ def test_the_sandwich_is_that_of_its_definition(toss):
 
 
 def test_what_an_information_does_not_show_is_not_made_up():
-    root, null = covariance_root(np.array([[2.0, 2.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 4.0]]))
+    rows = np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [0.0, 0.0, 2.0]])
+    root, null = covariance_root(rows)
     np.testing.assert_allclose((root @ root.T)[2], [0.0, 0.0, 0.25], atol=1e-15)
     np.testing.assert_allclose(np.abs(null), [[0.5**0.5, 0.5**0.5, 0.0]], atol=1e-12)
     units = np.array([1e-6, 1.0, 1e6])
     good = np.array([[2.0, 1.0, 0.0], [1.0, 2.0, 0.5], [0.0, 0.5, 4.0]])
-    root, null = covariance_root(good * np.outer(units, units))
+    root, null = covariance_root(np.linalg.cholesky(good).T * units)
     wanted = np.linalg.inv(good) / np.outer(units, units)
     np.testing.assert_allclose(root @ root.T, wanted, rtol=1e-12)
     assert null.shape == (0, 3)

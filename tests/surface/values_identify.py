@@ -622,8 +622,9 @@ leave_out(
     *(f"identify.Linearisation.{name}" for name in (
         "squared_residual_change", "covariance_by_recording", "first_times", "free_count",
         "information_by_sensor", "weighted_jacobian", "weighted_jacobians_by_sensor",
+        "weighted_residuals",
         "misfit_gradients_by_recording",
-        "misfit_gradient", "rows_for_all_numbers")),
+        "misfit_gradient")),
 )  # fmt: skip
 leave_out(
     "compared with the intervals of Student: tests/identify/test_freedom.py",

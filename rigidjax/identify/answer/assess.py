@@ -298,7 +298,7 @@ def assess(
     linear = uncertainty.linearise(model, x, noise, best.blocks, thickened)
     times = uncertainty.correlation_times(linear)
     white = uncertainty.white_covariance(linear)
-    stretches = leave_one_out(model, linear)
+    stretches = leave_one_out(model, white.root)
     numbers, charts = quantities_on_host(model, x, near), named_charts(model)
     hidden = np.zeros((0, linear.free_count))
     if stretches is None:
@@ -365,10 +365,10 @@ def assess(
         covariance.determined,
         np.concatenate([covariance.null_directions, hidden]),
         limits,
-        freedom.of_variance(numbers.slopes),
+        freedom.of_variance(numbers.jacobian),
     )
     words = describe_allowed(
-        model, linear, noise, white.determined, considered_errors, quantities, numbers.slopes
+        model, linear, noise, white.determined, considered_errors, quantities, numbers.jacobian
     )
     words = f"{words} {describe_large_biases(model, quantities)}".rstrip()
     if not np.isfinite(best_cost):

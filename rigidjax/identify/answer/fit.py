@@ -19,9 +19,8 @@ from rigidjax.identify.answer.assess import assess
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.reference_states import rates, require_turning
-from rigidjax.identify.model.model import Model, checked_x
+from rigidjax.identify.model.model import Model, all_errors, checked_x
 from rigidjax.identify.model.predict import AbstractIntegrator, Adaptive
-from rigidjax.identify.model.terms import all_errors
 from rigidjax.identify.search.checkpoint import (
     Checkpoint,
     fingerprint,

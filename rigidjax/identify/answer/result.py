@@ -1,7 +1,8 @@
 """Hold the result of a fit: the best point, its uncertainty, and the end of each start."""
 
 import dataclasses
-from collections.abc import Callable
+import html
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -10,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax.identify.answer import answers, undetermined
 from rigidjax.identify.answer.answers import Answer, Cause
 from rigidjax.identify.answer.causes import causes
 from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
+from rigidjax.identify.answer.table import Row, html_rows, interval_text, numbers, table
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
 from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jacobian
 from rigidjax.identify.model.terms import Noise
@@ -190,17 +192,13 @@ class Fit(eqx.Module):
         )
 
     def __str__(self) -> str:
-        from rigidjax.identify import report
-
-        return f"{report.table(report.rows(self))}\n\n{report.verdict(self)}"
+        return f"{table(rows(self))}\n\n{verdict(self)}"
 
     def _repr_html_(self) -> str:
         """Return HTML that a notebook shows for this fit: the status, a table of the quantities,
         and the verdict, which says in words whether the fit can be trusted, and what to try.
         """
-        from rigidjax.identify import report
-
-        return report.as_html(self)
+        return as_html(self)
 
     @property
     def body(self) -> Any:
@@ -383,3 +381,88 @@ def require_one_fit(fit: PyTree, name: str = "fit") -> Fit:
             f"{np.shape(fit.chi2)}; give its fits one by one"
         )
     return fit
+
+
+def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
+    """Return all results of a fit as rows (name, value, low, high, unit), where low and high are
+    the ends of the 95 % interval.
+
+    **Arguments:**
+
+    - `fit`: a result of `rigidjax.identify.fit`.
+    - `rate_unit`: the unit of all angular rates, such as initial rates and biases of gyros:
+      `rad/s`, `deg/s` or `deg/day`.
+
+    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> name, value, low, high, unit = rows(result)[0]
+    >>> name, round(value, 1), low < value < high
+    ('Ix/Iz', 3.1, True)
+    """
+    require_one_fit(fit)
+    bounds = fit.interval(0.95)
+    out: list[Row] = []
+    for quantity in fit.quantities:
+        low, high = bounds[quantity.name]
+        scale, unit = _show.shown_unit(quantity.unit, rate_unit)
+        name = quantity.name
+        if name.startswith("Ω"):
+            axis, *where = name.split(" ", 1)
+            name = " ".join([axis, "at the start", *where])
+        out.append((name, quantity.value * scale, low * scale, high * scale, unit))
+    return out
+
+
+def verdict(fit: Fit) -> str:
+    """Return in words whether the search of a fit found the best point, whether the model explains
+    the readings, what to try, and what the data do not determine.
+
+    **Arguments:** `fit` a result of `rigidjax.identify.fit`.
+
+    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> verdict(result).splitlines()[0]
+    'status: ok'
+    """
+    require_one_fit(fit)
+    good = [start for start in fit.starts if start.converged and start.fits]
+    lines = ["status: ok"] if fit.ok else [f"search: {fit.search}", f"model: {fit.explanation}"]
+    lines += [str(cause) for cause in fit.causes] + [fit.advice]
+    lines.append(
+        f"starts: {len(good)} of {len(fit.starts)} reached a motion that fits as well as the best"
+        + (", all the same one" if fit.ok and len(good) > 1 else "")
+    )
+    lines += [f"- {line}" for line in fit.identifiability]
+    lines += [fit.place] if fit.place else []
+    if fit.x.dtype == np.float32:
+        lines.append(
+            "A fit is better in float64: this one was computed in float32, with seven digits. "
+            "jax.config.update('jax_enable_x64', True) at the start of the program, before any "
+            "array is made, gives float64."
+        )
+    return "\n".join(lines)
+
+
+def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str:
+    """Return a fit as HTML, for a page or a notebook: its status, a table of its quantities, and
+    the verdict, which says in words whether the fit can be trusted, and what to try.
+
+    **Arguments:**
+
+    - `fit`: a result of `rigidjax.identify.fit`.
+    - `rate_unit`: the unit of all angular rates: `rad/s`, `deg/s` or `deg/day`.
+    - `more`: rows (name, value, low, high, unit) of further quantities.
+
+    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> as_html(result).startswith("<p") and "Ix/Iz" in as_html(result)
+    True
+    """
+    lines = html_rows(
+        (name, (shown := numbers(*three))[0], interval_text(shown), unit)
+        for name, *three, unit in (*rows(fit, rate_unit), *more)
+    )
+    head, *words = verdict(fit).splitlines()
+    said = "".join(f"<li>{html.escape(line.removeprefix('- '))}</li>" for line in words)
+    colour = "#009E73" if fit.ok else "#D55E00"
+    return f"""<p style="color: {colour}; font-weight: 600">{html.escape(head)}</p>
+<table><tr><th></th><th>value</th><th>95 % interval</th><th>unit</th></tr>{lines}</table>
+<p>Covariance: {html.escape(fit.covariance_kind)}.</p>
+<ul>{said}</ul>"""

@@ -13,16 +13,15 @@ from rigidjax.identify.answer.answers import FAILS, NOT_ENDED
 from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.data.full_scale import describe_full_scale
 from rigidjax.identify.data.reference_states import ReferenceStates
-from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, body_list
+from rigidjax.identify.model.charts import BASIS, COMPONENTS, Tensor, body_list
+from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
 from rigidjax.identify.model.model import Model, shortened
-from rigidjax.identify.model.terms import value_and_jacfwd
 from rigidjax.identify.search.stages import blocks_at
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 from rigidjax.identify.uncertainty.flat_limit import bodies_at
 from rigidjax.identify.uncertainty.quantities import (
     Label,
-    Linear,
     Quantity,
     labels,
     log_deviation,
@@ -251,13 +250,13 @@ def _labels(model: Model) -> list[Label]:
     return out
 
 
-def _numbers_on_host(point: BestPoint) -> Linear:
+def _numbers_on_host(point: BestPoint) -> FirstOrder:
     """Return all numbers that a report may name, in the order of `_labels`."""
-    return Linear(*map(np.asarray, _numbers(shortened(point.model), point.derivative_point)))
+    return FirstOrder(*map(np.asarray, _numbers(shortened(point.model), point.derivative_point)))
 
 
 @eqx.filter_jit
-def _numbers(model: Model, point: Float[Array, " n"]) -> Linear:
+def _numbers(model: Model, point: Float[Array, " n"]) -> FirstOrder:
     """Return all numbers that a report may name.
 
     An initial attitude is a turn from that at `point`; an initial position or velocity is the
@@ -284,7 +283,7 @@ def _numbers(model: Model, point: Float[Array, " n"]) -> Linear:
             numbers += initial_states(x)
         return jnp.concatenate([part.reshape(-1) for part in numbers])
 
-    return Linear(*value_and_jacfwd(value, point))
+    return value_and_jacfwd(value, point)
 
 
 def _mask(
@@ -420,7 +419,7 @@ def _scale_is_free(point: BestPoint, uncertainty: Uncertainty) -> bool:
     by one factor; false for several bodies.
     """
     null = np.asarray(uncertainty.null_directions)
-    if not len(null) or isinstance(point.model.chart, Bodies):
+    if not len(null) or point.model.body_indices is not None:
         return False
     first = len(labels(point.model))
     values, slopes = _numbers_on_host(point)

@@ -25,9 +25,8 @@ from rigidjax.identify.filtering.steps import (
     correlated_torques,
     dynamics_of,
 )
-from rigidjax.identify.model.model import Model, checked_x, require_single
+from rigidjax.identify.model.model import Model, bound_torque, checked_x, require_single, scene_at
 from rigidjax.identify.model.scene import Process, Scene
-from rigidjax.identify.model.terms import bound_torque, scene_at
 from rigidjax.identify.model.walks import Drift, broadcast_to, drifting_values
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import project_to_group

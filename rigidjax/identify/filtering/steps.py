@@ -18,8 +18,8 @@ from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.filtering import roots
+from rigidjax.identify.model.build import TURN_OF_A_FILTER_STEP
 from rigidjax.identify.model.free import with_leaves
-from rigidjax.identify.model.model import TURN_OF_A_FILTER_STEP
 from rigidjax.identify.model.predict import needed_body, shifted
 from rigidjax.identify.model.scene import (
     Process,

@@ -22,18 +22,17 @@ from rigidjax.identify.filtering.filter import (
 )
 from rigidjax.identify.filtering.roots import LogDensityTerms
 from rigidjax.identify.filtering.steps import require_sensors
-from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.normal import normal_matrix
-from rigidjax.identify.model.terms import (
+from rigidjax.identify.model.first_order import value_and_jacfwd
+from rigidjax.identify.model.model import (
     BodyIndex,
+    Model,
     bound_torque,
     error_jacobians,
-    prior_residuals,
     scene_at,
     scene_errors,
-    standardise,
-    value_and_jacfwd,
 )
+from rigidjax.identify.model.normal import normal_matrix
+from rigidjax.identify.model.terms import prior_residuals, standardise
 from rigidjax.identify.sensors.base import extras
 from rigidjax.motion.manifold import dimension
 

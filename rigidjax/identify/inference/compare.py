@@ -17,10 +17,9 @@ from rigidjax.identify.data.recording import Recording, numbers_read
 from rigidjax.identify.model.charts import Known, body_places
 from rigidjax.identify.model.free import with_steps
 from rigidjax.identify.model.index import build_index
-from rigidjax.identify.model.model import Model, replaced
+from rigidjax.identify.model.model import Model, starting_scene
 from rigidjax.identify.model.terms import (
     decorrelate,
-    starting_scene,
     whiten,
 )
 from rigidjax.identify.search.stages import blocks_at
@@ -166,11 +165,11 @@ def _with_shared_fixed(model: Model, fit_of_others: Fit) -> Model:
         for slot in model.slots
         if slot.own is not None
     ]
-    chart = Known(fit_of_others.body)
+    charts = (Known(fit_of_others.body),)
     kinds = model.index.start.shape[1] // 3
-    index, slots = build_index(body_places(chart, None, model.count), chart.size, own, kinds)
+    index, slots = build_index(body_places(charts, None, model.count), own, kinds)
     records = eqx.tree_at(
         lambda r: [reading.sensor for reading in r.readings], model.records, list(sensors)
     )
-    parts = dict(chart=chart, torque=scene.torque, records=records, slots=slots, index=index)
-    return replaced(model, **parts)
+    parts = dict(charts=charts, torque=scene.torque, records=records, slots=slots, index=index)
+    return dataclasses.replace(model, **parts)

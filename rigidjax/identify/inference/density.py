@@ -16,19 +16,20 @@ from rigidjax._types import Scalar
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.filtering.terms import recording_terms
+from rigidjax.identify.model.build import interval_steps
 from rigidjax.identify.model.charts import body_places
 from rigidjax.identify.model.free import Slot
 from rigidjax.identify.model.index import build_index
 from rigidjax.identify.model.model import (
     Model,
     Unpacked,
-    interval_steps,
-    replaced,
+    map_rows,
     scenes_of,
+    starting_scene,
     unpack_at,
 )
 from rigidjax.identify.model.scene import Process, Scene, require_unknown_torque
-from rigidjax.identify.model.terms import Noise, map_rows, prior_residuals, starting_scene
+from rigidjax.identify.model.terms import Noise, prior_residuals
 from rigidjax.identify.uncertainty.covariance import white_covariance
 from rigidjax.motion.torques.composite import parts_of
 
@@ -250,10 +251,10 @@ def _extended(model: Model, noises: Noise, process: Process | None, slots: list[
 
     They come before the parameters of one recording alone, which get other indices.
     """
-    bodies = body_places(model.chart, model.body_indices, model.count)
+    bodies = body_places(model.charts, model.body_indices, model.count)
     kinds = model.index.start.shape[1] // 3
     every = [*model.slots, *slots]
-    index, placed = build_index(bodies, model.index.bodies, every, kinds)
+    index, placed = build_index(bodies, every, kinds)
     places = np.arange(model.size)
     places[np.asarray(model.index.start)] = np.asarray(index.start)
     for old, new in zip(model.slots, placed, strict=False):
@@ -266,8 +267,8 @@ def _extended(model: Model, noises: Noise, process: Process | None, slots: list[
         list(noises),
         is_leaf=lambda node: node is None,
     )
-    steps = model.filter_steps if process is None else interval_steps(model)
-    new_model = replaced(
+    steps = model.filter_steps if process is None else interval_steps(records, model.reference)
+    new_model = dataclasses.replace(
         model, records=records, process=process, slots=placed, index=index, filter_steps=steps
     )
     return _Extended(new_model, places)

@@ -7,16 +7,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax.identify.model.model import Model, checked_x
-from rigidjax.identify.model.normal import normal_matrix
-from rigidjax.identify.model.terms import (
+from rigidjax.identify.model.model import (
+    Model,
+    checked_x,
     delay_slopes,
     error_jacobians,
-    scaled_slopes,
 )
+from rigidjax.identify.model.normal import normal_matrix
+from rigidjax.identify.model.terms import scaled_slopes
 from rigidjax.identify.sensors.base import extras
 from rigidjax.identify.uncertainty import flat_limit
-from rigidjax.identify.uncertainty.covariance import covariance_root
+from rigidjax.identify.uncertainty.covariance import Linearisation, white_covariance
 from rigidjax.identify.uncertainty.quantities import (
     Quantity,
     quantities_on_host,
@@ -51,14 +52,23 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
         )
     _require_known_noise(model, x)
     near = flat_limit.thicken(model, x)
-    information = np.asarray(_fisher(model, x if near is None else near))
-    if not np.isfinite(information).all():
+    rows = tuple(map(np.asarray, _rows(model, x if near is None else near)))
+    if not all(np.isfinite(block).all() for block in rows):
         raise ValueError(
             "expected_quantities: wanted a finite Fisher information, got NaN or infinity; the "
             "recordings of model hold NaN, or the motion of x overflows"
         )
-    half, null = covariance_root(information)
-    return reported_quantities(model, quantities_on_host(model, x, near), half @ half.T, null)
+    # The readings are planned: their residuals are zero, and priors do not count.
+    zeros, none = tuple(block[..., 0] * 0.0 for block in rows), np.zeros(model.size)
+    weights = tuple(np.ones(block.shape[:2]) for block in rows)
+    mask = tuple(np.ones(block.shape, bool) for block in zeros)
+    places, extra = np.asarray(model.index.places), np.zeros((0, model.size))
+    linear = Linearisation(
+        zeros, rows, zeros, rows, weights, mask, places, none, none, extra[:, 0], extra
+    )
+    white = white_covariance(linear)
+    numbers = quantities_on_host(model, x, near)
+    return reported_quantities(model, numbers, white.determined, white.null_directions)
 
 
 def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
@@ -80,6 +90,12 @@ def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
 
 @eqx.filter_jit
 def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+    return normal_matrix(_rows(model, x), model.index.places, model.size).core
+
+
+@eqx.filter_jit
+def _rows(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "records times k m"], ...]:
+    """Return the derivatives of the readings of each sensor, in standard deviations."""
     sensors = model.records.sensors
     noises: list[Any] = [sensor.noise for sensor in sensors]
     _, slopes = error_jacobians(model, x)
@@ -89,7 +105,7 @@ def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
         if jitter is not None:
             late = jitter[:, None, None] * delay_slopes(model, x)[index]
         rows.append(scaled_slopes(block, noise, late))
-    return normal_matrix(rows, model.index.places, model.size).core
+    return tuple(rows)
 
 
 def _require_known_noise(model: Model, x: Float[Array, " n"]) -> None:

@@ -22,9 +22,9 @@ from rigidjax._types import Scalar
 from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.filtering.terms import curvature
 from rigidjax.identify.inference.density import LogDensity, map_draws
+from rigidjax.identify.model.first_order import value_and_jacfwd
 from rigidjax.identify.model.model import Unpacked
 from rigidjax.identify.model.normal import NormalMatrix
-from rigidjax.identify.model.terms import value_and_jacfwd
 from rigidjax.identify.search.least_squares import Settings, minimise
 from rigidjax.identify.search.stages import of_order_one
 from rigidjax.identify.uncertainty.quantities import interval_about

@@ -3,6 +3,8 @@
 The horizon is the number of steps from the measured start of a window to the predicted state.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -16,10 +18,10 @@ from rigidjax.identify.data.windows import (
     require_windows,
     window_starts,
 )
+from rigidjax.identify.model.build import require_inputs
 from rigidjax.identify.model.charts import body_places
 from rigidjax.identify.model.index import build_index
-from rigidjax.identify.model.model import replaced, require_inputs
-from rigidjax.identify.model.terms import all_errors
+from rigidjax.identify.model.model import all_errors
 
 
 def predict_windows(fit: Fit, windows: Windows) -> Horizons:
@@ -63,8 +65,8 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
     require_inputs(model.torque, windows)
     # The states at the starts are known, so that the parameters are those that all windows share.
     reference, _, clusters = window_starts(windows, 1)
-    bodies = body_places(model.chart, None, windows.count)
-    index, slots = build_index(bodies, model.index.bodies, model.slots, 0)
+    bodies = body_places(model.charts, None, windows.count)
+    index, slots = build_index(bodies, model.slots, 0)
     parts = dict(
         records=windows.records(),
         counts=np.full(windows.count, windows.length + 1, np.int32),
@@ -76,7 +78,7 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
         clusters=clusters,
         noise_groups=jnp.zeros(windows.count, jnp.int32),
     )
-    errors = _errors(replaced(model, **parts), fit.x[: index.size])[0]
+    errors = _errors(dataclasses.replace(model, **parts), fit.x[: index.size])[0]
     return by_horizon(windows.starts, errors[:, 1:])
 
 

@@ -1,7 +1,7 @@
 """Map unconstrained numbers to physically possible bodies by charts, for a fit."""
 
 import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -376,75 +376,6 @@ def _pad_with_zeros(
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(leading, trailing)])
 
 
-class Bodies(eqx.Module):
-    """Hold the charts of several bodies; a vector holds the parameters of one body after the other.
-
-    Charts are of one kind if they have the same structure and their arrays the same shapes. All
-    charts of one kind are stacked in one chart, so that one program serves the recordings of all
-    bodies.
-    """
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    charts: tuple[AbstractBodyChart, ...]
-    # The stacked charts, one for each kind.
-    kinds: tuple[AbstractBodyChart, ...]
-    # For each body the index of its kind, and of its chart in the stacked chart.
-    kind_of: tuple[int, ...] = eqx.field(static=True)
-    row_of: tuple[int, ...] = eqx.field(static=True)
-
-    def __init__(self, charts: Mapping[str, AbstractBodyChart]):
-        self.names, self.charts = tuple(charts), tuple(charts.values())
-        members: dict[Any, list[AbstractBodyChart]] = {}
-        kind_of, row_of = [], []
-        for chart in self.charts:
-            leaves, structure = jax.tree.flatten(chart)
-            form = structure, tuple(np.shape(leaf) for leaf in leaves)
-            alike = members.setdefault(form, [])
-            kind_of.append(list(members).index(form))
-            row_of.append(len(alike))
-            alike.append(chart)
-        self.kind_of, self.row_of = tuple(kind_of), tuple(row_of)
-        self.kinds = tuple(
-            jax.tree.map(lambda *x: jnp.stack(x), *alike) for alike in members.values()
-        )
-        if len({has_mass(chart) for chart in self.charts}) > 1:
-            raise ValueError(
-                "body: wanted a mass for all bodies or for none, got "
-                + ", ".join(f"{n}: {type(c).__name__}" for n, c in charts.items())
-            )
-
-    @property
-    def size(self) -> int:
-        return sum(chart.size for chart in self.charts)
-
-    def by_name(self, vector: Float[Array, " numbers"]) -> dict[str, Inertia | MassProperties]:
-        """Return all bodies by name, from the parameters of all of them."""
-        rows = zip(self.names, self.charts, split_numbers(self, vector), strict=True)
-        return {name: marked_body(chart, numbers) for name, chart, numbers in rows}
-
-    def body(self, vector: Numbers, body_index: Int[Array, ""]) -> Inertia | MassProperties:
-        """Return one of the bodies, whose index in `names` may be traced.
-
-        Its parameters in `vector` may be followed by others, which are not read.
-        """
-        kind, row = jnp.asarray(self.kind_of)[body_index], jnp.asarray(self.row_of)[body_index]
-        chosen: Any = None
-        for index, alike in enumerate(self.kinds):
-            here = jnp.where(kind == index, row, 0)
-            chart = jax.tree.map(lambda leaf, at=here: leaf[at], alike)
-            body = chart.body(vector[: chart.size])
-            leaves, form = jax.tree.flatten(body)
-            if chosen is not None:
-                # The chart of each kind makes a body, and the body of the right kind is chosen. The
-                # choice is made array by array, since a choice between whole JAX trees needs trees
-                # of one structure: the body of a `Known` chart may have another `scale`, a static
-                # member, than the other bodies.
-                both = zip(leaves, jax.tree.leaves(chosen), strict=True)
-                body = jax.tree.unflatten(form, [jnp.where(kind == index, *pair) for pair in both])
-            chosen = body
-        return chosen
-
-
 def marked_body(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
     """Return the body that `vector` represents, marked `scale="arbitrary"` if the chart finds no
     scale.
@@ -457,44 +388,63 @@ def marked_body(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProp
     return Inertia(body.tensor, chart.scale)
 
 
+Charts = tuple[AbstractBodyChart, ...]
+
+
 def body_places(
-    chart: AbstractBodyChart | Bodies,
-    body_indices: Int[Array, " records"] | None,
-    recording_count: int,
+    charts: Charts, body_indices: Int[Array, " records"] | None, recording_count: int
 ) -> Int[np.ndarray, "records numbers"]:
     """Return the places of the parameters of each recording's body among those of all bodies.
 
     The row of a body with fewer parameters than another is filled up with −1.
     """
-    if not isinstance(chart, Bodies):
-        return np.broadcast_to(np.arange(chart.size), (recording_count, chart.size))
-    widest = max(one.size for one in chart.charts)
-    parts = split_numbers(chart, np.arange(chart.size))
+    widest, size = max(one.size for one in charts), sum(one.size for one in charts)
+    parts = split_numbers(charts, np.arange(size))
     rows = [np.pad(part, (0, widest - part.size), constant_values=-1) for part in parts]
+    if body_indices is None:
+        return np.broadcast_to(rows[0], (recording_count, widest))
     return np.stack(rows)[np.asarray(body_indices)]
 
 
 def body_at(
-    chart: AbstractBodyChart | Bodies, vector: Numbers, body_index: Int[Array, ""] | None
+    charts: Charts, vector: Numbers, body_index: Int[Array, ""] | None
 ) -> Inertia | MassProperties:
     """Return the body of one recording from its row, in which the parameters of the body come
     first.
+
+    The index of the body among several, which may be traced, is `None` for a single body.
     """
-    if not isinstance(chart, Bodies):
-        return chart.body(vector[: chart.size])
-    assert body_index is not None
-    return chart.body(vector, body_index)
+    if body_index is None:
+        return charts[0].body(vector[: charts[0].size])
+    # Charts are of one kind if they have the same structure and their arrays the same shapes. All
+    # charts of one kind are stacked in one chart, so that one program serves all bodies.
+    kinds: dict[Any, list[int]] = {}
+    for index, chart in enumerate(charts):
+        leaves, structure = jax.tree.flatten(chart)
+        kinds.setdefault((structure, tuple(map(jnp.shape, leaves))), []).append(index)
+    chosen: Any = None
+    for members in kinds.values():
+        here = jnp.asarray(members, jnp.int32) == body_index
+        row, right = jnp.argmax(here), jnp.any(here)
+        alike = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(charts[i] for i in members))
+        chart = jax.tree.map(lambda leaf, at=row: leaf[at], alike)
+        body = chart.body(vector[: chart.size])
+        leaves, form = jax.tree.flatten(body)
+        if chosen is not None:
+            # The chart of each kind makes a body, and the body of the right kind is chosen. The
+            # choice is made array by array, since a choice between whole JAX trees needs trees of
+            # one structure: the body of a `Known` chart may have another `scale`, a static member,
+            # than the other bodies.
+            both = zip(leaves, jax.tree.leaves(chosen), strict=True)
+            body = jax.tree.unflatten(form, [jnp.where(right, *pair) for pair in both])
+        chosen = body
+    return chosen
 
 
-def chart_list(chart: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...]:
-    """Return the charts of all bodies."""
-    return chart.charts if isinstance(chart, Bodies) else (chart,)
-
-
-def split_numbers(chart: AbstractBodyChart | Bodies, vector: Array | np.ndarray) -> list[Any]:
+def split_numbers(charts: Charts, vector: Array | np.ndarray) -> list[Any]:
     """Return the parts of `vector` that describe each body."""
-    sizes = [one.size for one in chart_list(chart)]
-    return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
+    ends = np.cumsum([chart.size for chart in charts])
+    return [vector[end - chart.size : end] for chart, end in zip(charts, ends, strict=True)]
 
 
 def body_list(bodies: Inertia | MassProperties | dict[str, Any]) -> list[Any]:

@@ -59,7 +59,6 @@ class Placed(NamedTuple):
 
 def build_index(
     body_places: Int[np.ndarray, "records k"],
-    body_number_count: int,
     slots: Sequence[Slot],
     vectors_in_state: int,
 ) -> Placed:
@@ -68,7 +67,8 @@ def build_index(
     `body_places` is −1 where a body has fewer than k parameters. `vectors_in_state` is the number
     of three-vectors in an initial state, such as 2 for attitude and rate.
     """
-    count, end = len(body_places), body_number_count
+    count, body_number_count = len(body_places), int(body_places.max(initial=-1)) + 1
+    end = body_number_count
 
     def take_places(*shape: int) -> np.ndarray:
         nonlocal end

@@ -1,5 +1,8 @@
 """Solve normal equations after elimination of the numbers that only one recording has (Schur
 complement).
+
+A search solves them at each step by Cholesky, the cheapest way within a compiled program, and its
+damping keeps them positive definite. Where ranks are decided, `uncertainty.covariance` takes QR.
 """
 
 from collections.abc import Sequence

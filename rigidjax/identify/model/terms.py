@@ -1,40 +1,17 @@
-"""Compute the errors of all readings, and their derivatives recording by recording."""
+"""Compute the residuals of readings and priors, in standard deviations."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from rigidjax.identify.data import stacking
-from rigidjax.identify.data.recording import Recording, input_functions
-from rigidjax.identify.data.reference_states import ReferenceStates
-from rigidjax.identify.model.charts import Bodies, body_at
-from rigidjax.identify.model.free import with_steps
-from rigidjax.identify.model.predict import (
-    HeldSteps,
-    errors_along,
-    needed_body,
-    sensor_inputs,
-    states_at,
-)
-from rigidjax.identify.model.scene import Scene
+from rigidjax.identify.model.first_order import FirstOrder
+from rigidjax.identify.model.model import Model
 from rigidjax.identify.sensors.base import extras
-from rigidjax.motion.torques.base import Torque
-from rigidjax.motion.torques.inputs import Input, bind
-from rigidjax.rotation.barrier import match_batch_axes, platform
 
-if TYPE_CHECKING:
-    from rigidjax.identify.model.model import Model
-
-# A `Row` holds the parameters of one recording, as `Index` describes. A `BodyIndex` is the index of
-# the body of a recording among several bodies, or `None` for one body.
-Row = Float[Array, " columns"]
-BodyIndex = Array | None
 # `SensorErrors` holds one array for each sensor, such as its errors (R, T, k), for R recordings, T
 # times and k components.
 SensorErrors = tuple[Array | np.ndarray, ...]
@@ -42,25 +19,9 @@ SensorErrors = tuple[Array | np.ndarray, ...]
 Noise = tuple[Float[Array, "records _"], ...]
 
 
-class FirstOrder(NamedTuple):
-    """Hold the value of a function and its Jacobian, both arrays or pytrees of arrays."""
-
-    value: Any
-    # The parameters are the last axis of each array.
-    jacobian: Any
-
-
 # `Blocks` holds for each sensor the errors (R, T, k), and their Jacobian (R, T, k, m) with respect
 # to the m columns of a row.
 Blocks = FirstOrder
-
-
-class Motion(NamedTuple):
-    """Hold the states at the times of a recording, and the torque with its inputs."""
-
-    # The states have a leading time axis.
-    states: Any
-    torque: Torque | None
 
 
 class White(NamedTuple):
@@ -81,189 +42,7 @@ class Standardised(NamedTuple):
     widening: Float[Array, "times k"] | None
 
 
-def starting_scene(model: "Model", record: Recording) -> Scene:
-    """Return the scene of a recording at the starting values, without body and initial state."""
-    return Scene(None, model.torque, model.process, record.sensors, None)
-
-
-def scene_at(
-    model: "Model", row: Row, record: Recording, reference: ReferenceStates, body_index: BodyIndex
-) -> Scene:
-    """Return the scene of one recording at its parameters, which its `row` holds."""
-    scene = with_steps(starting_scene(model, record), model.slots, row)
-    body = body_at(model.chart, row, body_index)
-    start = reference.initial(row[model.index.first :])
-    return Scene(body, scene.torque, scene.process, scene.sensors, start)
-
-
-def motion_in(model: "Model", scene: Scene, record: Recording) -> Motion:
-    """Return the states at the times of a recording, and the torque that reads its inputs."""
-    assert scene.body is not None and scene.start is not None
-    body: Any = needed_body(scene.body, model.state_kind)
-    functions = {name: source for name, source in record.inputs.items() if callable(source)}
-    if isinstance(model.integrator, HeldSteps) and scene.torque is not None:
-        samples = {n: rows for n, rows in record.inputs.items() if n not in functions}
-        unbound = {name: Input(name) for name in samples}
-        torque = bind(scene.torque, functions | unbound)
-        states = model.integrator.driven_states(body, scene.start, record.t, torque, samples)
-        return Motion(states, bound_torque(scene, record))
-    torque = bound_torque(scene, record)
-    states = states_at(model.integrator, body, scene.start, record.t, torque)
-    return Motion(states, torque)
-
-
-def bound_torque(scene: Scene, record: Recording) -> Torque | None:
-    return bind(scene.torque, input_functions(record))
-
-
-def sensor_errors(
-    model: "Model",
-    row: Row,
-    record: Recording,
-    reference: ReferenceStates,
-    body_index: BodyIndex,
-    delay: Array | None = None,
-) -> tuple[Array, ...]:
-    """Return the errors of each sensor in one recording, in the unit of the sensor.
-
-    The error is reading minus prediction, and zero for a masked reading. `delay`, s, is added to
-    the clock offset of each sensor.
-    """
-    scene = scene_at(model, row, record, reference, body_index)
-    return scene_errors(model, scene, record, delay)
-
-
-def scene_errors(
-    model: "Model", scene: Scene, record: Recording, delay: Array | None = None
-) -> tuple[Array, ...]:
-    """Return the errors of each sensor in a `scene` of the recording `record`, as `sensor_errors`
-    does.
-    """
-    states, torque = motion_in(model, scene, record)
-    assert scene.body is not None and scene.start is not None
-    out, motion = [], (scene.body, torque, record.t, scene.start, states)
-    for reading, sensor in zip(record.readings, scene.sensors, strict=True):
-        errors = errors_along(sensor, reading.values, sensor_inputs(sensor, *motion, delay))
-        out.append(jnp.where(reading.mask[:, None], errors, 0.0))
-    return tuple(out)
-
-
-def map_recordings(function: Callable[..., PyTree], model: "Model", *arguments: PyTree) -> Any:
-    """Return `function(*arguments, record, reference, body_index)` of every recording.
-
-    The arguments and the result have a leading axis of recordings. On a CPU the recordings are
-    computed one after another: XLA compiles the loop over the times of one recording, which changes
-    a few dozen numbers in each step, to one kernel. Batched over recordings this loop runs at half
-    the speed.
-    """
-    trees = *arguments, model.records, model.reference, model.body_indices
-    arrays, rest = eqx.partition(trees, eqx.is_array)
-
-    def function_of_recording(part: PyTree[Array]) -> PyTree:
-        return function(*eqx.combine(part, rest))
-
-    if model.count == 1:
-        # For a single recording the function is called directly: a loop over recordings would only
-        # make the compiled program larger.
-        return jax.tree.map(
-            lambda leaf: leaf[None], function_of_recording(stacking.pick(arrays, 0))
-        )
-    if platform() == "cpu":
-        return lax.map(function_of_recording, arrays, batch_size=1)
-    return jax.vmap(function_of_recording)(arrays)
-
-
-def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
-    """Return the errors of each sensor of a `model` in the sensor's unit, reading minus prediction.
-
-    Derivatives are computed as by `map_rows`.
-    """
-    return map_rows(model.index.rows(x), model, sensor_errors)
-
-
-@eqx.filter_custom_jvp
-def map_rows(
-    rows: Float[Array, "records columns"], model: "Model", function: Callable[..., PyTree]
-) -> Any:
-    """Return `function(model, row, record, reference, body_index)` of every recording.
-
-    Only derivatives with respect to the rows are defined; they are computed recording by recording,
-    in forward mode.
-    """
-
-    def function_of_row(row: Row, *rest: PyTree) -> Any:
-        return function(model, row, *rest)
-
-    return match_batch_axes(map_recordings(function_of_row, model, rows), rows)
-
-
-@map_rows.def_jvp
-def _map_rows_jvp(
-    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
-) -> tuple[PyTree, PyTree]:
-    (rows, model, function), (step, *rest) = primals, tangents
-    if jax.tree.leaves(rest):
-        raise TypeError(
-            "model: wanted derivatives in the free numbers x alone, not in the numbers of the "
-            "model; make them free by a Free(where, name)"
-        )
-    out, slopes = _row_jacobians(model, rows, function)
-    along = jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, step), slopes)
-    return match_batch_axes(out, rows), along
-
-
-def error_jacobians(
-    model: "Model", x: Float[Array, " n"], function: Callable[..., PyTree] = sensor_errors
-) -> FirstOrder:
-    """Return the value of `function` for each recording, and its Jacobian with respect to the row.
-
-    The last axis (m) of the Jacobian is that of `model.index.places`.
-    """
-    out, slopes = _row_jacobians(model, model.index.rows(x), function)
-    columns = jnp.asarray(model.index.columns, jnp.int32)
-    if columns.size > model.index.width:
-        slopes = jax.tree.map(lambda block: block[..., columns], slopes)
-    return FirstOrder(out, slopes)
-
-
-def _row_jacobians(
-    model: "Model", rows: Float[Array, "records columns"], function: Callable[..., PyTree[Array]]
-) -> FirstOrder:
-    """Return the value of a `function` for `map_rows`, and its Jacobian in the rows."""
-
-    def linear(row: Row, *rest: PyTree) -> FirstOrder:
-        # Forward mode is cheaper than reverse mode, to compile and to run, for a dozen numbers and
-        # one long loop over time.
-        return value_and_jacfwd(lambda row: function(model, row, *rest), row)
-
-    return map_recordings(linear, model, rows)
-
-
-@eqx.filter_jit
-def delay_slopes(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
-    """Return the derivative of each sensor's errors with respect to a delay of its clock, per
-    second.
-    """
-
-    def derivative_of_recording(row: Row, *rest: PyTree) -> Any:
-        now = jnp.zeros((), model.records.t.dtype)
-        return jax.jvp(lambda s: sensor_errors(model, row, *rest, delay=s), (now,), (now + 1,))[1]
-
-    return map_recordings(derivative_of_recording, model, model.index.rows(x))
-
-
-def value_and_jacfwd(function: Callable[[Array], Any], x: Float[Array, " n"]) -> FirstOrder:
-    """Return the value of a `function` at x and its Jacobian, by forward mode."""
-
-    def value_and_aux(x: Array) -> tuple[PyTree, PyTree]:
-        value = function(x)
-        return value, value
-
-    jacobian, value = jax.jacfwd(value_and_aux, has_aux=True)(x)
-    return FirstOrder(value, jacobian)
-
-
-def whiten(model: "Model", errors: SensorErrors, noise: Noise) -> tuple[Float[Array, "..."], ...]:
+def whiten(model: Model, errors: SensorErrors, noise: Noise) -> tuple[Float[Array, "..."], ...]:
     """Return the errors of each sensor in standard deviations, as `standardise` computes them."""
     out = []
     for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
@@ -341,7 +120,7 @@ def standardise(
 
 
 def reading_residuals(
-    model: "Model", errors: SensorErrors, noise: Noise, weights: Float[Array, "records times"]
+    model: Model, errors: SensorErrors, noise: Noise, weights: Float[Array, "records times"]
 ) -> tuple[Array, ...]:
     """Return the residuals of the readings of each sensor, shrunk by the robust loss.
 
@@ -371,7 +150,7 @@ def residual_jacobians(
     return FirstOrder(value, jax.vmap(push, in_axes=-1, out_axes=-1)(slopes))
 
 
-def prior_weights(model: "Model") -> Float[Array, " n"]:
+def prior_weights(model: Model) -> Float[Array, " n"]:
     """Return one over the standard deviation of the prior of each parameter, or zero without a
     prior.
     """
@@ -386,16 +165,16 @@ def prior_weights(model: "Model") -> Float[Array, " n"]:
     return weights
 
 
-def joint_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
+def joint_residuals(model: Model, x: Float[Array, " n"]) -> Float[Array, " j"]:
     """Return the residuals of the prior of the body, if the model has one."""
     if model.prior is None:
         return jnp.zeros(0, x.dtype)
-    assert not isinstance(model.chart, Bodies)
-    body = model.chart.body(x[: model.index.bodies])
-    return model.prior.residuals(body, to_scale=model.chart.unit != "").reshape(-1)
+    (chart,) = model.charts
+    body = chart.body(x[: model.index.bodies])
+    return model.prior.residuals(body, to_scale=chart.unit != "").reshape(-1)
 
 
-def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]:
+def prior_residuals(model: Model, x: Float[Array, " n"]) -> Float[Array, " m"]:
     """Return all residuals that belong to no reading: of each parameter's prior, and
     `joint_residuals`.
     """
@@ -403,7 +182,7 @@ def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]
 
 
 def reading_weights(
-    model: "Model", errors: SensorErrors, noise: Noise
+    model: Model, errors: SensorErrors, noise: Noise
 ) -> tuple[Float[Array, "..."], ...]:
     """Return the weights of each sensor's readings in the normal equations, zero for a masked one.
 

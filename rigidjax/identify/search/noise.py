@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.terms import Blocks, Noise, delay_slopes, whiten
+from rigidjax.identify.model.model import Model, delay_slopes
+from rigidjax.identify.model.terms import Blocks, Noise, whiten
 from rigidjax.identify.sensors.base import extras
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 from rigidjax.identify.uncertainty.degrees_of_freedom import effective_parameters

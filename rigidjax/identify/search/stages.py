@@ -16,8 +16,9 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.data.recording import Reading, numbers_read
 from rigidjax.identify.model import terms
-from rigidjax.identify.model.charts import chart_list, split_numbers
-from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.charts import split_numbers
+from rigidjax.identify.model.first_order import value_and_jacfwd
+from rigidjax.identify.model.model import Model, error_jacobians
 from rigidjax.identify.model.normal import NormalMatrix, normal_matrix
 from rigidjax.identify.model.predict import FixedSteps, HeldSteps
 from rigidjax.identify.model.terms import Blocks, Noise
@@ -117,7 +118,7 @@ def marquardt(
     def evaluate(x: Array) -> tuple[Evaluation, Array, NormalMatrix, Array]:
         # Without a barrier XLA on CPU computes the derivatives again inside each residual, and the
         # program takes a fifth longer to compile.
-        errors, slopes = barrier(terms.error_jacobians(model, x))
+        errors, slopes = barrier(error_jacobians(model, x))
         residuals, rows = terms.residual_jacobians(
             lambda e: terms.reading_residuals(model, e, noise, weights), errors, slopes
         )
@@ -131,13 +132,13 @@ def marquardt(
         slope = jnp.zeros(number + 1, kind).at[places].add(pulls)
         normal = normal_matrix(rows, places, number, alone).add_diagonal(prior**2)
         total, slope = total + jnp.sum((prior * x) ** 2), slope[:-1] + prior**2 * x
-        e, row = terms.value_and_jacfwd(lambda x: terms.joint_residuals(model, x), x)
+        e, row = value_and_jacfwd(lambda x: terms.joint_residuals(model, x), x)
         if e.size:
             total, slope = total + jnp.sum(e**2), slope + e @ row
             normal = normal.add_rows(row)
         # The body is no linear function of its parameters, which matters if it may be flat.
-        charts, few = chart_list(model.chart), slice(model.index.bodies)
-        parts = (split_numbers(model.chart, y[few]) for y in (x, slope))
+        charts, few = model.charts, slice(model.index.bodies)
+        parts = (split_numbers(charts, y[few]) for y in (x, slope))
         bent = [chart.curvature_rows(*mine) for chart, *mine in zip(charts, *parts, strict=True)]
         curvature = block_diag(*bent)
         normal = normal.add_rows(jnp.pad(curvature, ((0, 0), (0, number - curvature.shape[1]))))

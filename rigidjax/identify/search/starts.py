@@ -15,7 +15,7 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, input_functions
 from rigidjax.identify.data.reference_states import rates
-from rigidjax.identify.model.charts import BASIS, Bodies
+from rigidjax.identify.model.charts import BASIS
 from rigidjax.identify.model.model import Model
 from rigidjax.motion import Spin
 from rigidjax.motion.torques.base import Torque, evaluate_torque
@@ -33,15 +33,12 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
     are the same at each call.
     """
     recordings = stacking.on_host(model.records, model.counts) if model.index.bodies else ()
-    if isinstance(model.chart, Bodies):
-        rows = list(zip(recordings, model.body_names, strict=True))
-        bodies_by_name = {
-            name: regress_inertia(tuple(record for record, of in rows if of == name), model.torque)
-            for name in model.chart.names
-        }
-        regressed = {n: body for n, body in bodies_by_name.items() if body is not None} or None
-    else:
-        regressed = regress_inertia(recordings, model.torque) if recordings else None
+    members: dict[str, list[Recording]] = {}
+    for name, record in zip(model.body_names, recordings, strict=False):
+        members.setdefault(name, []).append(record)
+    found = {name: regress_inertia(tuple(rows), model.torque) for name, rows in members.items()}
+    found = {name: body for name, body in found.items() if body is not None}
+    regressed = (found.get("") if model.body_indices is None else found) or None
     start = model.start(regressed)
     bodies, spins = slice(model.index.bodies), np.asarray(model.index.start)[:, -3:]
     # NumPy's random generator is used, since the generator of JAX takes seconds to compile.

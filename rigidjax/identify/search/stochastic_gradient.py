@@ -11,10 +11,9 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from rigidjax import _checks
 from rigidjax.identify.data import stacking
-from rigidjax.identify.model.model import Model, checked_x
+from rigidjax.identify.model.model import Model, all_errors, checked_x
 from rigidjax.identify.model.terms import (
     Noise,
-    all_errors,
     half_squares,
     prior_residuals,
     reading_residuals,

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from rigidjax.identify.model.first_order import value_and_jacfwd
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import (
     Blocks,
@@ -17,7 +18,6 @@ from rigidjax.identify.model.terms import (
     prior_weights,
     reading_weights,
     residual_jacobians,
-    value_and_jacfwd,
     whiten,
 )
 
@@ -86,7 +86,8 @@ class Linearisation(eqx.Module):
         """Return the gradient (n,) of the cost: half the sum of squared residuals, those of priors
         included. Under a robust loss, the loss takes the place of half the squares of readings.
         """
-        readings = self.rows_for_all_numbers(self.misfit_gradients_by_recording).sum(axis=0)
+        places, parts = self.places.ravel(), self.misfit_gradients_by_recording.ravel()
+        readings = np.bincount(places, parts, self.free_count + 1)[:-1]
         priors = self.prior_weights * self.prior_residuals
         return readings + priors + self.extra @ self.extra_slopes
 
@@ -101,9 +102,18 @@ class Linearisation(eqx.Module):
     def weighted_jacobians_by_sensor(self) -> list[np.ndarray]:
         """Return the `weighted_jacobian` of each sensor by itself, (R, T k, m)."""
         return [
-            _slopes_as_matrices(slope * np.sqrt(weight)[..., None, None])
+            (slope * np.sqrt(weight)[..., None, None]).reshape(len(slope), -1, slope.shape[-1])
             for slope, weight in zip(self.slopes, self.weights, strict=True)
         ]
+
+    @property
+    def weighted_residuals(self) -> np.ndarray:
+        """Return the residuals (R, N) of each recording, times the square roots of their
+        weights.
+        """
+        pairs = zip(self.errors, self.weights, strict=True)
+        parts = [(error * np.sqrt(weight)[..., None]) for error, weight in pairs]
+        return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
 
     @property
     def information_by_sensor(self) -> tuple[np.ndarray, ...]:
@@ -119,12 +129,6 @@ class Linearisation(eqx.Module):
         rest = self.prior_weights * step, self.extra_slopes @ step
         return float(sum(np.sum(part**2) for part in (readings, *rest)))
 
-    def rows_for_all_numbers(self, rows: np.ndarray) -> np.ndarray:
-        """Return rows (R, n) for all n parameters from `rows` (R, m) of recordings."""
-        wide = np.zeros((len(rows), self.free_count + 1))
-        np.add.at(wide, (np.arange(len(rows))[:, None], self.places), rows)
-        return wide[:, :-1]
-
     def covariance_by_recording(self, covariance: np.ndarray) -> np.ndarray:
         """Return the parts (R, m, m) of a `covariance` (n, n) for the parameters of each recording,
         or zero if it is not finite.
@@ -136,19 +140,11 @@ class Linearisation(eqx.Module):
     @property
     def misfit_gradients_by_recording(self) -> np.ndarray:
         """Return the gradient (R, m) of the cost of each recording's own residuals."""
-        total: Any = sum(
-            ((error * weight[..., None]).reshape(len(error), 1, -1) @ _slopes_as_matrices(slope))[
-                :, 0
-            ]
-            for error, slope, weight in zip(self.errors, self.slopes, self.weights, strict=True)
-        )
+        total: Any = 0.0
+        for error, slope, weight in zip(self.errors, self.slopes, self.weights, strict=True):
+            pulls = (error * weight[..., None]).reshape(len(error), 1, -1)
+            total = total + (pulls @ slope.reshape(len(slope), -1, slope.shape[-1]))[:, 0]
         return total
-
-
-def _slopes_as_matrices(
-    slopes: Float[np.ndarray, "records times k m"],
-) -> Float[np.ndarray, "records rows m"]:
-    return slopes.reshape(len(slopes), -1, slopes.shape[-1])
 
 
 @eqx.filter_jit
@@ -212,8 +208,13 @@ class Root(eqx.Module):
     # How all parameters change with the shared ones, if own parameters take the least cost.
     lift: Float[np.ndarray, "n s"]
     core: Float[np.ndarray, "s r"]  # a root of the covariance of the shared parameters
+    shared: Int[np.ndarray, " s"]  # the places of the shared parameters among all
+    # For each recording the derivatives with respect to the shared parameters that are left after
+    # the elimination of its own parameters; the last column holds the residuals.
+    left: tuple[Float[np.ndarray, "p s+1"], ...]
     own: tuple[_Own, ...]
-    ties: Float[np.ndarray, "q s"]  # derivatives of residuals of priors of shared parameters
+    # Of the residuals of priors of shared parameters, as in `left`.
+    ties: Float[np.ndarray, "q s+1"]
     null: Float[np.ndarray, "i n"]  # orthonormal directions that the data do not determine
 
     def sandwich_covariance(
@@ -227,7 +228,8 @@ class Root(eqx.Module):
         """
         wide, lift = (np.concatenate([x, 0 * x[:1]]) for x in (1.0 / self.size, self.lift))
         rows, inverse = rows * wide[places][:, None, :], self.core @ self.core.T
-        total = inverse @ self.ties.T @ self.ties @ inverse
+        held = self.ties[:, :-1] @ inverse
+        total = held.T @ held
         cross, blocks = np.zeros_like(self.lift), []
         for (mine, root, ties), columns, one, m in zip(self.own, places, rows, middle, strict=True):
             count, alone, order = mine.size, root @ root.T, np.argsort(columns)
@@ -278,53 +280,71 @@ def white_covariance(linear: Linearisation) -> Covariance:
 
     The parameters of one recording alone are eliminated first, recording by recording (Schur
     complement), and ranks are decided block by block: a direction is not determined if its singular
-    value is below 1e-8 of the largest one of its block.
+    value is below 1e-8 of the largest one of its block. The elimination is by QR, since JᵀWJ, which
+    a search eliminates by Cholesky (`model.normal`), squares the condition.
     """
     n, dense = linear.free_count, linear.weighted_jacobian
     if not (np.isfinite(dense).all() and np.isfinite(linear.extra_slopes).all()):
         lost, kind = np.full((n, n), np.nan), "none: the motion is not finite"
         return Covariance(lost, lost, kind, np.zeros((0, n)), None)
-    triangles, owner = np.linalg.qr(dense, mode="r"), _owners(linear)
+    # The residuals are a last column, number n + 1, so that each elimination applies to them, too.
+    # Column n is that of places that stand for no parameter.
+    owner = _owners(linear)
+    triangles = np.linalg.qr(np.dstack([dense, linear.weighted_residuals]), mode="r")
+    places = np.pad(linear.places, ((0, 0), (0, 1)), constant_values=n + 1)
     shared = np.flatnonzero(owner < 0)
+    late = np.append(shared, n + 1)
     # Divide the columns of the Jacobian by their lengths (`size`), so that a bias in rad/s does not
     # look undetermined next to a moment of inertia. The lower bound of `size` keeps columns of mere
     # round-off from being scaled up.
-    squares = np.bincount(linear.places.ravel(), np.sum(triangles**2, axis=1).ravel(), n + 1)[:n]
+    squares = np.bincount(places.ravel(), np.sum(triangles**2, axis=1).ravel(), n + 2)[:n]
     size = np.sqrt(squares + linear.prior_weights**2 + np.sum(linear.extra_slopes**2, axis=0))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-150))
-    prior, extra = linear.prior_weights / size, linear.extra_slopes / size
-    of = np.where(extra != 0, owner, -1).max(axis=1, initial=-1)
+    unit = np.append(size, [1.0, 1.0])
+    extra = np.zeros((len(linear.extra), n + 2))
+    extra[:, :n], extra[:, -1] = linear.extra_slopes / size, linear.extra
+
+    def prior_rows(places: np.ndarray) -> np.ndarray:
+        rows = np.zeros((places.size, n + 2))
+        rows[np.arange(places.size), places] = (linear.prior_weights / size)[places]
+        rows[:, -1] = linear.prior_residuals[places]
+        return rows
+
+    of = np.where(extra[:, :n] != 0, owner, -1).max(axis=1, initial=-1)
     lift = np.zeros((n, shared.size))
     lift[shared, np.arange(shared.size)] = 1.0
-    ties = np.concatenate([np.diag(prior[shared]), extra[of < 0][:, shared]])
+    ties = np.concatenate([prior_rows(shared), extra[of < 0]])[:, late]
     # Take all recordings without own parameters together, such as windows with known starts: they
     # have nothing to eliminate, and a loop over a thousand such recordings took most of the time.
     all_shared = ~np.isin(np.arange(len(triangles)), owner)
     no_own = _Own(np.zeros(0, int), np.zeros((0, 0)), np.zeros((0, shared.size)))
-    wide = np.zeros((int(all_shared.sum()), triangles.shape[1], n + 1))
-    columns = np.broadcast_to(linear.places[all_shared][:, None, :], triangles[all_shared].shape)
+    wide = np.zeros((int(all_shared.sum()), triangles.shape[1], n + 2))
+    columns = np.broadcast_to(places[all_shared][:, None, :], triangles[all_shared].shape)
     np.put_along_axis(wide, columns, triangles[all_shared], axis=2)
-    rows = (wide[..., :-1] / size).reshape(-1, n)
-    rest, own, null = [ties, np.linalg.qr(rows[:, shared], mode="r")], [], []
-    for record, (triangle, columns) in enumerate(zip(triangles, linear.places, strict=True)):
+    of_all = iter(wide[..., late] / unit[late])
+    left, own, null = [], [], []
+    for record, (triangle, columns) in enumerate(zip(triangles, places, strict=True)):
         if all_shared[record]:
+            left.append(next(of_all))
             own.append(no_own)
             continue
         mine = np.flatnonzero(owner == record)
-        wide, held = np.zeros((len(triangle), n + 1)), np.zeros((mine.size, n))
-        wide[:, columns], held[np.arange(mine.size), mine] = triangle, prior[mine]
-        priors = np.concatenate([extra[of == record], held])
-        rows = np.concatenate([wide[:, :-1] / size, priors])
+        wide = np.zeros((len(triangle), n + 2))
+        wide[:, columns] = triangle
+        priors = np.concatenate([extra[of == record], prior_rows(mine)])
+        rows = np.concatenate([wide / unit, priors])
         range_, root, blind = _range_and_null(rows[:, mine])
-        taken = range_.T @ rows[:, shared]
-        lift[mine] = -root @ taken
-        rest.append(np.linalg.qr(rows[:, shared] - range_ @ taken, mode="r"))
+        taken = range_.T @ rows[:, late]
+        lift[mine] = -root @ taken[:, :-1]
+        left.append(np.linalg.qr(rows[:, late] - range_ @ taken, mode="r"))
         own.append(_Own(mine, root, np.concatenate([priors[:, mine], priors[:, shared]], axis=1)))
         null.append(np.zeros((len(blind), n)))
         null[-1][:, mine] = blind
-    _, core, blind = _range_and_null(np.concatenate(rest))
+    rows = np.concatenate([ties, *left])[:, :-1]
+    _, core, blind = _range_and_null(np.linalg.qr(rows, mode="r"))
     null.append(blind @ lift.T)
-    root = Root(size, lift, core, tuple(own), ties, np.linalg.qr(np.concatenate(null).T)[0].T)
+    null = np.linalg.qr(np.concatenate(null).T)[0].T
+    root = Root(size, lift, core, shared, tuple(left), tuple(own), ties, null)
     directions = root.null / size
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     covariance = root.covariance
@@ -401,15 +421,15 @@ class InverseRoot(NamedTuple):
     null: Float[np.ndarray, "k n"]  # the directions that the information does not determine
 
 
-def covariance_root(information: Float[np.ndarray, "n n"]) -> InverseRoot:
-    """Return a root of the inverse of an `information` matrix."""
-    size = np.sqrt(np.diag(information))
-    size = np.maximum(size, max(WEAKEST * size.max(), 1e-150))
-    values, vectors = np.linalg.eigh(information / np.outer(size, size))
-    determined = values > 1e-14 * values.max()
-    half = vectors[:, determined] / np.sqrt(values[determined]) / size[:, None]
-    null = vectors[:, ~determined].T / size
-    return InverseRoot(half, null / np.linalg.norm(null, axis=1, keepdims=True))
+def covariance_root(rows: Float[np.ndarray, "q n"]) -> InverseRoot:
+    """Return a root of the inverse of the information matrix `rowsᵀ rows`; q is at least n."""
+    size = np.linalg.norm(rows, axis=0)
+    size = np.maximum(size, max(WEAKEST * size.max(initial=0.0), 1e-150))
+    found = _range_and_null(rows / size)
+    null = found.null / size
+    return InverseRoot(
+        found.root / size[:, None], null / np.linalg.norm(null, axis=1, keepdims=True)
+    )
 
 
 def distance_to_minimum(

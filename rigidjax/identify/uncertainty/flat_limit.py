@@ -16,7 +16,6 @@ from rigidjax.body.symmetric3 import to_inertia
 from rigidjax.identify.model.charts import (
     AbstractBodyChart,
     body_list,
-    chart_list,
     split_numbers,
 )
 from rigidjax.identify.model.model import Model
@@ -100,10 +99,10 @@ def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     of its thickness with respect to x is zero at a flat body: derivatives are computed at a
     slightly thicker one. The information on the inertia tensor itself is hardly different there.
     """
-    thick = list(map(_thicker, chart_list(model.chart), bodies_at(model, x)))
+    thick = list(map(_thicker, model.charts, bodies_at(model, x)))
     if all(one is None for one in thick):
         return None
-    pairs = zip(split_numbers(model.chart, x[: model.index.bodies]), thick, strict=True)
+    pairs = zip(split_numbers(model.charts, x[: model.index.bodies]), thick, strict=True)
     vectors = [old if new is None else new for old, new in pairs]
     return jnp.concatenate([*vectors, x[model.index.bodies :]])
 
@@ -151,7 +150,7 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
     """
     out = []
     bodies = body_list(model.bodies(x))
-    for chart, body in zip(chart_list(model.chart), bodies, strict=True):
+    for chart, body in zip(model.charts, bodies, strict=True):
         if not _has_limit(chart):
             out.append(jnp.ones((), x.dtype))
             continue
@@ -178,7 +177,7 @@ def limits(
     body; `step_to_minimum` leads from the best point to the minimum of the linearised model.
     """
     last = (part[-len(body_suffixes) :] for part in quantities)
-    rows = zip(chart_list(model.chart), body_suffixes, *last, strict=True)
+    rows = zip(model.charts, body_suffixes, *last, strict=True)
     return tuple(
         Limit(name, float(value), float(value + min(slope @ step_to_minimum, 0.0)), slope)
         for chart, name, value, slope in rows

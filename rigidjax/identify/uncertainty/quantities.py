@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax.identify.model.charts import AbstractBodyChart, Bodies, Ratios, body_list
+from rigidjax.identify.model.charts import AbstractBodyChart, Ratios, body_list
+from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
 from rigidjax.identify.model.model import Model, shortened, values_of
-from rigidjax.identify.model.terms import value_and_jacfwd
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 
@@ -127,8 +127,8 @@ def labels(model: Model) -> list[Label]:
 
 
 def reports_starts(model: Model) -> bool:
-    """Return whether a fit reports initial states, of which windows have too many."""
-    return model.clusters is None
+    """Return whether a fit reports initial states: those that are free and have no prior."""
+    return model.index.start.size > 0 and model.start_weight is None
 
 
 class NamedChart(NamedTuple):
@@ -138,10 +138,8 @@ class NamedChart(NamedTuple):
 
 def named_charts(model: Model) -> list[NamedChart]:
     """Return the chart of each body of a `model`."""
-    if not isinstance(model.chart, Bodies):
-        return [NamedChart("", model.chart)]
-    named = zip(model.chart.names, model.chart.charts, strict=True)
-    return [NamedChart(f" [{name}]", chart) for name, chart in named]
+    named = zip(dict.fromkeys(model.body_names), model.charts, strict=True)
+    return [NamedChart(f" [{name}]" if name else "", chart) for name, chart in named]
 
 
 def recording_suffixes(model: Model) -> list[str]:
@@ -177,44 +175,37 @@ def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
     return jnp.concatenate([part.astype(x.dtype) for part in parts])
 
 
-class Linear(NamedTuple):
-    """Hold reported quantities, positive ones as logarithms, and their derivatives.
+def quantities_at(model: Model, x: Float[Array, " n"]) -> FirstOrder:
+    """Return the reported quantities (q,) of a `model`, positive ones as logarithms.
 
     The last entries are the flatness (I1 + I2 − I3) / I3 of each body.
     """
-
-    values: Any  # (q,)
-    slopes: Any  # (q, n)
-
-
-def quantities_at(model: Model, x: Float[Array, " n"]) -> Linear:
-    """Return the reported quantities of a `model` at the parameters x."""
     return _quantities_at(shortened(model), x)
 
 
 @eqx.filter_jit
-def _quantities_at(model: Model, x: Float[Array, " n"]) -> Linear:
+def _quantities_at(model: Model, x: Float[Array, " n"]) -> FirstOrder:
     def value(x: Array) -> Array:
         return jnp.concatenate([quantity_vector(model, x), flat_limit.flatness(model, x)])
 
-    return Linear(*value_and_jacfwd(value, x))
+    return value_and_jacfwd(value, x)
 
 
 def quantities_on_host(
     model: Model, x: Float[Array, " n"], derivative_point: Float[Array, " n"] | None
-) -> Linear:
+) -> FirstOrder:
     """Return the reported quantities at the parameters x in NumPy, with the derivatives at a
     thicker body, the `derivative_point`, if a body is flat at x.
     """
     values, slopes = map(np.asarray, quantities_at(model, x))
     if derivative_point is not None:
-        slopes = np.asarray(quantities_at(model, derivative_point).slopes)
-    return Linear(values, slopes)
+        slopes = np.asarray(quantities_at(model, derivative_point).jacobian)
+    return FirstOrder(values, slopes)
 
 
 def reported_quantities(
     model: Model,
-    quantities: tuple[np.ndarray, np.ndarray],
+    quantities: FirstOrder,
     covariance: np.ndarray,
     null_directions: np.ndarray,
     limits: tuple[flat_limit.Limit, ...] = (),

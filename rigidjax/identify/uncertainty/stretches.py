@@ -13,14 +13,15 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from rigidjax.identify.model.first_order import FirstOrder
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.uncertainty.covariance import (
     Covariance,
-    Linearisation,
+    Root,
     covariance_root,
     with_infinite_variance,
 )
-from rigidjax.identify.uncertainty.quantities import Linear, labels
+from rigidjax.identify.uncertainty.quantities import labels
 
 # A quantity depends on one stretch of windows if this stretch causes more than the fraction HANGS
 # of the variance of the quantity. This is not tested if there are fewer than FEWEST stretches.
@@ -48,54 +49,37 @@ class Stretches(eqx.Module):
         return np.concatenate(self.null)
 
 
-def leave_one_out(model: Model, linear: Linearisation) -> Stretches | None:
+def leave_one_out(model: Model, root: Root | None) -> Stretches | None:
     """Return the changes of a fit if a stretch of windows is left out, for each stretch.
 
-    The result is `None` without windows, or if the motion is not finite. The parameters of one
-    window alone are eliminated window by window (Schur complement).
+    The `root` is that of the covariance for white errors. The result is `None` without windows, or
+    if the motion is not finite.
     """
-    if model.clusters is None:
+    if model.clusters is None or root is None:
         return None
-    clusters = np.asarray(model.clusters)
-    count, alone = int(clusters.max()) + 1, np.asarray(model.index.alone, int)
-    dense = linear.weighted_jacobian
-    if not np.isfinite(dense).all():
-        return None
-    shared = np.setdiff1d(np.arange(dense.shape[-1]), alone)
-    errors = [e * np.sqrt(w)[..., None] for e, w in zip(linear.errors, linear.weights, strict=True)]
-    e = np.concatenate([one.reshape(len(one), -1) for one in errors], axis=1)
-    own, rest = dense[..., alone], dense[..., shared]
-    gram = rest.swapaxes(1, 2) @ rest
-    slope = np.einsum("rns,rn->rs", rest, e)
-    if alone.size:
-        at = linear.places[:, alone]
-        held = linear.prior_weights[at]
-        inner = own.swapaxes(1, 2) @ own + held[:, :, None] ** 2 * np.eye(alone.size)
-        sides = own.swapaxes(1, 2) @ rest
-        pull = np.einsum("rnk,rn->rk", own, e) + held * linear.prior_residuals[at]
-        both = np.linalg.solve(inner, np.concatenate([sides, pull[..., None]], axis=2))
-        gram = gram - sides.swapaxes(1, 2) @ both[..., :-1]
-        slope = slope - np.einsum("rks,rk->rs", sides, both[..., -1])
-    # A parameter may have one value for each group of windows. One column of the derivatives then
-    # stands for another parameter in each group: the indices in `linear.places` tell which.
-    places, columns = np.unique(linear.places[:, shared], return_inverse=True)
-    columns = columns.reshape(len(gram), shared.size)
-    grams, slopes = np.zeros((count, places.size, places.size)), np.zeros((count, places.size))
-    np.add.at(grams, (clusters[:, None, None], columns[:, :, None], columns[:, None, :]), gram)
-    np.add.at(slopes, (clusters[:, None], columns), slope)
-    known = np.diag(linear.prior_weights[places] ** 2)
-    steps, null = np.zeros_like(slopes), []
+    clusters, places = np.asarray(model.clusters), root.shared
+    count, n = int(clusters.max()) + 1, root.size.size
+    if count == 1:
+        # All parameters are the own ones of a single window, and no other window shows them.
+        alone = np.asarray(model.index.places)[:, np.asarray(model.index.alone, int)]
+        places = np.setdiff1d(np.arange(n), alone)
+        null = np.eye(n)[places]
+        return Stretches(np.zeros((1, places.size)), places, (null,))
+    rows = [
+        np.concatenate([root.left[i] for i in np.flatnonzero(clusters == k)]) for k in range(count)
+    ]
+    rows = [np.linalg.qr(one, mode="r") for one in rows]
+    size, steps, null = root.size[places], np.zeros((count, places.size)), []
     for k in range(count):
-        # Add up the information matrices (`grams`) of all stretches but stretch k. If the matrix of
-        # stretch k were subtracted from the sum of all, round-off would remain in the directions
-        # that the other stretches do not determine.
-        rest = np.delete(grams, k, axis=0).sum(axis=0) + known
-        blind = np.eye(places.size)
-        if rest.any():
-            half, blind = covariance_root(rest)
-            steps[k] = half @ (half.T @ slopes[k])
-        null.append(np.zeros((len(blind), linear.free_count)))
-        null[-1][:, places] = blind
+        # All stretches but stretch k, and the priors. If the information of stretch k were
+        # subtracted from that of all, round-off would remain in the directions that the other
+        # stretches do not determine.
+        others = np.concatenate([root.ties, *rows[:k], *rows[k + 1 :]])[:, :-1]
+        half, blind = covariance_root(others)
+        steps[k] = half @ (half.T @ (rows[k][:, :-1].T @ rows[k][:, -1])) / size
+        null.append(np.zeros((len(blind), n)))
+        null[-1][:, places] = blind / size
+        null[-1] /= np.linalg.norm(null[-1], axis=1, keepdims=True)
     return Stretches(steps, places, tuple(null))
 
 
@@ -119,7 +103,7 @@ def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
 
 
 def stretch_remarks(
-    stretches: Stretches, model: Model, quantities: Linear, white: Covariance
+    stretches: Stretches, model: Model, quantities: FirstOrder, white: Covariance
 ) -> list[str]:
     """Return a remark on each quantity whose value or deviation depends on a single stretch."""
     count, names = len(stretches.steps), labels(model)

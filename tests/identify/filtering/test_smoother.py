@@ -115,7 +115,7 @@ def test_pushes_stand_in_the_order_of_the_process(short):
     """The equal of a long memory and a slow drift: the torque that is correlated comes first."""
     model, _, first, found = short
     process = rj.torques.Sum(rj.torques.CorrelatedTorque(1e-12, 1.0), model.process)
-    both = identify.Model(model.recording, model.chart, process=process)
+    both = identify.Model(model.recording, model.charts[0], process=process)
     first = identify.first_belief(both, state=first.state, rate=0.3, attitude=0.3)
     again = identify.smooth(both, first, substeps=1, tolerance=1e-9, iterations=30)
     correlated, white = again.pushes

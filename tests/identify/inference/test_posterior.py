@@ -18,7 +18,7 @@ from rigidjax import identify
 from rigidjax.identify.answer.answers import Answer
 from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.filtering.terms import curvature
-from rigidjax.identify.model.terms import error_jacobians
+from rigidjax.identify.model.model import error_jacobians
 from rigidjax.identify.uncertainty.covariance import linearise
 
 # The places of the initial rate among the free numbers of `model`.
