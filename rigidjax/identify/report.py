@@ -21,7 +21,7 @@ from rigidjax.identify.answer.result import (
     verdict as verdict,
 )
 from rigidjax.identify.answer.table import (
-    Row,
+    Row as Row,
     html_rows,
     numbers as numbers,
     table as table,
