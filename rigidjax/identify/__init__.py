@@ -73,6 +73,7 @@ from rigidjax.identify.sensors import (
     Accelerometer as Accelerometer,
     AttitudeSensor as AttitudeSensor,
     Direction as Direction,
+    ForceTorque as ForceTorque,
     Gyro as Gyro,
     LowPass as LowPass,
     Magnetometer as Magnetometer,
@@ -86,14 +87,15 @@ from rigidjax.identify.sensors import (
 
 __all__ = [
     "AbstractBodyChart", "AbstractLoss", "AbstractSensor", "Accelerometer", "Adaptive",
-    "AttitudeSensor", "Descent", "Direction", "Entropic", "Fit", "FixedSteps", "Free", "Gyro",
-    "Huber", "Known", "LinearModel", "LogDensity", "LowPass", "Magnetometer", "Marker", "Mass",
-    "Model", "Nuts", "Position", "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios",
-    "Recording", "Refit", "Scene", "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked",
-    "Velocity", "Walk", "Windows", "best_first_rate", "compare", "cross_validate", "descend",
-    "expected_quantities", "filter", "first_belief", "fisher", "fit", "linear_filter",
-    "linear_smooth", "log_likelihood", "posterior", "predict_windows", "profile", "read_table",
-    "refit", "report", "sample", "simulate_readings", "smooth", "step", "windows",
+    "AttitudeSensor", "Descent", "Direction", "Entropic", "Fit", "FixedSteps", "ForceTorque",
+    "Free", "Gyro", "Huber", "Known", "LinearModel", "LogDensity", "LowPass", "Magnetometer",
+    "Marker", "Mass", "Model", "Nuts", "Position", "Posterior", "Principal", "PrincipalRatios",
+    "Range", "Ratios", "Recording", "Refit", "Scene", "SensorInput", "SoftL1", "Tensor",
+    "Tolerance", "Unpacked", "Velocity", "Walk", "Windows", "best_first_rate", "compare",
+    "cross_validate", "descend", "expected_quantities", "filter", "first_belief", "fisher",
+    "fit", "linear_filter", "linear_smooth", "log_likelihood", "posterior", "predict_windows",
+    "profile", "read_table", "refit", "report", "sample", "simulate_readings", "smooth", "step",
+    "windows",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

@@ -23,6 +23,12 @@ row(
     dict(noise=0.1, **vectors, **filtered, g_sensitivity=1e-3 * M, place=Y, gravity=W),
 )
 row("identify.Accelerometer", dict(noise=0.1, place=Y, gravity=W, **vectors, **filtered))
+row(
+    "identify.ForceTorque",
+    dict(
+        noise=np.full(6, 0.1), gravity=W, place=Y, mounting=0.1 * V, bias=np.r_[V, W], offset=0.01
+    ),
+)
 row("identify.Magnetometer", dict(noise=0.1, field=Y, **vectors, **filtered))
 row("identify.LowPass", dict(cutoff=20.0, order=2))
 row(

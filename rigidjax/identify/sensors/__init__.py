@@ -13,6 +13,7 @@ from rigidjax.identify.sensors.base import (
     AbstractSensor as AbstractSensor,
     SensorInput as SensorInput,
 )
+from rigidjax.identify.sensors.force_torque import ForceTorque as ForceTorque
 from rigidjax.identify.sensors.lowpass import LowPass as LowPass
 from rigidjax.identify.sensors.tolerance import Tolerance as Tolerance
 from rigidjax.identify.sensors.vectors import (
@@ -22,8 +23,9 @@ from rigidjax.identify.sensors.vectors import (
 )
 
 __all__ = [
-    "AbstractSensor", "Accelerometer", "AttitudeSensor", "Direction", "Gyro", "LowPass",
-    "Magnetometer", "Marker", "Position", "Range", "SensorInput", "Tolerance", "Velocity",
+    "AbstractSensor", "Accelerometer", "AttitudeSensor", "Direction", "ForceTorque", "Gyro",
+    "LowPass", "Magnetometer", "Marker", "Position", "Range", "SensorInput", "Tolerance",
+    "Velocity",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)
