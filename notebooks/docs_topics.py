@@ -62,6 +62,7 @@ TOPICS = {
         "Air": "Damping QuadraticDamping Drag BodyDrag",
         "Wheels and propellers": "Flywheel Wheel ReactionWheels Rotors",
         "Forces": "UniformGravity CentralGravity Wrench",
+        "A given motion": "Carried LoggedMotion Kinematics",
         "Functions of time, measured inputs": "Linear Series Chebyshev Held Input bind Delayed Lagged",
         "Unknown torques": "RandomTorque CorrelatedTorque",
         "Laws together, laws of your own": "Sum AbstractTorque ChangingInertia",

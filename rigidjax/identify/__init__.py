@@ -66,6 +66,7 @@ from rigidjax.identify.sensors import (
     Accelerometer as Accelerometer,
     AttitudeSensor as AttitudeSensor,
     Direction as Direction,
+    ForceTorque as ForceTorque,
     Gyro as Gyro,
     Magnetometer as Magnetometer,
     Marker as Marker,
@@ -78,8 +79,8 @@ from rigidjax.identify.sensors import (
 
 __all__ = [
     "AbstractBodyChart", "AbstractLoss", "AbstractSensor", "Accelerometer", "Adaptive",
-    "AttitudeSensor", "Descent", "Direction", "Entropic", "Fit", "FixedSteps", "Free", "Gyro",
-    "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass", "Model", "Nuts", "Position",
+    "AttitudeSensor", "Descent", "Direction", "Entropic", "Fit", "FixedSteps", "ForceTorque",
+    "Free", "Gyro", "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass", "Model", "Nuts", "Position",
     "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios", "Recording", "Refit", "Scene",
     "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity", "Walk", "Windows",
     "compare", "cross_validate", "descend", "expected_quantities", "filter", "first_belief",

@@ -50,6 +50,7 @@ def test_all_is_free_by_default():
         "com x",
         "com y",
         "com z",
+        *("Ixx", "Iyy", "Izz", "Iyz", "Ixz", "Ixy"),
     )
 
 

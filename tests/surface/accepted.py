@@ -25,6 +25,12 @@ LIMIT = "the right limit for an infinite argument"
 
 # (row, argument: replacement, what came of it, reason), as patterns; the first that fits counts.
 ACCEPTED: list[tuple[str, str, str, str]] = [
+    (
+        "motion.torques.LoggedMotion.from_poses",
+        "*: float32",
+        "returned*",
+        "a second derivative of smoothed poses has two digits fewer than the poses",
+    ),
     # Light: directions of time, no period to fold with, no motion to draw.
     *(
         ("tumblers.Brightness", f"{name}: function", "taken without a word*", OF_TIME)

@@ -22,6 +22,12 @@ row(
     dict(noise=0.1, **vectors, offset=0.01, g_sensitivity=1e-3 * M, place=Y, gravity=W),
 )
 row("identify.Accelerometer", dict(noise=0.1, place=Y, gravity=W, **vectors, offset=0.01))
+row(
+    "identify.ForceTorque",
+    dict(
+        noise=np.full(6, 0.1), gravity=W, place=Y, mounting=0.1 * V, bias=np.r_[V, W], offset=0.01
+    ),
+)
 row("identify.Magnetometer", dict(noise=0.1, field=Y, **vectors, offset=0.01))
 row("identify.AttitudeSensor", dict(noise=np.array([0.1, 0.2, 0.3]), mounting=V, offset=0.01))
 row(

@@ -98,6 +98,24 @@ row(
     lambda: dict(inertia=0.2, axis=np.eye(3)[2], speed=s.Quadratic(jnp.asarray(3.0)), delay=0.1),
     traced=("inertia", "speed", "delay"),
 )
+_LOG = dict(
+    x=np.cos(np.arange(45.0)).reshape(15, 3),
+    q=np.stack([np.cos(0.1 * np.arange(15)), *(3 * [np.sin(0.1 * np.arange(15)) / 3**0.5])], 1),
+)
+row(
+    "motion.torques.LoggedMotion",
+    dict(t=np.linspace(0.0, 2.0, 15), **_LOG, omega=np.sin(np.arange(45.0)).reshape(15, 3)),
+    host=True,
+    transforms=(),
+)
+row(
+    "motion.torques.LoggedMotion.from_poses",
+    dict(t=np.linspace(0.0, 2.0, 15), **_LOG),
+    host=True,
+    transforms=(),
+)
+row("motion.torques.Carried", lambda: dict(motion=s.Quadratic(jnp.asarray(3.0))), transforms=())
+leave_out("what a given motion returns", "motion.torques.Kinematics")
 leave_out("a name, and no number", "motion.torques.Input", "motion.torques.bind")
 row("motion.torques.FromPotential", lambda: dict(potential=s.Spring(jnp.asarray(2.0))))
 row(

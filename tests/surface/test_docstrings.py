@@ -33,6 +33,7 @@ WITHOUT_EXAMPLE = {
             "identify.ExtendedState",
             "lagrangian.LiePoissonWithDirection",
             "identify.Belief",
+            "motion.torques.Kinematics",
             "identify.Filtered",
             "identify.Push",
             "identify.Posterior",

@@ -179,6 +179,10 @@ def our_sensors(x, u, q, w, m, c, s, b, r, read, other):
         identify.Velocity(0.1, place=r).error(now, read),
         identify.Range(read, 0.1, place=r, bias=0.3).error(now, jnp.asarray(1.5)),
         now.lever(r),
+        identify.ForceTorque(
+            0.1, gravity=[0.0, 0, -9.8], place=r, mounting=0.3 * b, bias=jnp.concatenate([b, r]),
+            scale=jnp.concatenate([1.0 + 0.1 * r, 1.0 + 0.1 * b]),
+        ).error(now, jnp.concatenate([read, b])),
     ]  # fmt: skip
 
 
@@ -195,6 +199,7 @@ def sensors(x, u, q, w, m, c, s, b, r, read, other):
         w, np.cross(w, lever))  # fmt: skip
     mount = v.quaternion_of(mp.mpf(0.3) * b)
     expected = v.times(q, mount)
+    held = m * turned.T @ (push - down)
     miss = v.times([expected[0], *(-expected[1:])], other)
     point = x + turned @ lever
     speed = u + turned @ np.cross(w, lever)
@@ -203,6 +208,10 @@ def sensors(x, u, q, w, m, c, s, b, r, read, other):
         v.matrix_of(v.times(expected, v.quaternion_of(b / 2))), read - point, read - x - b,
         read - seen @ turned.T @ speed - b, read - speed,
         np.array([mp.mpf(1.5) - v.norm(point - read) - mp.mpf(0.3)]), lever,
+        np.concatenate([
+            read - (1 + mp.mpf(0.1) * r) * (seen @ held) - b,
+            b - (1 + mp.mpf(0.1) * b) * (seen @ (torque - np.cross(lever, held))) - r,
+        ]),
     ]  # fmt: skip
 
 
@@ -211,7 +220,8 @@ way(
         "Gyro", "Gyro.error", "Accelerometer", "Accelerometer.error", "Magnetometer",
         "Magnetometer.error", "AttitudeSensor", "AttitudeSensor.error",
         "AttitudeSensor.reading_of", "Marker", "Marker.error", "Position", "Position.error",
-        "Velocity", "Velocity.error", "Range", "Range.error", "SensorInput",
+        "Velocity", "Velocity.error", "Range", "Range.error", "ForceTorque", "ForceTorque.error",
+        "SensorInput",
         "SensorInput.lever",
     )),
     our_sensors,

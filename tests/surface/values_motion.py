@@ -263,6 +263,13 @@ way(
 )  # fmt: skip
 
 
+leave_out(
+    "beside a path in closed form: tests/motion/test_carried.py",
+    "motion.torques.LoggedMotion", "motion.torques.LoggedMotion.from_poses",
+    "motion.torques.Carried", "motion.torques.Carried.motion", "motion.torques.Kinematics",
+)  # fmt: skip
+
+
 def tilted(tilt, axis):
     """The axis, and so much of the two next ones."""
     found = np.array([mp.mpf(1), *tilt])

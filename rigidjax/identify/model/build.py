@@ -32,6 +32,7 @@ from rigidjax.identify.model.walks import find_drifts
 from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import dimension
+from rigidjax.motion.torques import Carried
 from rigidjax.motion.torques.base import AbstractForce, Torque, require_torque
 from rigidjax.motion.torques.composite import parts_of
 from rigidjax.motion.torques.inputs import input_names_of
@@ -229,12 +230,13 @@ def _recorded(
     # computed at compile time, so that they are concrete arrays, too.
     with jax.ensure_compile_time_eval():
         reference = references(recordings, state_kind)
+    carried = isinstance(torque, Carried)
     if _sampled(torque, recordings[0]):
         integrator = _held(integrator)
-    elif integrator is None and torque is not None:
+    elif integrator is None and torque is not None and not carried:
         widest = max(float(np.diff(r.t).max()) for r in recordings)
         integrator = integrator_for(1.5 * widest * float(np.max(np.asarray(reference.rate))))
-    vectors = dimension(stacking.pick(reference.state, 0)) // 3
+    vectors = 0 if carried else dimension(stacking.pick(reference.state, 0)) // 3
     return _Data(records, counts, sensors, state_kind, reference, vectors, integrator)
 
 

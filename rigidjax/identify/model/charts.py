@@ -297,7 +297,8 @@ class Mass(AbstractBodyChart):
         self.size = len(self._free_indices)
         moments = ("I1", "I2", "I3") if "inertia" in chosen else ()
         self.log_names = ("mass", *moments) if "mass" in chosen else moments
-        self.plain_names = ("com x", "com y", "com z") if "com" in chosen else ()
+        center = ("com x", "com y", "com z") if "com" in chosen else ()
+        self.plain_names = (*center, *(Tensor.plain_names if moments else ()))
 
     @property
     def _free_indices(self) -> list[int]:
@@ -341,7 +342,10 @@ class Mass(AbstractBodyChart):
         return jnp.log(jnp.concatenate(parts)) if parts else jnp.zeros(0, mass.dtype)
 
     def plain(self, body: MassProperties) -> Float[Array, " signed_quantities"]:
-        return body.com if "com" in self.free else jnp.zeros(0, body.com.dtype)
+        parts = [body.com] if "com" in self.free else []
+        if "inertia" in self.free:
+            parts += [jnp.stack([body.inertia.tensor[k] for k in COMPONENTS])]
+        return jnp.concatenate(parts) if parts else jnp.zeros(0, body.com.dtype)
 
 
 class Known(AbstractBodyChart):

@@ -19,10 +19,12 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
+from rigidjax.identify.model.carried import CarriedMotion
 from rigidjax.identify.sensors import AbstractSensor, SensorInput
 from rigidjax.identify.sensors.base import extras
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, CoupledEquations, with_own_states
+from rigidjax.motion.torques import Carried
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.motion.torques.states import freeze_own_states
@@ -173,11 +175,24 @@ def states_at(
     ts: Float[Array, " times"],
     torque: Torque | None,
 ) -> PyTree:
-    """Return the states of a motion at the times `ts`, s; a free body needs no `integrator`."""
-    if torque is not None:
-        assert integrator is not None
-        return integrator.states(body, state0, ts, torque)
-    return FreeMotion(body, state0)(ts - ts[0])
+    """Return the states of a motion at the times `ts`, s; a free body and a carried one need no
+    `integrator`.
+    """
+    known = _known_motion(body, state0, ts, torque)
+    if known is not None:
+        return known(ts)
+    assert integrator is not None and torque is not None
+    return integrator.states(body, state0, ts, torque)
+
+
+def _known_motion(
+    body: Body, state0: State, ts: Float[Array, " times"], torque: Torque | None
+) -> Callable[[Array], PyTree] | None:
+    """Return the motion as a function of times, s, if no integrator is needed, else `None`."""
+    if isinstance(torque, Carried):
+        return CarriedMotion(cast(MassProperties, body), torque)
+    free = FreeMotion(body, state0) if torque is None else None
+    return None if free is None else lambda times: free(times - ts[0])
 
 
 class HeldSteps(AbstractIntegrator):
@@ -276,14 +291,16 @@ def sensor_inputs(
     clock offset of the sensor.
     """
     turned = needed_body(body, type(state0))
-    field = equations_of_motion(turned, state0, torque)
+    known = _known_motion(turned, state0, ts, torque)
+    carried = isinstance(known, CarriedMotion)
+    field = known.field if carried else equations_of_motion(turned, state0, torque)
     offset, times = extras(sensor).offset, ts
     if delay is not None:
         offset = delay if offset is None else offset + delay
     if offset is not None:
         times = ts + offset
-        if torque is None:
-            states = FreeMotion(turned, state0)(times - ts[0])
+        if known is not None:
+            states = known(times)
         else:
             whole = CoupledEquations(field, turned) if isinstance(states, Coupled) else field
             axes = (0, 0, 0 if jnp.ndim(offset) else None)
@@ -393,11 +410,15 @@ def simulate_readings(
                 "error), the reading whose error is this one"
             )
     start: Any = state0
-    sol = simulate(needed_body(body, type(state0)), start, ts, torque)
-    states = sol.ys if sol.own is None else Coupled(sol.ys, sol.own)
+    if isinstance(torque, Carried):
+        ts = jnp.asarray(ts, jnp.result_type(float))
+        states = CarriedMotion(cast(MassProperties, body), torque)(ts)
+    else:
+        sol = simulate(needed_body(body, type(state0)), start, ts, torque)
+        states, ts = sol.ys if sol.own is None else Coupled(sol.ys, sol.own), sol.ts
     count = len(sensors)
     keys = [None] * count if key is None else jax.random.split(_checks.random_key(key), count)
-    motion = body, torque, sol.ts, start, states
+    motion = body, torque, ts, start, states
     out = tuple(_readings(one, *motion, key=own) for one, own in zip(sensors, keys, strict=True))
     return out if several else out[0]
 

@@ -2,7 +2,8 @@
 scatter.
 """
 
-from typing import NamedTuple
+import dataclasses
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,13 +12,17 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax._types import HasSpin
-from rigidjax.body.inertia import Inertia
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.symmetric3 import from_components
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, input_functions
 from rigidjax.identify.data.reference_states import rates
 from rigidjax.identify.model.charts import BASIS
-from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
+from rigidjax.identify.model.model import Model, map_recordings, scene_at, scene_errors
+from rigidjax.identify.search.noise import initial_noise
 from rigidjax.motion import Spin
+from rigidjax.motion.torques import Carried
 from rigidjax.motion.torques.base import Torque, evaluate_torque
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.motion.torques.states import contains_own_states
@@ -32,11 +37,15 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
     There is only one point if neither a body nor initial rates are free. Without a `key` the points
     are the same at each call.
     """
+    carried = isinstance(model.torque, Carried)
     recordings = stacking.on_host(model.records, model.counts) if model.index.bodies else ()
     members: dict[str, list[Recording]] = {}
     for name, record in zip(model.body_names, recordings, strict=False):
         members.setdefault(name, []).append(record)
-    found = {name: regress_inertia(tuple(rows), model.torque) for name, rows in members.items()}
+    if carried:
+        found = carried_bodies(model, list(members))
+    else:
+        found = {name: regress_inertia(tuple(rows), model.torque) for name, rows in members.items()}
     found = {name: body for name, body in found.items() if body is not None}
     regressed = (found.get("") if model.body_indices is None else found) or None
     start = model.start(regressed)
@@ -44,8 +53,9 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
     # NumPy's random generator is used, since the generator of JAX takes seconds to compile.
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)
     out = []
-    # If neither a body nor initial rates are free, there is nothing to scatter.
-    for index in range(count if model.index.bodies or spins.size else 1):
+    # If neither a body nor initial rates are free, there is nothing to scatter. The readings of a
+    # carried body are linear in its numbers: there is one best point.
+    for index in range(count if (model.index.bodies or spins.size) and not carried else 1):
         wide = 0.0 if index == 0 else (0.5 if regressed is not None and index % 2 else 1.5)
         x = np.array(start)
         middle = x[bodies] if (index == 0 or wide < 1) else 0 * x[bodies]
@@ -80,6 +90,76 @@ def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) ->
     values = np.maximum(values, 1e-2 * values.max())
     second_moment = (axes * values) @ axes.T
     return Inertia(jnp.asarray(np.trace(second_moment) * np.eye(3) - second_moment))
+
+
+# The place of each of ten numbers in the symmetric matrix ∫ (r, 1)(r, 1)ᵀ dm: second moments about
+# the origin of the body frame, mass times centre of mass, and mass.
+_TEN = [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1), (0, 3), (1, 3), (2, 3), (3, 3)]
+_UNIT = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+# If this matrix has an eigenvalue below zero, those below this fraction of the largest are raised
+# to it: the body is then possible.
+_POSSIBLE = 1e-4
+
+
+def carried_bodies(model: Model, names: list[str]) -> dict[str, Any]:
+    """Return the bodies of carried recordings, by name, by weighted linear least squares, made
+    possible.
+    """
+    x, rows = model.start(), np.array([one[0] for one in _TEN])
+    columns = np.array([one[1] for one in _TEN])
+    value, slope = _linear_errors(model, x)
+    errors, slopes = [], []
+    for reading, sigma, error, jacobian in zip(
+        model.records.readings, initial_noise(model), value, slope, strict=True
+    ):
+        weights = np.asarray(reading.mask)[..., None] / np.asarray(sigma)[:, None]
+        errors.append((weights * error).reshape(model.count, -1))
+        slopes.append((weights[..., None] * jacobian).reshape(model.count, -1, 10))
+    matrix = np.concatenate(slopes, axis=1)
+    # The errors without a body: the numbers of a light one are then not lost beside `_UNIT`.
+    side = matrix @ _UNIT - np.concatenate(errors, axis=1)
+
+    def body_of(name: str) -> MassProperties:
+        mine = np.array([other == name for other in model.body_names])
+        ten = np.linalg.lstsq(matrix[mine].reshape(-1, 10), side[mine].ravel(), rcond=None)[0]
+        whole = np.zeros((4, 4))
+        whole[rows, columns] = whole[columns, rows] = ten
+        # Lengths in units of the body's size: the eigenvalues are then alike.
+        size = np.sqrt(abs(np.trace(whole[:3, :3]) / whole[3, 3]))
+        units = np.array([size, size, size, 1.0])
+        values, axes = np.linalg.eigh(whole / np.outer(units, units))
+        if not values[0] > 0:
+            values = np.maximum(values, _POSSIBLE * values[-1])
+            whole = (axes * values) @ axes.T * np.outer(units, units)
+        return _body_of_ten(jnp.asarray(whole[rows, columns]))
+
+    return {name: body_of(name) for name in names}
+
+
+def _body_of_ten(ten: Float[Array, "10"]) -> MassProperties:
+    """Return the body of ten numbers, in the order of `_TEN`, in which its wrench is linear."""
+    xx, yy, zz, yz, xz, xy = ten[:6]
+    com = ten[6:9] / ten[9]
+    about_origin = from_components(xx, yy, zz, xy, xz, yz)
+    return MassProperties(ten[9], com, about_origin - ten[9] * jnp.outer(com, com))
+
+
+@eqx.filter_jit
+def _linear_errors(model: Model, x: Float[Array, " n"]) -> FirstOrder:
+    """Return the errors of all sensors, (R, T, k), for the body `_UNIT`, and their derivative in
+    ten numbers.
+    """
+
+    def of_recording(row: Array, record: Recording, *rest: Any) -> FirstOrder:
+        scene = scene_at(model, row, record, *rest)
+
+        def errors(ten: Array) -> tuple[Array, ...]:
+            known = dataclasses.replace(scene, body=_body_of_ten(ten))
+            return scene_errors(model, known, record)
+
+        return value_and_jacfwd(errors, jnp.asarray(_UNIT, x.dtype))
+
+    return map_recordings(of_recording, model, model.index.rows(x))
 
 
 class Components(NamedTuple):

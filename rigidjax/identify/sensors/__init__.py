@@ -13,6 +13,7 @@ from rigidjax.identify.sensors.base import (
     AbstractSensor as AbstractSensor,
     SensorInput as SensorInput,
 )
+from rigidjax.identify.sensors.force_torque import ForceTorque as ForceTorque
 from rigidjax.identify.sensors.tolerance import Tolerance as Tolerance
 from rigidjax.identify.sensors.vectors import (
     Accelerometer as Accelerometer,
@@ -21,8 +22,9 @@ from rigidjax.identify.sensors.vectors import (
 )
 
 __all__ = [
-    "AbstractSensor", "Accelerometer", "AttitudeSensor", "Direction", "Gyro",
-    "Magnetometer", "Marker", "Position", "Range", "SensorInput", "Tolerance", "Velocity",
+    "AbstractSensor", "Accelerometer", "AttitudeSensor", "Direction", "ForceTorque", "Gyro",
+    "Magnetometer", "Marker", "Position", "Range", "SensorInput", "Tolerance",
+    "Velocity",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

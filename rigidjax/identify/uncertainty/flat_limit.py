@@ -127,12 +127,15 @@ def _thicker(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array 
         return None
     values, axes = np.linalg.eigh(second)
     least = THIN * values.sum()
-    if values[0] >= least:
+    # A body whose best size is zero, a point, has no shape to make thicker.
+    if values[0] >= least or not least > np.finfo(float).tiny:
         return None
     second = jnp.asarray((axes * np.maximum(values, least)) @ axes.T)
     if isinstance(body, MassProperties):
-        return chart.vector(MassProperties(body.mass, body.com, second))
-    return chart.vector(Inertia(to_inertia(second)))
+        thicker = MassProperties(body.mass, body.com, second)
+    else:
+        thicker = Inertia(to_inertia(second))
+    return eqx.filter_jit(chart.vector)(thicker)
 
 
 def _has_limit(chart: AbstractBodyChart) -> bool:

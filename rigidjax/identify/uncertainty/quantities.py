@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax.identify.model.charts import AbstractBodyChart, Ratios, body_list
+from rigidjax.identify.model.charts import BASIS, AbstractBodyChart, Ratios, Tensor, body_list
 from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
 from rigidjax.identify.model.model import Model, shortened, values_of
 from rigidjax.identify.uncertainty import flat_limit
@@ -19,6 +19,9 @@ from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 FARTHEST = 1e3
 # A correlation whose magnitude differs from one by less than this counts as ±1.
 ROUND_OFF = 1e-13
+# Two moments count as close if they differ by less than this multiple of the 95 % quantile of the
+# noise of the tensor; the second multiple is half the width of a 95 % interval in deviations.
+_CLOSE, NORMAL_95 = 2.0, 1.959964
 
 
 class Quantity(eqx.Module):
@@ -34,7 +37,7 @@ class Quantity(eqx.Module):
     - `cuts`: for each body the correlation of the number with the flatness of the body, which is
       (I1 + I2 − I3) / I3, and the flatness divided by its standard deviation. Intervals end where a
       body would be flat.
-    - `most`: the largest value of the number that a real body can have.
+    - `least`, `most`: the smallest and the largest value of the number that a real body can have.
     - `freedom`: the degrees of freedom of the variance of the number; infinite if all noise is
       given.
 
@@ -50,6 +53,7 @@ class Quantity(eqx.Module):
     unit: str
     positive: bool
     cuts: tuple[tuple[float, float], ...] = ()
+    least: float = -np.inf
     most: float = np.inf
     freedom: float = np.inf
 
@@ -68,7 +72,7 @@ class Quantity(eqx.Module):
         wide = log_deviation(self)
         low, high = (float(side) * wide for side in interval_ends(reach, self.cuts))
         if not self.positive:
-            return self.value + low, self.value + high
+            return max(self.value + low, self.least), min(self.value + high, self.most)
         if max(-low, high) > np.log(FARTHEST):
             return 0.0, self.most
         return float(self.value * np.exp(low)), min(float(self.value * np.exp(high)), self.most)
@@ -224,18 +228,55 @@ def reported_quantities(
     # A quantity that does not depend on any free number, such as a known quantity, gets no
     # deviation (NaN).
     deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
+    close = _deviations_of_close_moments(model, names, values, slope, covariance)
     out = []
     for index, (name, unit, positive) in enumerate(names):
         value, deviation = values[index], deviations[index]
         shown = float(np.exp(value)) if positive else float(value)
-        # No number is known better than its round-off.
-        least = np.finfo(float).eps * (1.0 if positive else abs(shown))
-        most = 1.0 if name.startswith(Ratios.log_names) else np.inf
+        least, most = -np.inf, 1.0 if name.startswith(Ratios.log_names) else np.inf
         mine = tuple((float(rho[index]), away) for rho, away in cuts)
-        deviation = float(np.maximum(deviation, least)) * (shown if positive else 1.0)
+        if close[index] > deviation * shown:
+            deviation, positive, least, mine = close[index], False, 0.0, ()
+        # No number is known better than its round-off.
+        smallest = np.finfo(float).eps * (1.0 if positive else abs(shown))
+        deviation = float(np.maximum(deviation, smallest)) * (shown if positive else 1.0)
         own = float(freedom[index])
-        out.append(Quantity(name, shown, deviation, unit, positive, mine, most, own))
+        out.append(Quantity(name, shown, deviation, unit, positive, mine, least, most, own))
     return tuple(out)
+
+
+def _deviations_of_close_moments(
+    model: Model,
+    names: list[Label],
+    values: np.ndarray,
+    slope: np.ndarray,
+    covariance: np.ndarray,
+) -> Float[np.ndarray, " quantities"]:
+    """Return deviations, kg m², of sorted moments that are close to one another or to zero beside
+    the noise of the tensor; zero for all other quantities.
+
+    Noise drives sorted moments apart, which first derivatives do not see: of small tools 79 to 88 %
+    of such 95 % intervals held. A sorted moment moves by no more than the spectral norm of the
+    noise (Weyl 1912, doi:10.1007/BF01456804), whose 95 % quantile is drawn.
+    """
+    out, places = np.zeros(len(names)), {name: index for index, (name, *_) in enumerate(names)}
+    for suffix, chart in named_charts(model):
+        if not {"I1", "Ixx"} <= {*chart.log_names, *chart.plain_names}:
+            continue
+        moments = [places[f"{name}{suffix}"] for name in ("I1", "I2", "I3")]
+        six = slope[[places[f"{name}{suffix}"] for name in Tensor.plain_names]]
+        spread = six @ covariance @ six.T
+        sizes = np.exp(values[moments])
+        if not np.isfinite(spread).all():
+            continue
+        axes = np.linalg.eigh(spread)
+        root = axes[1] * np.sqrt(np.maximum(axes[0], 0.0))
+        draws = np.random.default_rng(0).normal(size=(2000, 6)) @ root.T
+        norms = np.abs(np.linalg.eigvalsh(np.einsum("dk,kij->dij", draws, BASIS))).max(axis=1)
+        wide = float(np.quantile(norms, 0.95))
+        close = np.diff([0.0, *sizes, np.inf]) < _CLOSE * wide
+        out[moments] = np.where(close[1:] | close[:-1], wide / NORMAL_95, 0.0)
+    return out
 
 
 def interval_about(

@@ -2,6 +2,11 @@
 
 from rigidjax._names import define_dir_and_getattr
 from rigidjax.motion.torques.base import AbstractTorque as AbstractTorque, Wrench as Wrench
+from rigidjax.motion.torques.carried import (
+    Carried as Carried,
+    Kinematics as Kinematics,
+    LoggedMotion as LoggedMotion,
+)
 from rigidjax.motion.torques.chebyshev import Chebyshev as Chebyshev
 from rigidjax.motion.torques.composite import (
     ChangingInertia as ChangingInertia,
@@ -47,11 +52,12 @@ from rigidjax.motion.torques.spline import Series as Series, Wheel as Wheel
 from rigidjax.motion.torques.wheels import Flywheel as Flywheel, ReactionWheels as ReactionWheels
 
 __all__ = [
-    "AbstractTorque", "BodyDrag", "CentralGravity", "ChangingInertia", "Chebyshev",
-    "ConstantTorque", "CorrelatedTorque", "Damping", "Delayed", "Drag", "Flywheel", "FromPotential",
-    "GravityGradient", "HeavyTop", "Held", "InSpace", "Input", "Lagged", "Linear", "MagneticDipole",
-    "Pulses", "QuadraticDamping", "RandomTorque", "ReactionWheels", "Rotors", "Series", "Sum",
-    "Tabulated", "Tide", "UniformGravity", "Wheel", "Wrench", "bind",
+    "AbstractTorque", "BodyDrag", "Carried", "CentralGravity", "ChangingInertia", "Chebyshev",
+    "ConstantTorque", "CorrelatedTorque", "Damping", "Delayed", "Drag", "Flywheel",
+    "FromPotential", "GravityGradient", "HeavyTop", "Held", "InSpace", "Input", "Kinematics",
+    "Lagged", "Linear", "LoggedMotion", "MagneticDipole", "Pulses", "QuadraticDamping",
+    "RandomTorque", "ReactionWheels", "Rotors", "Series", "Sum", "Tabulated", "Tide",
+    "UniformGravity", "Wheel", "Wrench", "bind",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)
