@@ -80,12 +80,12 @@ from rigidjax.identify.sensors import (
 __all__ = [
     "AbstractBodyChart", "AbstractLoss", "AbstractSensor", "Accelerometer", "Adaptive",
     "AttitudeSensor", "Descent", "Direction", "Entropic", "Fit", "FixedSteps", "ForceTorque",
-    "Free", "Gyro", "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass", "Model", "Nuts", "Position",
-    "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios", "Recording", "Refit", "Scene",
-    "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity", "Walk", "Windows",
-    "compare", "cross_validate", "descend", "expected_quantities", "filter", "first_belief",
-    "fisher", "fit", "log_likelihood", "posterior", "predict_windows", "read_table", "refit",
-    "report", "sample", "simulate_readings", "smooth", "step", "windows",
+    "Free", "Gyro", "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass", "Model",
+    "Nuts", "Position", "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios", "Recording",
+    "Refit", "Scene", "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity",
+    "Walk", "Windows", "compare", "cross_validate", "descend", "expected_quantities", "filter",
+    "first_belief", "fisher", "fit", "log_likelihood", "posterior", "predict_windows", "read_table",
+    "refit", "report", "sample", "simulate_readings", "smooth", "step", "windows",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)
