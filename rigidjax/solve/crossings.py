@@ -62,11 +62,11 @@ from rigidjax.solve.crossing_loop import (
 )
 from rigidjax.solve.explicit import AbstractExplicit, require_explicit
 from rigidjax.solve.linear_map import nan_derivatives, with_derivatives
-from rigidjax.solve.momentum import ByMomentum, equations_by_momentum
+from rigidjax.solve.momentum import Integrated, integrated
 from rigidjax.solve.run import (
+    AnyRun,
     ClosedFormRun,
     DiffraxRun,
-    equations_of_motion,
     forward_time,
     hoist,
     solve,
@@ -230,11 +230,11 @@ def crossings(
     state0 = checked_state(event, body, state0, torque, times[0])
     condition = hoist(condition, times[0], state0, body)
     event = Event(condition, direction, max_step)
+    way = time_direction(times)
     if torque is None and solver is None and body is not None:
-        return _crossings(ClosedFormRun(body, False), event, many, max_steps, state0, times)
+        return _crossings(ClosedFormRun(body, way, False), event, many, max_steps, state0, times)
     solver = require_explicit(solver)
     rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
-    way = time_direction(times)
     setup = DiffraxRun(
         body, torque, solver, rtol, atol, None, None, None, REPLAY, NO_METER, way, max_steps, False
     )
@@ -291,15 +291,11 @@ class EventRun(NamedTuple):
 
 
 @eqx.filter_jit
-def solve_until_event(
-    setup: ClosedFormRun | DiffraxRun, event: Event, state0: PyTree, ts: Array
-) -> EventRun:
+def solve_until_event(setup: AnyRun, event: Event, state0: PyTree, ts: Array) -> EventRun:
     """Return the run that ends at the first event."""
     state0 = project_to_group(state0)
     crossed, numbers = section_of_run(setup, event, state0, ts)
-    given = setup.max_steps if isinstance(setup, DiffraxRun) else None
-    steps = 1_000_000 if given is None else given
-    found = locate(crossed, Search(event.direction, 1, steps), numbers)
+    found = locate(crossed, Search(event.direction, 1, setup.max_steps or 1_000_000), numbers)
     met, last = found.number > 0, lax.stop_gradient(ts[-1])
     end = jnp.where(met, crossed.signed(found.times[0]), last)
     before = ~(crossed.signed(ts) > crossed.signed(end))
@@ -340,9 +336,8 @@ def _unknown_to_nan(crossing: PyTree, jumps: Array, inputs: PyTree) -> PyTree:
 
 @eqx.filter_jit
 def _crossings(
-    setup: ClosedFormRun | DiffraxRun, event: Event, max_crossings: int, max_steps: int,
-    state0: Any, ts: Array,
-) -> Crossings:  # fmt: skip
+    setup: AnyRun, event: Event, max_crossings: int, max_steps: int, state0: Any, ts: Array
+) -> Crossings:
     """Return the crossings of a run, with their derivatives."""
     state0 = project_to_group(state0)
     crossed, numbers = section_of_run(setup, event, state0, ts)
@@ -414,18 +409,15 @@ class Section(NamedTuple):
     tree: Callable[[Array], Any]  # the state from the vector of its numbers
     sizes: list[int]  # how many numbers each array of the state has
     sign: Array  # σ
-    # If the inertia is a function of time, `form` replaces the body rate of a state by the momentum
-    # divided by a fixed inertia, and converts it back. If `form` is `None`, the state itself is
-    # integrated.
-    form: ByMomentum | None = None
+    form: Integrated  # what is integrated
 
     def vector(self, t: Array, state: PyTree) -> Array:
         """Return the vector (n,) of the numbers that are integrated, made from the state at `t`."""
-        return ravel_pytree(state if self.form is None else self.form.to_momentum(t, state))[0]
+        return ravel_pytree(self.form.from_state(t, state))[0]
 
     def state(self, t: Array, y: Array) -> PyTree:
         """Return the state at `t` of a vector of integrated numbers, the inverse of `vector`."""
-        return self.tree(y) if self.form is None else self.form.to_rate(t, self.tree(y))
+        return self.form.to_state(t, self.tree(y))
 
     def project(self, y: Array) -> Array:
         """Return the vector of a state with its quaternion, if any, scaled to length 1."""
@@ -462,31 +454,23 @@ class Numbers(NamedTuple):
     longest: Array  # the length of the longest step, s
 
 
-def section_of_run(
-    setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
-) -> tuple[Section, Numbers]:
+def section_of_run(setup: AnyRun, event: Event, state0: Any, ts: Array) -> tuple[Section, Numbers]:
     """Return the condition of an event and the motion of a run, as what can be searched."""
-    form = (
-        equations_by_momentum(setup.body, state0, setup.torque)
-        if isinstance(setup, DiffraxRun)
-        else None
-    )
+    form = integrated(setup.body, state0, setup.torque)
 
     def condition(t: Array, y: Any) -> Array:
-        return condition_value(event, setup.body, t, y if form is None else form.to_rate(t, y))
+        return condition_value(event, setup.body, t, form.to_state(t, y))
 
-    inside = state0 if form is None else form.to_momentum(ts[0], state0)
-    (y0, tree), dtype = ravel_pytree(inside), ts.dtype
+    (y0, tree), dtype = ravel_pytree(form.from_state(ts[0], state0)), ts.dtype
     sign = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
-    way = setup.sign if isinstance(setup, DiffraxRun) else sign
-    field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
-    field, asked, along, jumps = forward_time(way, field, condition, ts[jnp.array([0, -1])])
+    ends = ts[jnp.array([0, -1])]
+    field, asked, along, jumps = forward_time(setup.sign, form.field, condition, ends)
     whole: Any = lambda s, y, *sides: ravel_pytree(field(s, tree(y), sides or None))[0]  # noqa: E731
     program = program_with_stops(whole, jumps, along[0], along[1], y0)
     longest = length = lax.stop_gradient(along[1] - along[0])
     if event.max_step is not None:
         longest = lax.stop_gradient(jnp.asarray(event.max_step, dtype))
-    if isinstance(setup, DiffraxRun) and setup.max_step is not None:
+    if setup.max_step is not None:
         longest = jnp.minimum(longest, setup.max_step)
 
     def slope(s: Array, y: Array) -> Array:

@@ -29,7 +29,7 @@ from rigidjax.motion.manifold import leaf_names, minus, parts_by_name
 from rigidjax.solve import difference, validation
 from rigidjax.solve.linear_map import with_derivatives
 from rigidjax.solve.peaks import times_of_peaks
-from rigidjax.solve.run import ClosedFormRun, DiffraxRun, solve
+from rigidjax.solve.run import AnyRun, DiffraxRun, solve
 
 # The error of a run is measured by a second, more accurate run. This number is the tolerance of the
 # second run divided by the tolerance of the first. With this value the second run of a method of
@@ -225,7 +225,7 @@ def estimate_error_of_run(
         rtol, others = setup.rtol, before.ys
         far = _relative_distance(others, ys) > _FORESEEN
         factor = jnp.where(far, jnp.inf, _ALLOWED * rtol / before.rtol)
-    elif isinstance(setup, ClosedFormRun):
+    elif setup.solver is None:
         # The distance of a state from itself may be a rounding error; at times that the run did not
         # reach it stays NaN.
         factor = 0.0
@@ -244,7 +244,7 @@ def _without_derivatives(tree: PyTree) -> PyTree:
 
 
 def _error_with_round_off(
-    setup: ClosedFormRun | DiffraxRun,
+    setup: AnyRun,
     ts: Array,
     ys: PyTree,
     num_steps: Array,
@@ -269,12 +269,12 @@ def _error_with_round_off(
     known = _largest_relative_distance(step_errors, sizes)
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
     setup, ys, more = _run_at_larger_tolerance(setup, start, ts, ys, num_steps, search)
-    free = isinstance(setup, ClosedFormRun)
+    free = setup.solver is None
 
     def changes_of_neighbour(numbers: Any, times: Array) -> Array:
         body, torque, y0 = eqx.combine(numbers, rest)
-        new = dict(body=body, throw=False) | ({} if free else dict(torque=torque))
-        return more * jax.vmap(minus)(solve(dataclasses.replace(setup, **new), y0, times)[0], ys)
+        run = dataclasses.replace(setup, body=body, torque=torque, throw=False)
+        return more * jax.vmap(minus)(solve(run, y0, times)[0], ys)
 
     def neighbour(clear: Array, inputs: Any) -> tuple[Array, tuple[Array, dict[str, Array]]]:
         number, near, later = inputs
@@ -330,8 +330,7 @@ def _run_at_larger_tolerance(
     The given run itself is returned in float32, where it takes few steps anyway, in closed form,
     and if it does not record its steps.
     """
-    replayed = isinstance(setup, DiffraxRun) and setup.replays
-    if not replayed or ts.dtype == jnp.float32:
+    if not setup.replays or ts.dtype == jnp.float32:
         return setup, ys, 1.0
 
     def is_near(run: TriedRun) -> Array:

@@ -1,4 +1,4 @@
-"""Integrate the momentum of a body whose inertia is a function of time.
+"""Choose what a run integrates: the state or, if the inertia is a function of time, the momentum.
 
 The momentum p = I(t) Ω obeys `dp/dt = p × Ω + τ`, however the inertia I changes; Ω is the body rate
 and τ the torque. Where I jumps, p stays as it is and Ω jumps, and no derivative of I is needed. A
@@ -8,15 +8,16 @@ suit Ω̃.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import MassProperties, tensor_of, with_tensor
+from rigidjax.frames import Point
+from rigidjax.frames.frame_dynamics import scene_of_force
 from rigidjax.motion import Attitude
 from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of
 from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
@@ -24,6 +25,7 @@ from rigidjax.motion.torques import ChangingInertia, Sum
 from rigidjax.motion.torques.base import in_precision
 from rigidjax.motion.torques.composite import parts_of, tensor_or_nan
 from rigidjax.motion.torques.states import freeze_own_states
+from rigidjax.rotation.barrier import warn_of_slow_loops
 from rigidjax.rotation.linalg3 import apply, solve
 
 
@@ -37,9 +39,7 @@ class _ChangingEquations(eqx.Module):
         dtype = y.omega.dtype
         body, law = in_precision(self.body, dtype), in_precision(self.law, dtype)
         now = tensor_or_nan(law.tensor(jnp.asarray(t, dtype)).astype(dtype))
-        kind: Any = AttitudeEquations if isinstance(y, Attitude) else EulerEquations
-        kind = NewtonEuler if isinstance(body, MassProperties) else kind
-        slope = kind(with_tensor(body, now), law.torque)(t, y)
+        slope = equations_of(with_tensor(body, now), y, law.torque)(t, y)
         change = solve(tensor_of(body), apply(now, slope.omega))
         return eqx.tree_at(lambda s: s.omega, slope, change)
 
@@ -53,40 +53,68 @@ class ByMomentum(eqx.Module):
     field: Any  # an `_ChangingEquations`, or a `CoupledEquations` that contains it
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None) -> Any:
-        return self.field(t, self.to_rate(t, y))
+        return self.field(t, self.replace_rate(t, y, _to_rate))
 
-    def to_momentum(self, t: Any, y: PyTree) -> PyTree:
-        """Return the state with Ω replaced by Ω̃ = I₀⁻¹ I(t) Ω."""
-        return self._replace_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
-
-    def to_rate(self, t: Any, y: PyTree) -> PyTree:
-        """Return the state with Ω̃ replaced by Ω = I(t)⁻¹ I₀ Ω̃."""
-        return self._replace_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
-
-    def _replace_rate(
-        self, y: PyTree, new_rate: Callable[[Array, Array, Array], Array], t: Any
+    def replace_rate(
+        self, t: Any, y: PyTree, new_rate: Callable[[Array, Array, Array], Array]
     ) -> PyTree:
         """Return the state with the rate `new_rate(I, I₀, rate)`, rad/s."""
         motion, own = motion_of(y), y.own if isinstance(y, Coupled) else ()
         dtype = motion.omega.dtype
         inner: Any = self.field.field if isinstance(self.field, CoupledEquations) else self.field
-        now = (
-            freeze_own_states(inner.law, own).tensor(jnp.asarray(t, dtype))
-            if own
-            else inner.law.tensor(t)
+        law, t = (
+            (freeze_own_states(inner.law, own), jnp.asarray(t, dtype)) if own else (inner.law, t)
         )
-        omega = new_rate(now.astype(dtype), tensor_of(inner.body).astype(dtype), motion.omega)
+        fixed = tensor_of(inner.body).astype(dtype)
+        omega = new_rate(law.tensor(t).astype(dtype), fixed, motion.omega)
         return eqx.tree_at(lambda s: motion_of(s).omega, y, omega)
 
 
-def equations_by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
-    """Return the equations by momentum; `None` unless the inertia is a function of time alone."""
-    if not isinstance(law := changing_inertia(torque), ChangingInertia) or hasattr(
-        law.inertia, "feels"
-    ):
-        return None
+def _to_momentum(now: Array, fixed: Array, omega: Array) -> Array:
+    """Return Ω̃ = I₀⁻¹ I(t) Ω."""
+    return solve(fixed, apply(now, omega))
+
+
+def _to_rate(now: Array, fixed: Array, omega: Array) -> Array:
+    """Return Ω = I(t)⁻¹ I₀ Ω̃."""
+    return solve(now, apply(fixed, omega))
+
+
+class Integrated(NamedTuple):
+    """Hold what a run integrates, y, and convert states of the body to y and back."""
+
+    field: Any  # f(t, y, args): dy/dt; a `ByMomentum` if the inertia is a function of time alone
+
+    def from_state(self, t: Any, state: PyTree) -> PyTree:
+        if not isinstance(self.field, ByMomentum):
+            return state
+        return self.field.replace_rate(t, state, _to_momentum)
+
+    def to_state(self, t: Any, y: PyTree) -> PyTree:
+        return self.field.replace_rate(t, y, _to_rate) if isinstance(self.field, ByMomentum) else y
+
+
+def integrated(body: Any, state0: Any, torque: Any) -> Integrated:
+    """Return what a run integrates, for arguments that fit together."""
+    law = changing_inertia(torque)
+    if law is None or hasattr(law.inertia, "feels"):
+        return Integrated(equations_of(body, state0, torque))
     field: Any = _ChangingEquations(body, law)
-    return ByMomentum(CoupledEquations(field, body) if isinstance(state0, Coupled) else field)
+    return Integrated(
+        ByMomentum(CoupledEquations(field, body) if isinstance(state0, Coupled) else field)
+    )
+
+
+def equations_of(body: Any, state0: Any, torque: Any) -> Callable[..., Any]:
+    """Return the vector field of a body or particle, for arguments that fit together."""
+    if isinstance(state0, Coupled):
+        return CoupledEquations(equations_of(body, state0.motion, torque), body)
+    if torque is not None:
+        warn_of_slow_loops()
+    if isinstance(state0, Point):
+        return scene_of_force(torque).field
+    kind: Any = AttitudeEquations if isinstance(state0, Attitude) else EulerEquations
+    return (NewtonEuler if isinstance(body, MassProperties) else kind)(body, torque)
 
 
 def changing_inertia(torque: Any) -> ChangingInertia | None:
@@ -95,8 +123,3 @@ def changing_inertia(torque: Any) -> ChangingInertia | None:
     # not searched for parts.
     parts = parts_of(torque) if isinstance(torque, ChangingInertia | Sum) else ()
     return parts[0] if len(parts) == 1 and isinstance(parts[0], ChangingInertia) else None
-
-
-def with_body_rates(form: ByMomentum | None, ts: Array, ys: PyTree) -> PyTree:
-    """Return the saved states of a run with their body rates (see `ByMomentum`)."""
-    return ys if form is None else jax.vmap(form.to_rate)(ts, ys)

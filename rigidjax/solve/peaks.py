@@ -14,7 +14,8 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from rigidjax.solve.run import DiffraxRun, equations_of_motion
+from rigidjax.solve.momentum import equations_of
+from rigidjax.solve.run import DiffraxRun
 from rigidjax.solve.sides import evaluate_on_correct_sides
 from rigidjax.solve.switching import (
     BENT,
@@ -71,7 +72,7 @@ def times_of_peaks(setup: DiffraxRun, ts: Array, ys: PyTree, num_steps: Array) -
     way, dtype = jnp.sign(span), ts.dtype
     state0 = jax.tree.map(lambda leaf: leaf[0], ys)
     tree, numbers = ravel_pytree(state0)[1], jax.vmap(lambda y: ravel_pytree(y)[0])(ys)
-    field = equations_of_motion(setup.body, state0, setup.torque)
+    field = equations_of(setup.body, state0, setup.torque)
     sided = evaluate_on_correct_sides(field, setup.sign, None, ts[-1])
     flat = lambda t, y: ravel_pytree(sided(t, tree(y), None))[0]  # noqa: E731
     program = trace_program(flat, begin, numbers[0]).closed

@@ -22,23 +22,17 @@ from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of_force
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of, with_own_states
-from rigidjax.motion.equations import (
-    AttitudeEquations,
-    EulerEquations,
-    NewtonEuler,
-    project_to_group,
-)  # fmt: skip
+from rigidjax.motion.coupled import Coupled, motion_of, with_own_states
+from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.composite import Sum
-from rigidjax.rotation.barrier import warn_of_slow_loops
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import integrate
 from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_of_body
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.momentum import changing_inertia, equations_by_momentum, with_body_rates
+from rigidjax.solve.momentum import changing_inertia, equations_of, integrated
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.sides import declared_jumps, evaluate_on_correct_sides
@@ -54,8 +48,29 @@ class ClosedFormRun(eqx.Module):
     """Hold the set-up of a run of a free body in closed form, without start and saved times."""
 
     body: Inertia | MassProperties
+    sign: Array | None  # as in `DiffraxRun`
     throw: bool = eqx.field(static=True)  # whether a run that fails raises an error
-    torque: ClassVar[None] = None
+    torque: None = None
+    # What follows is as in `DiffraxRun`: there are no steps.
+    solver: ClassVar[None] = None
+    rtol: ClassVar[None] = None
+    max_step: ClassVar[None] = None
+    max_steps: ClassVar[None] = None
+    replays: ClassVar[bool] = False
+
+    def solve(self, state0: Any, ts: Array) -> "Solved":
+        """Return the motion at the times `ts` (T,), s."""
+        ys: Any = FreeMotion(self.body, state0)(ts - ts[0])
+        stats = dict.fromkeys(_COUNTS, jnp.zeros((), int))
+        return Solved(ys, stats, dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE))
+
+    def raise_reason(self, ys: Any, result: dfx.RESULTS) -> Any:
+        """Return the states `ys`; raise an error with the reason if the run ended early."""
+        return eqx.error_if(ys, result != dfx.RESULTS.successful, _CLOSED_FORM)
+
+    def forward(self) -> "ClosedFormRun":
+        """Return the run without errors, for derivatives in forward mode."""
+        return dataclasses.replace(self, throw=False)
 
 
 class DiffraxRun(eqx.Module):
@@ -67,7 +82,7 @@ class DiffraxRun(eqx.Module):
     body: Inertia | MassProperties | None
     torque: Any
     solver: Any
-    rtol: Any
+    rtol: Any  # that of the user's step controller if there is one; `None` if that has none
     atol: Any
     controller: Any  # the user's step controller in the place of tolerances, or `None`
     dt0: Any
@@ -80,32 +95,58 @@ class DiffraxRun(eqx.Module):
     cuts: Array | None = None  # more times at which a step ends, besides the jumps of the torque
 
     @property
-    def stops_at_jumps(self) -> bool:
-        """Return whether steps end where the torque jumps; the run then uses the time s = σt."""
-        # Where steps end at jumps, the vector field is replaced by a traced program. `Magnus4`,
-        # `FreeSolver` and the splittings read attributes of the field, which a traced program does
-        # not have.
-        solver = self.solver.solver if isinstance(self.solver, Projected) else self.solver
-        reads_field = isinstance(solver, AbstractSplitting | Magnus4 | FreeSolver)
-        stops = self.controller is None or isinstance(self.controller, dfx.ConstantStepSize)
-        return stops and not reads_field
-
-    @property
     def replays(self) -> bool:
         """Return whether the run records its steps, which derivatives then repeat."""
         explicit = isinstance(self.solver, AbstractExplicit) and self.max_steps is not None
         return explicit and self.controller is None and isinstance(self.adjoint, ReplayAdjoint)
 
-    def step_controller(self) -> dfx.AbstractStepSizeController:
-        """Return the step controller; an adaptive one also ends a run that cannot continue."""
-        control = self.controller
-        if control is None:
-            control = StandardController(self.rtol, self.atol, self.max_step)
-        if isinstance(control, dfx.AbstractAdaptiveStepSizeController):
-            control = Watched(control)
-        if self.cuts is not None and not self.stops_at_jumps:
-            control = dfx.ClipStepSizeController(control, step_ts=jnp.sort(self.cuts))
-        return control
+    def solve(self, state0: Any, ts: Array) -> "Solved":
+        """Return the motion at the times `ts` (T,), s."""
+        # If the torque has states of its own, they are integrated together with the state of the
+        # body.
+        state0 = with_own_states(self.body, state0, self.torque, ts[0])
+        scene: Any = scene_of_force(self.torque) if isinstance(state0, Point) else None
+        watch = Ends(scene) if hasattr(scene, "ends") else None
+        ys, stats, result, end = _integrate(self, watch, state0, ts)
+        if watch is not None:
+            ended = result == dfx.RESULTS.event_occurred
+            stats |= {"ended": ended, "end_time": end.time, "end_state": end.state}
+        if scene is not None:
+            stats["drift"] = scene.drift(ts, ys)
+        return Solved(ys, stats, result)
+
+    def raise_reason(self, ys: Any, result: dfx.RESULTS) -> Any:
+        """Return the states `ys`; raise an error with the reason if the run ended early, but for an
+        event.
+        """
+        if changing_inertia(self.torque) is not None:
+            ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
+        ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
+        dtype = jax.tree.leaves(ys)[0].dtype
+        gap = np.spacing(np.asarray(1e9, dtype))
+        shortest = (
+            "simulate: no step is short enough: the minimum step size, some units of round-off of "
+            "the time, was reached. Does the torque jump or grow without bound? In "
+            f"{np.dtype(dtype)} the times near 1e9 s are {gap:.2g} s apart: "
+            f"{_checks.advice_on_times(dtype)}"
+        )
+        for why, words in (
+            (dfx.RESULTS.max_steps_reached, _MANY_STEPS),
+            (NONFINITE, _NONFINITE_WORDS),
+            (dfx.RESULTS.dt_min_reached, shortest),
+        ):
+            ys = eqx.error_if(ys, result == why, words)
+            ill = ill & (result != why)
+        return result.error_if(ys, ill)
+
+    def forward(self) -> "DiffraxRun":
+        """Return the run without errors, for derivatives in forward mode."""
+        # A run that does not record its steps needs `ForwardMode` for this.
+        adjoint = self.adjoint if self.replays else dfx.ForwardMode()
+        return dataclasses.replace(self, throw=False, adjoint=adjoint)
+
+
+AnyRun = ClosedFormRun | DiffraxRun
 
 
 class ForwardRun(NamedTuple):
@@ -146,19 +187,8 @@ def equations_of_motion(
     >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))
     <class 'rigidjax.motion.equations.EulerEquations'>
     """
-    if isinstance(state0, Coupled):
-        return CoupledEquations(equations_of_motion(body, state0.motion, torque), body)
-    validation.require_compatible(body, state0, torque)
-    if torque is not None:
-        warn_of_slow_loops()
-    if isinstance(state0, Point):
-        return scene_of_force(torque).field
-    kind: Any = EulerEquations
-    if isinstance(body, MassProperties):
-        kind = NewtonEuler
-    elif isinstance(state0, Attitude):
-        kind = AttitudeEquations
-    return kind(body, torque)
+    validation.require_compatible(body, motion_of(state0), torque)
+    return equations_of(body, state0, torque)
 
 
 def hoist(function: Any, *args: Any) -> Any:
@@ -212,30 +242,15 @@ class Solved(NamedTuple):
 
 
 @eqx.filter_jit
-def solve(setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array) -> Solved:
+def solve(setup: AnyRun, state0: Any, ts: Array) -> Solved:
     """Compute the motion of one body from `state0`, at the times `ts` (T,), s."""
     # The whole function is under one `jit`, because a single operation outside of `jit` takes as
     # long as a hundred steps.
-    state0 = given = project_to_group(state0)
-    if isinstance(setup, ClosedFormRun):
-        ys: Any = FreeMotion(setup.body, state0)(ts - ts[0])
-        stats: dict[str, Any] = dict.fromkeys(_COUNTS, jnp.zeros((), int))
-        result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-    else:
-        # If the torque has states of its own, they are integrated together with the state of the
-        # body.
-        state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
-        scene: Any = scene_of_force(setup.torque) if isinstance(state0, Point) else None
-        watch = Ends(scene) if hasattr(scene, "ends") else None
-        ys, stats, result, end = _integrate(setup, watch, state0, ts)
-        if watch is not None:
-            ended = result == dfx.RESULTS.event_occurred
-            stats |= {"ended": ended, "end_time": end.time, "end_state": end.state}
-        if scene is not None:
-            stats["drift"] = scene.drift(ts, ys)
+    state0 = project_to_group(state0)
+    ys, stats, result = setup.solve(state0, ts)
     if setup.throw:
         ys = require_complete(setup, ys, result)
-    ys = nan_derivatives(ys, (setup.body, setup.torque, given, ts))
+    ys = nan_derivatives(ys, (setup.body, setup.torque, state0, ts))
     return Solved(ys, stats, result_of_body(result, setup.body))
 
 
@@ -258,19 +273,30 @@ class _Integrated(NamedTuple):
 
 def _integrate(setup: DiffraxRun, watch: Ends | None, state0: Any, ts: Array) -> _Integrated:
     """Integrate the motion step by step, until `watch`, if any, becomes true."""
-    form = equations_by_momentum(setup.body, state0, setup.torque)
-    field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
-    state0 = state0 if form is None else form.to_momentum(ts[0], state0)
+    form = integrated(setup.body, state0, setup.torque)
+    field, y0, control = form.field, form.from_state(ts[0], state0), setup.controller
     along, jumps, dt0, sign, halt = ts, None, setup.dt0, None, watch
-    if setup.stops_at_jumps:
+    if control is None:
+        control = StandardController(setup.rtol, setup.atol, setup.max_step)
+    # Where steps end at jumps, the vector field is replaced by a traced program, and the run uses
+    # the time s = σt. `Magnus4`, `FreeSolver` and the splittings read attributes of the field,
+    # which a traced program does not have.
+    solver = setup.solver.solver if isinstance(setup.solver, Projected) else setup.solver
+    stops = setup.controller is None or isinstance(control, dfx.ConstantStepSize)
+    stops = stops and not isinstance(solver, AbstractSplitting | Magnus4 | FreeSolver)
+    if isinstance(control, dfx.AbstractAdaptiveStepSizeController):
+        control = Watched(control)
+    if stops:
         sign = setup.sign
         field, halt, along, jumps = forward_time(sign, field, watch, ts)
         if setup.cuts is not None:
             jumps = [*jumps, _signed(sign, setup.cuts)]
-    elif dt0 is not None:
-        dt0 = dt0 * jnp.sign(ts[-1] - ts[0])
+    else:
+        dt0 = None if dt0 is None else dt0 * jnp.sign(ts[-1] - ts[0])
+        if setup.cuts is not None:
+            control = dfx.ClipStepSizeController(control, step_ts=jnp.sort(setup.cuts))
     out = integrate(
-        setup.solver, field, along, state0, setup.step_controller(), jumps=jumps, halt=halt,
+        setup.solver, field, along, y0, control, jumps=jumps, halt=halt,
         dt0=dt0, max_steps=setup.max_steps, adjoint=setup.adjoint,
         progress_meter=setup.progress_meter,
     )  # fmt: skip
@@ -279,9 +305,8 @@ def _integrate(setup: DiffraxRun, watch: Ends | None, state0: Any, ts: Array) ->
     if out.missed is not None:
         stats["switches_missed"] = out.missed
     last_time = _signed(sign, out.last_time)
-    last = out.last if form is None else form.to_rate(last_time, out.last)
-    end = _End(last_time, last, out.next_step)
-    return _Integrated(with_body_rates(form, ts, out.ys), stats, out.result, end)
+    end = _End(last_time, form.to_state(last_time, out.last), out.next_step)
+    return _Integrated(jax.vmap(form.to_state)(ts, out.ys), stats, out.result, end)
 
 
 def _signed(sign: Array | None, t: Array) -> Array:
@@ -313,44 +338,22 @@ _CLOSED_FORM = (
 )
 
 
-def require_complete(setup: ClosedFormRun | DiffraxRun, ys: Any, result: dfx.RESULTS) -> Any:
+def require_complete(setup: AnyRun, ys: Any, result: dfx.RESULTS) -> Any:
     """Return the states of a run; raise a readable error if it ended early, but for an event."""
     # Known results are compared as whole numbers: an operation of JAX outside of `jit` takes 50 µs.
     number, successful = jax.tree.leaves((result, dfx.RESULTS.successful))
     if _checks.is_known(number) and int(number) == int(successful):
         return ys
-    if isinstance(setup, ClosedFormRun):
-        return eqx.error_if(ys, result != dfx.RESULTS.successful, _CLOSED_FORM)
-    if changing_inertia(setup.torque) is not None:
-        ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
-    ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
-    dtype = jax.tree.leaves(ys)[0].dtype
-    gap = np.spacing(np.asarray(1e9, dtype))
-    shortest = (
-        "simulate: no step is short enough: the minimum step size, some units of round-off of the "
-        f"time, was reached. Does the torque jump or grow without bound? In {np.dtype(dtype)} "
-        f"the times near 1e9 s are {gap:.2g} s apart: {_checks.advice_on_times(dtype)}"
-    )
-    for why, words in (
-        (dfx.RESULTS.max_steps_reached, _MANY_STEPS),
-        (NONFINITE, _NONFINITE_WORDS),
-        (dfx.RESULTS.dt_min_reached, shortest),
-    ):
-        ys = eqx.error_if(ys, result == why, words)
-        ill = ill & (result != why)
-    return result.error_if(ys, ill)
+    return setup.raise_reason(ys, result)
 
 
-def warn_of_missed(
-    setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array, stats: dict[str, Any]
-) -> None:
+def warn_of_missed(setup: AnyRun, state0: Any, ts: Array, stats: dict[str, Any]) -> None:
     """Warn if a torque switches in time so often that steps do not end at all of its switches."""
     missed = stats.get("switches_missed", False)
     if not _checks.is_known((missed, state0, ts)) or not np.any(np.asarray(missed)):
         return
     state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
-    form = equations_by_momentum(setup.body, state0, setup.torque)
-    field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
+    field = integrated(setup.body, state0, setup.torque).field
     program = trace_program(lambda t, y: ravel_pytree(field(t, y, None))[0], ts[0], state0)
     lines = dict.fromkeys(s.line for s in find_switches(program.closed).switches)
     warnings.warn(
@@ -374,13 +377,11 @@ def _rerun(setup: DiffraxRun, state0: Any, ts: Array) -> tuple[_End, Array]:
 _STUCK = 1e-2
 
 
-def explain_max_steps(
-    setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array, error: RuntimeError
-) -> RuntimeError:
+def explain_max_steps(setup: AnyRun, state0: Any, ts: Array, error: RuntimeError) -> RuntimeError:
     """Return the error of a run; if it used up all steps, say which time it reached, and why."""
-    if _MANY_STEPS not in str(error) or not isinstance(setup, DiffraxRun):
+    if _MANY_STEPS not in str(error) or not isinstance(setup, DiffraxRun) or not setup.replays:
         return error
-    if not setup.replays or not _checks.is_known((setup, state0, ts)):
+    if not _checks.is_known((setup, state0, ts)):
         return error
     (t, state, step), count = _rerun(dataclasses.replace(setup, throw=False), state0, ts)
     # A torque that is a function may hold traced numbers, which are then in the result alone.

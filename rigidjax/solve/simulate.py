@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -23,6 +23,7 @@ from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.run import (
+    AnyRun,
     ClosedFormRun,
     DiffraxRun,
     explain_max_steps,
@@ -173,18 +174,21 @@ def simulate(
         max_step = jnp.asarray(max_step, times.dtype)
     if stepsize_controller is None:
         rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
+    way = time_direction(times)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
-        found = _solve_run(ClosedFormRun(body, throw), event, state0, times)
+        found = _solve_run(ClosedFormRun(body, way, throw), event, state0, times)
         return found if accuracy is None else with_error(found, found.error, accuracy)
     # The tolerances are arrays, so that another tolerance does not compile again.
     if stepsize_controller is None:
         rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
+    else:
+        rtol = getattr(stepsize_controller, "rtol", None)
+    how = _chosen(solver, adjoint, max_steps, rtol, event is not None)
     setup = DiffraxRun(
-        body, torque, _solver_of_run(solver, adjoint, event, max_steps), rtol, atol,
-        stepsize_controller, None if dt0 is None else validation.checked_first_step(dt0, times),
-        max_step, adjoint, progress_meter or NO_METER, time_direction(times), max_steps, throw,
+        body, torque, how.solver, rtol, atol, stepsize_controller,
+        None if dt0 is None else validation.checked_first_step(dt0, times), max_step, how.adjoint,
+        progress_meter or NO_METER, way, max_steps, throw,
     )  # fmt: skip
-    setup = dataclasses.replace(setup, adjoint=_adjoint_of_run(setup))
     sought = setup.replays and progress_meter is None
     for name, asked in (("accuracy", accuracy), ("event", event)):
         if asked is not None and not sought:
@@ -192,6 +196,34 @@ def simulate(
     if accuracy is not None:
         return _solve_to_accuracy(setup, event, state0, times, accuracy)
     return _solve_run(setup, event, state0, times)
+
+
+class _Chosen(NamedTuple):
+    """Hold the solver of a run, and the adjoint by which derivatives are taken."""
+
+    solver: dfx.AbstractSolver
+    adjoint: dfx.AbstractAdjoint
+
+
+def _chosen(
+    solver: dfx.AbstractSolver | None, adjoint: dfx.AbstractAdjoint | None,
+    max_steps: int | None, rtol: Any, has_event: bool,
+) -> _Chosen:  # fmt: skip
+    """Return the given solver and adjoint or, for `None`, the fastest that work with the rest."""
+    if solver is None:
+        # If the user asks for forward mode alone, diffrax computes the tangents together with the
+        # run.
+        forward = isinstance(adjoint, dfx.ForwardMode) and not has_event
+        solver = SOLVER if forward or max_steps is None else DormandPrince8()
+    elif not isinstance(solver, AbstractExplicit | AbstractSplitting | Projected):
+        # The explicit methods and the splittings of this package scale the quaternion inside the
+        # kernel of a step. They are not wrapped, because a second scaling outside would split this
+        # kernel.
+        solver = Projected(solver)
+    if isinstance(solver, AbstractExplicit) and max_steps and isinstance(adjoint, _EITHER_MODE):
+        return _Chosen(solver, REPLAY)
+    tight = rtol is not None and _checks.is_known(rtol) and float(rtol) < _TIGHT
+    return _Chosen(solver, adjoint or (_EVERY_STEP if tight else ADJOINT))
 
 
 def _message_of_conflict(
@@ -221,52 +253,6 @@ def _message_of_conflict(
         f"simulate: {name} does not go with {' and '.join(given)}, a run in the loop of diffrax: "
         f"{', or '.join(advice)}"
     )
-
-
-def _solver_of_run(
-    solver: dfx.AbstractSolver | None,
-    adjoint: dfx.AbstractAdjoint | None,
-    event: Event | Callable[..., Any] | None,
-    max_steps: int | None,
-) -> dfx.AbstractSolver:
-    """Return the solver that a run uses, one that keeps attitudes unit quaternions.
-
-    If `solver` is `None`, the result is the fastest solver that works with the other arguments. A
-    solver of diffrax is wrapped, so that each step scales the quaternion of the state to length 1.
-
-    - `solver`: the solver that the user gave, or `None`.
-    - `adjoint`: how derivatives are taken; `None` is the default way.
-    - `event`: a condition at whose first zero the run ends, or `None`.
-    - `max_steps`: the largest number of steps; `None` is no limit.
-    """
-    if solver is None:
-        # If the user asks for forward mode alone, diffrax computes the tangents together with the
-        # run.
-        forward = isinstance(adjoint, dfx.ForwardMode) and event is None
-        return SOLVER if forward or max_steps is None else DormandPrince8()
-    # The explicit methods and the splittings of this package scale the quaternion inside the kernel
-    # of a step. They are not wrapped, because a second scaling outside would split this kernel.
-    ours = isinstance(solver, AbstractExplicit | AbstractSplitting | Projected)
-    return solver if ours else Projected(solver)
-
-
-def _adjoint_of_run(setup: DiffraxRun) -> dfx.AbstractAdjoint:
-    """Return the adjoint that a run uses, that is how its derivatives are taken.
-
-    `setup` holds the adjoint that the user gave or `None`, the solver, the tolerances, and the
-    largest number of steps or `None`. The result is `ReplayAdjoint` if the solver is an explicit
-    method of this package, the number of steps is limited, and `ReplayAdjoint` can do all that the
-    given adjoint can. Otherwise it is the given adjoint or, if none was given, an adjoint of
-    diffrax for reverse mode.
-    """
-    explicit = isinstance(setup.solver, AbstractExplicit) and setup.max_steps is not None
-    if explicit and isinstance(setup.adjoint, _EITHER_MODE):
-        return REPLAY
-    if setup.adjoint is not None:
-        return setup.adjoint
-    rtol = getattr(setup.step_controller(), "rtol", None)
-    tight = rtol is not None and _checks.is_known(rtol) and float(rtol) < _TIGHT
-    return _EVERY_STEP if tight else ADJOINT
 
 
 def _solve_to_accuracy(
@@ -303,7 +289,7 @@ def _solve_to_accuracy(
 
 
 def _solve_run(
-    setup: ClosedFormRun | DiffraxRun,
+    setup: AnyRun,
     event: Event | Callable[..., Any] | None,
     state0: Any,
     times: Array,

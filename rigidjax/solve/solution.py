@@ -20,7 +20,7 @@ from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.manifold import dimension, minus_small, parts_by_name, plus, rotation_slices
 from rigidjax.motion.torques.states import require_no_own_states
 from rigidjax.solve.error import Error, estimate_error_of_run, largest_length_in_run
-from rigidjax.solve.run import ClosedFormRun, DiffraxRun, solve
+from rigidjax.solve.run import AnyRun, solve
 
 _drift: Any = eqx.filter_jit(drift)
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
@@ -110,9 +110,7 @@ class Solution(eqx.Module, Generic[State]):
         t − t₀ (Eckmann and Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
         found = _growth(self._setup, self.ts, self._states)
-        rtol = None
-        if isinstance(self._setup, DiffraxRun):
-            rtol = getattr(self._setup.step_controller(), "rtol", None)
+        rtol = self._setup.rtol
         if rtol is None:
             rtol = 100 * float(jnp.finfo(self.ts.dtype).eps)
         if _checks.is_known((found, rtol, self.ts)):
@@ -190,7 +188,7 @@ class Solution(eqx.Module, Generic[State]):
         return motion_of(jax.tree.map(lambda leaf: leaf[-1], ys))
 
     @property
-    def _setup(self) -> ClosedFormRun | DiffraxRun:
+    def _setup(self) -> AnyRun:
         return eqx.combine(self._arrays, self._rest)
 
     @property
@@ -223,16 +221,9 @@ def _warn_of_error(error: Error, limit: Any, message_start: str) -> None:
 
 
 @eqx.filter_jit
-def _transition_matrix(
-    setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any
-) -> Float[Array, "times n n"]:
+def _transition_matrix(setup: AnyRun, ts: Array, ys: Any) -> Float[Array, "times n n"]:
     """Return the derivatives (T, n, n) of the states by the first, all as small changes."""
-    # The run is repeated below with a changed start. It must not raise an error, and it must be
-    # differentiable in forward mode: a run of diffrax that does not record its steps needs
-    # `ForwardMode` for this.
-    plain = isinstance(setup, DiffraxRun) and not setup.replays
-    more = dict(adjoint=dfx.ForwardMode()) if plain else {}
-    setup = dataclasses.replace(setup, throw=False, **more)
+    setup = setup.forward()
     start = jax.tree.map(lambda leaf: leaf[0], ys)
 
     def changes(change: Array) -> Array:
@@ -242,7 +233,7 @@ def _transition_matrix(
 
 
 @eqx.filter_jit
-def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, " times"]:
+def _growth(setup: AnyRun, ts: Array, ys: Any) -> Float[Array, " times"]:
     """Return the factors (T,) by which a small error at the start grows, as `Solution.growth`."""
     start = jax.tree.map(lambda leaf: leaf[0], ys)
     each = parts_by_name(start, jnp.ones(dimension(start), ts.dtype)).values()
