@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive_loop import NONFINITE, finite
@@ -59,11 +59,6 @@ class _FieldOnTree(eqx.Module):
         return self.tree(self.field(self.constants, t, ravel_pytree(y)[0]))
 
 
-def _vector(t: Any, y: PyTree, args: object) -> Array:
-    """Return the numbers of a state as one vector (n,), for diffrax to save."""
-    return ravel_pytree(y)[0]
-
-
 def integrate(
     solver: dfx.AbstractSolver,
     field: Callable[..., Any],
@@ -94,11 +89,16 @@ def integrate(
         if program.stops.size:
             controller = Stopping(controller, program.stops)
     # The last of `ts` is the end of the last step, so that the state there needs no dense output.
-    subs = [dfx.SubSaveAt(t1=True, fn=_vector)]
-    if ts.shape[0] > 2 and isinstance(adjoint, ReplayAdjoint) and can_run(solver, max_steps, y0):
+    vector = lambda t, y, args: ravel_pytree(y)[0]  # noqa: E731
+    subs = [dfx.SubSaveAt(t1=True, fn=vector)]
+    if (
+        ts.shape[0] > 2
+        and isinstance(adjoint, ReplayAdjoint)
+        and can_run(solver, controller, max_steps, y0)
+    ):
         adjoint = dataclasses.replace(adjoint, between=ts[1:-1])
     elif ts.shape[0] > 2:
-        subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=_vector)]
+        subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=vector)]
     out = dfx.diffeqsolve(
         dfx.ODETerm(field), solver, ts[0], ts[-1], dt0, y0,
         saveat=dfx.SaveAt(subs=subs), stepsize_controller=controller, adjoint=adjoint,

@@ -203,14 +203,20 @@ def _next(motion: Motion, search: Search, run: Path, body: _SearchState) -> _Sea
     # to an extremum of g, because g may have two zeros beside it (`shorter`); or the zero of g in
     # the step is searched for (`crossed`).
     step = on & ~arrived & ~body.refining
-    whole = run.stops[-1] - run.t0
-    good, following = _accept(norm, motion.order, t, length, h, last, whole)
+    good, following = accept_and_adapt(norm, motion.order, length)
+    # The shortest step that the time can resolve; near t = 0, where the round-off of t vanishes, of
+    # the length of the run.
+    eps = jnp.finfo(h.dtype).eps
+    unit = 8 * eps * jnp.maximum(jnp.abs(t), eps * (run.stops[-1] - run.t0))
+    # If a rejected step cannot be shortened, the next length is 0, or NaN if the error is not
+    # finite. A step that a stop cut short does not shorten the next one.
+    stuck = jnp.where(jnp.isfinite(norm), 0.0, jnp.nan).astype(h.dtype)
+    longer = jnp.where(last, jnp.maximum(following, lax.stop_gradient(h)), following)
+    following = jnp.where(good, longer, jnp.where(following > unit, following, stuck))
     following = jnp.minimum(following, motion.longest)
     good = step & good
     hidden, turn = _hidden_zeros(side, start, here, blur)
-    eps = jnp.finfo(h.dtype).eps
-    long_enough = turn > 8 * eps * jnp.maximum(jnp.abs(t), eps * whole)
-    shorter = good & hidden & long_enough & (body.tries < _GUESSES)
+    shorter = good & hidden & (turn > unit) & (body.tries < _GUESSES)
     # If g crosses zero in the direction that is not asked for, the time of the zero is not
     # computed: the step is accepted, and only the new sign of g is stored.
     crossed = good & ~shorter & other & asked
@@ -359,31 +365,6 @@ def step_with_error(
     largest = jnp.maximum(jnp.abs(left), jnp.abs(after))
     scale = lift(run.atol, left) + lift(run.rtol, left) * largest
     return right, jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + float(jnp.finfo(error.dtype).tiny))
-
-
-def _accept(
-    error_norm: Array,
-    order: int,
-    t: Array,
-    h: Array,
-    uncut_length: Array,
-    ends_at_stop: Array,
-    run_length: Array,
-) -> tuple[Array, Array]:
-    """Return whether a step is accepted, and the length of the next step, s.
-
-    If a rejected step cannot be shortened, the next length is 0, or NaN if the error is not finite.
-    A step that a stop cut short does not shorten the next one below `uncut_length`. `run_length`
-    limits the length near t = 0, where the round-off of t vanishes.
-    """
-    good, following = accept_and_adapt(error_norm, order, h)
-    uncut_length = lax.stop_gradient(uncut_length)
-    eps = jnp.finfo(h.dtype).eps
-    unit = 8 * eps * jnp.maximum(jnp.abs(t), eps * run_length)
-    why = jnp.where(jnp.isfinite(error_norm), 0.0, jnp.nan).astype(h.dtype)
-    shorter = jnp.where(following > unit, following, why)
-    longer = jnp.where(ends_at_stop, jnp.maximum(following, uncut_length), following)
-    return good, jnp.where(good, longer, shorter)
 
 
 def result_of_search(h: Array, t: Array, end: Array, is_full: Array) -> dfx.RESULTS:

@@ -11,7 +11,6 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
@@ -27,7 +26,7 @@ from rigidjax.solve.traced import trace_program
 
 # These controllers do not read `args`. They get `None`, because `args` may be large, and a batch
 # would need a copy of `args` for each body.
-_WITHOUT_ARGS = (
+_CONTROLLERS = (
     dfx.PIDController, dfx.ClipStepSizeController, dfx.ConstantStepSize, dfx.StepTo,
     StandardController, Stopping, Watched,
 )  # fmt: skip
@@ -52,7 +51,9 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
     cannot do:
 
     - a run with a solver that is no explicit method of `rigidjax.solvers`;
-    - a run with `max_steps=None`, `SaveAt(dense=True)` or `SaveAt(steps=…)`;
+    - a run with a step controller of the user's own, instead of those of diffrax;
+    - a run with `max_steps=None`, `SaveAt(dense=True)`, `SaveAt(steps=…)` or several `SubSaveAt`s
+      with times;
     - a run with an event that has a `root_finder`, a real number as its condition, or several
       conditions (`ReplayAdjoint` can end a run only by one boolean condition);
     - a run whose state has complex numbers or several dtypes.
@@ -89,7 +90,8 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
     ) -> Any:  # fmt: skip
         how = dict(terms=terms, solver=solver, stepsize_controller=stepsize_controller)
         how |= dict(saveat=saveat, t0=t0, t1=t1, dt0=dt0, max_steps=max_steps)
-        if not can_run(solver, max_steps, init_state.y, saveat, event, init_state.event_values):
+        asked = saveat, event, init_state.event_values
+        if not can_run(solver, stepsize_controller, max_steps, init_state.y, *asked):
             more = dict(args=args, event=event, init_state=init_state)
             return self.otherwise.loop(progress_meter=progress_meter, **how, **more, **rest)
         y0, tree = ravel_pytree(init_state.y)
@@ -108,19 +110,14 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             condition = trace_program(lambda t, y: event.cond_fn(t, tree(y), args, **how), t0, y0)
             constants = constants + condition.jax_constants
             halt = lambda given, t, y: condition.call(given[count:], t, y)  # noqa: E731
-        controlled_by, inner = [], stepsize_controller  # the outermost first
-        while isinstance(inner, dfx.AbstractStepSizeController):
-            controlled_by.append(inner)
-            inner = getattr(inner, "controller", None)
-        plain = all(isinstance(c, _WITHOUT_ARGS) for c in controlled_by)
-        control = (stepsize_controller, progress_meter, None if plain else args)
-        arrays, static = eqx.partition(control, eqx.is_array)
+        arrays, static = eqx.partition((stepsize_controller, progress_meter), eqx.is_array)
         arrays, arrays_tree = jax.tree.flatten(lax.stop_gradient(arrays))
         given = lambda constants: arrays_tree.unflatten(constants[len(constants) - len(arrays) :])  # noqa: E731
         constants = constants + arrays
-        # If no step controller reads `args`, and all have the default norm, they get the state as
-        # one vector of its numbers; else they get it in its own type.
-        rows = plain and all(getattr(c, "norm", NORM) is NORM for c in controlled_by)
+        controlled_by = _nested(stepsize_controller)
+        # If all step controllers have the default norm, they get the state as one vector of its
+        # numbers; else they get it in its own type.
+        rows = all(getattr(c, "norm", NORM) is NORM for c in controlled_by)
         method = Method(
             tableau=solver.tableau,
             field=lambda given, t, y: program.call(given[:count], t, y),
@@ -132,34 +129,34 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             sizes=[leaf.size for leaf in jax.tree.leaves(init_state.y)],
             max_steps=max_steps,
         )
-        subs = _subs(saveat)
-        asked = jnp.concatenate([t0[None][:0], *(s.ts for s in subs if s.ts is not None)])
-        # If the `SaveAt` has several `SubSaveAt`s, each with saved times of its own, these times
-        # are joined and sorted.
-        order = jnp.argsort(lax.stop_gradient(asked)) if len(subs) > 1 else None
+        between = next((s.ts for s in _subs(saveat) if s.ts is not None), t0[None][:0])
         state = (init_state.controller_state, init_state.progress_meter_state)
         state = lax.stop_gradient(jax.tree.map(jnp.asarray, state))
-        between, first = asked if order is None else asked[order], init_state.tnext
-        run = Run(
-            t0, _stops(controlled_by, t0, t1), between, y0,
-            lax.stop_gradient(first), None if event is None else init_state.result,
-        )  # fmt: skip
+        jumps = [c.stops for c in controlled_by if type(c) is Stopping]
+        for c in controlled_by:
+            if type(c) is dfx.ClipStepSizeController and c.jump_ts is not None:
+                ts = c.jump_ts.astype(t0.dtype)
+                # No step ends at a jump after t1, and no step is needed to a jump at or before t0.
+                # Both are replaced by t0, so that the array keeps its length.
+                jumps.append(jnp.sort(jnp.where((t0 < ts) & (ts <= t1), ts, t0)))
+        jumps = [jnp.sort(jnp.concatenate(jumps))] if len(jumps) > 1 else jumps
+        stops = jnp.concatenate([*jumps, t1[None]])  # the times, s, at which steps end
+        ended = None if event is None else init_state.result
+        run = Run(t0, stops, between, y0, lax.stop_gradient(init_state.tnext), ended)
         # The first `count` constants are those of the field. Only they have derivatives: the
         # condition that ends a run has none, nor has the controller.
         smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
         ys, end = run_replayed(method, smooth, constants, state, run)
-        if order is not None:
-            ys = jnp.zeros_like(ys).at[order].set(ys)
-        final = _final_state(init_state, saveat, event, args, tree, run, asked, ys, end)
+        final = _final_state(init_state, saveat, event, args, tree, run, ys, end)
         return final, {"next_step": end.end - end.t}
 
 
 class _Control(NamedTuple):
     """Choose by a controller of diffrax whether a step of one body is accepted."""
 
-    static: Any  # controller, progress meter and `args`, without the arrays in them
-    # A function that selects the arrays of controller, progress meter and `args` from the constants
-    # of the run.
+    static: Any  # controller and progress meter, without the arrays in them
+    # A function that selects the arrays of controller and progress meter from the constants of the
+    # run.
     arrays: Callable[[Arrays], Any]
     # A function that converts the vector of the numbers of a state to the form in which the
     # controller gets the state: the state itself or, if the controller needs no more, the vector.
@@ -168,11 +165,11 @@ class _Control(NamedTuple):
 
     def __call__(self, again: bool, constants: Arrays, given: Any, numbers: Any) -> Decision:
         """Return the decision on a step; repeated for a derivative (`again`) it moves no meter."""
-        controller, meter, args = eqx.combine(self.arrays(constants), self.static)
+        controller, meter = eqx.combine(self.arrays(constants), self.static)
         (control, progress), (t0, last, begin, end) = given
         *states, error = (self.tree(y) for y in numbers)
         keep, t, following, _, control, result = controller.adapt_step_size(
-            begin, end, *states, args, error, self.order, control
+            begin, end, *states, None, error, self.order, control
         )
         # As in diffrax, a next step that would end just before the end of the run is extended to
         # the end, so that no step of a few units of round-off is left.
@@ -185,24 +182,34 @@ class _Control(NamedTuple):
 
 
 def can_run(
-    solver: dfx.AbstractSolver, max_steps: int | None, state: Any,
+    solver: dfx.AbstractSolver, controller: Any, max_steps: int | None, state: Any,
     saveat: dfx.SaveAt | None = None, event: dfx.Event | None = None, event_values: Any = None,
 ) -> bool:  # fmt: skip
     """Return whether `ReplayAdjoint` itself can do a run.
 
-    It takes an explicit method of this package, a largest number of steps, and numbers of one
-    floating-point dtype; no dense output or save at every step; and an event of one boolean
-    condition without a root finder.
+    It takes an explicit method of this package, a step controller of diffrax, a largest number of
+    steps, and numbers of one floating-point dtype; no dense output, save at every step or several
+    sets of saved times; and an event of one boolean condition without a root finder.
     """
     kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(state)}
     plain = isinstance(solver, AbstractExplicit) and max_steps is not None and len(kinds) == 1
     plain = plain and jnp.issubdtype(min(kinds, key=str), jnp.floating)
+    plain = plain and all(type(c) in _CONTROLLERS for c in _nested(controller))
     if event is not None:
         kind = jnp.result_type(jax.tree.leaves(event_values)[0])
         plain = plain and event.root_finder is None and callable(event.cond_fn)
         plain = plain and jnp.issubdtype(kind, jnp.bool_)
-    every = saveat is not None and (saveat.dense or any(sub.steps for sub in _subs(saveat)))
-    return plain and not every
+    if saveat is None:
+        return plain
+    subs = _subs(saveat)
+    few = sum(sub.ts is not None for sub in subs) <= 1 and not any(sub.steps for sub in subs)
+    return plain and few and not saveat.dense
+
+
+def _nested(controller: Any) -> list[Any]:
+    """Return a step controller and those inside it, the outermost first."""
+    inner = getattr(controller, "controller", None)
+    return [controller, *(_nested(inner) if inner is not None else ())]
 
 
 def _subs(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
@@ -211,43 +218,25 @@ def _subs(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
     return [s for s in jax.tree.leaves(saveat.subs, is_leaf=is_sub) if is_sub(s)]
 
 
-def _stops(controllers: list[Any], t0: Array, t1: Array) -> Array:
-    """Return in increasing order the times at which steps end, s: those of jumps, and then t1."""
-    jumps = [c.stops for c in controllers if type(c) is Stopping]
-    for c in controllers:
-        if type(c) is dfx.ClipStepSizeController and c.jump_ts is not None:
-            ts = c.jump_ts.astype(t0.dtype)
-            # No step ends at a jump after t1, and no step is needed to a jump at or before t0. Both
-            # are replaced by t0, so that the array keeps its length.
-            jumps.append(jnp.sort(jnp.where((t0 < ts) & (ts <= t1), ts, t0)))
-    if len(jumps) > 1:
-        jumps = [jnp.sort(jnp.concatenate(jumps))]
-    return jnp.concatenate([*jumps, t1[None]])
-
-
 def _final_state(
     state: Any, saveat: dfx.SaveAt, event: dfx.Event | None, args: Any,
-    make_state: Callable[[Array], Any], run: Run, saved_times: Array, ys: Array, end: LoopState,
+    make_state: Callable[[Array], Any], run: Run, ys: Array, end: LoopState,
 ) -> Any:  # fmt: skip
     """Return the state of `diffrax.diffeqsolve` at the end of a run, with all that it saves.
 
-    `ys` (K, n) are the states at `saved_times` (K,), those of all `diffrax.SubSaveAt`s joined.
+    `ys` (K, n) are the states at the saved times.
     """
     t1 = run.stops[-1]
     # Before its first accepted step a run saves nothing, unless the run has no step because t1 is
     # not after t0.
-    reached = (saved_times <= end.t) & ((end.t > run.t0) | (t1 <= run.t0))
-    counts = [s.ts.shape[0] for s in _subs(saveat) if s.ts is not None]
-    parts = [jnp.split(a, np.cumsum(counts)[:-1]) for a in (reached, ys)]
-    each = iter(zip(*parts, strict=True))
+    reached = (run.between <= end.t) & ((end.t > run.t0) | (t1 <= run.t0))
 
     def saved(sub: Any, old: Any) -> Any:
         ts, states, there = [], [], []
         if sub.t0:
             ts, states, there = [run.t0[None]], [run.y0[None]], [jnp.ones(1, bool)]
         if sub.ts is not None:
-            known, states_there = next(each)
-            ts, states, there = [*ts, sub.ts], [*states, states_there], [*there, known]
+            ts, states, there = [*ts, sub.ts], [*states, ys], [*there, reached]
         if sub.t1:
             ts, there = [*ts, end.t[None]], [*there, jnp.ones(1, bool)]
             states.append(end.y[None])

@@ -44,11 +44,7 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
     rtol: Any
     atol: Any
     dtmax: Any = None
-
-    @property
-    def norm(self) -> Callable[[PyTree], Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the root mean square, by which an error is measured."""
-        return NORM
+    norm: Callable[[PyTree], Any] = NORM  # the root mean square, by which an error is measured
 
     def wrap(self, direction: PyTree) -> "StandardController":
         return self
@@ -65,10 +61,7 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
         error_order: RealLike | None,
     ) -> tuple[Any, Any]:
         assert dt0 is not None
-        return t0 + self._limited(dt0), ()
-
-    def _limited(self, length: Any) -> Any:
-        return length if self.dtmax is None else jnp.minimum(length, self.dtmax)
+        return t0 + (dt0 if self.dtmax is None else jnp.minimum(dt0, self.dtmax)), ()
 
     def adapt_step_size(
         self,
@@ -87,17 +80,13 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
                 "rtol and atol need, got one that does not; give dt0 and "
                 "stepsize_controller=diffrax.ConstantStepSize(), or take another solver"
             )
-
-        def over_tolerance(error: Array, left: Array, right: Array) -> Array:
-            return error / (self.atol + self.rtol * jnp.maximum(jnp.abs(left), jnp.abs(right)))
-
-        still = lax.stop_gradient((y_error, y0, y1_candidate))
-        keep, length = accept_and_adapt(
-            self.norm(jax.tree.map(over_tolerance, *still)), error_order, t1 - t0
-        )
+        error, *states = lax.stop_gradient((y_error, y0, y1_candidate))
+        largest = jax.tree.map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), *states)
+        over = jax.tree.map(lambda e, most: e / (self.atol + self.rtol * most), error, largest)
+        keep, length = accept_and_adapt(self.norm(over), error_order, t1 - t0)
+        length = length if self.dtmax is None else jnp.minimum(length, self.dtmax)
         left = jnp.where(keep, t1, t0)
-        right = left + self._limited(length)
-        return keep, left, right, False, controller_state, dfx.RESULTS.successful
+        return keep, left, left + length, False, controller_state, dfx.RESULTS.successful
 
 
 class Watched(dfx.AbstractAdaptiveStepSizeController):
@@ -109,9 +98,6 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     """
 
     controller: Any
-
-    def __init__(self, controller: dfx.AbstractStepSizeController):
-        self.controller = controller
 
     rtol = _inner("rtol")
     atol = _inner("atol")
@@ -142,7 +128,14 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         if dt0 is None and error_order is not None:
             # The first step is chosen here, because diffrax itself takes 0.01 s for each field that
             # `diffeqsolve` has wrapped for the direction of time, and it wraps every field.
-            h = self._first_step(y0, slope, error_order).astype(begin.dtype)
+            numbers, tree = ravel_pytree(y0)
+            scale = self.atol + self.rtol * jnp.abs(numbers)
+            # The default norm may be called with the vector of all numbers; any other norm is
+            # called with the state.
+            tree = (lambda numbers: numbers) if self.norm is NORM else tree
+            both = (numbers, ravel_pytree(slope)[0])
+            size, rate = (jnp.asarray(self.norm(tree(a / scale))) for a in both)
+            h = starting_step(size, rate, error_order).astype(begin.dtype)
             # If the state or the slope is NaN or infinite, h > 0 is false; the inner controller
             # then gets the length 1.
             sound = h > 0
@@ -158,17 +151,6 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         # which ends the run.
         first = jnp.where(sound, jnp.maximum(first, begin + self._shortest(begin, least)), jnp.nan)
         return first.astype(begin.dtype), (inner, least)
-
-    def _first_step(self, y: PyTree, slope: PyTree, order: RealLike) -> Array:
-        """Return the length of the first step, s; 0 or NaN if state or slope are not finite."""
-        y, tree = ravel_pytree(y)
-        scale = self.atol + self.rtol * jnp.abs(y)
-        # The default norm may be called with the vector of all numbers; any other norm is called
-        # with the state.
-        of_state = (lambda numbers: numbers) if self.norm is NORM else tree
-        both = (y, ravel_pytree(slope)[0])
-        size, rate = (jnp.asarray(self.norm(of_state(a / scale))) for a in both)
-        return starting_step(size, rate, order)
 
     def _shortest(self, t: ArrayLike, smallest_time: ArrayLike) -> Array:
         """Return 8 units of round-off, s, of the time `t` or, if greater, of `smallest_time`."""

@@ -199,7 +199,7 @@ def test_a_body_of_nan_and_one_of_too_many_steps_change_no_bit_of_the_others():
 
 def test_sets_of_saved_times_their_functions_an_event_and_a_meter_are_those_of_diffrax():
     subs = {
-        "a": dfx.SubSaveAt(ts=TS[1:3], fn=lambda t, y, k: t * y["x"] + k[0]),
+        "a": dfx.SubSaveAt(t1=True, fn=lambda t, y, k: t * y["x"] + k[0]),
         "b": dfx.SubSaveAt(t0=True, ts=jnp.array([0.2, 1.9]), t1=True),
     }
     event = dfx.Event(lambda t, y, args, **_: y["x"] < 0.2)
@@ -238,6 +238,10 @@ def test_a_run_without_a_step_and_saved_times_at_the_start():
     np.testing.assert_allclose(ours, theirs, atol=1e-11)
 
 
+class Own(dfx.StepTo):
+    """A step controller of a user."""
+
+
 class Spy(dfx.AbstractAdjoint):
     """Says that it was asked."""
 
@@ -252,10 +256,21 @@ class Spy(dfx.AbstractAdjoint):
         dict(max_steps=None),
         dict(saveat=dfx.SaveAt(dense=True)),
         dict(saveat=dfx.SaveAt(steps=True)),
+        dict(saveat=dfx.SaveAt(subs=[dfx.SubSaveAt(ts=TS), dfx.SubSaveAt(ts=TS[1:])])),
+        dict(control=Own(ts=jnp.array([0.0, 1.0, 2.0]))),
         dict(event=dfx.Event(lambda t, y, args, **_: y["x"])),
         dict(event=dfx.Event([lambda t, y, args, **_: y["x"] < 0])),
     ],
-    ids=["solver", "max_steps", "dense", "steps", "a real event", "several events"],
+    ids=[
+        "solver",
+        "max_steps",
+        "dense",
+        "steps",
+        "sets of times",
+        "own controller",
+        "a real event",
+        "several events",
+    ],
 )
 def test_what_it_does_not_take_another_adjoint_does(how):
     with pytest.raises(NotImplementedError, match="the other adjoint"):
