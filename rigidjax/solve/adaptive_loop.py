@@ -335,20 +335,24 @@ def _unsaved(run: Run) -> Array:
     return jnp.broadcast_to(still[None], (run.between.shape[0], *run.y0.shape))
 
 
-def _most_rows(method: Method, run: Run) -> int:
-    """Return the largest number of rows of a record: its steps, and one row for each stop."""
-    return method.max_steps + run.stops.shape[0]
+class Segments(NamedTuple):
+    """Hold how a record is divided into segments."""
+
+    rows: int  # the number of rows of one segment
+    spare: int  # the number of spare rows for a segment that is run again
+    most: int  # the largest number of segments
 
 
-def _segment_size(method: Method, run: Run) -> tuple[int, int]:
-    """Return the number of rows of one segment, and of spare rows for a segment that is run again.
+def _segments(method: Method, run: Run) -> Segments:
+    """Return how the record of a run is divided into segments.
 
     On a GPU the record of all bodies stays in memory, most of it empty. There it has about as many
     segments as a segment has steps, so that it grows as the root of `max_steps`.
     """
-    most = _most_rows(method, run)
+    # A record has at most one row for each step and one for each stop.
+    most = method.max_steps + run.stops.shape[0]
     segment = min(SEGMENT, most if platform() == "cpu" else math.isqrt(most) + 1)
-    return segment, min(_MORE, max(8, segment // 8))
+    return Segments(segment, min(_MORE, max(8, segment // 8)), -(-most // segment))
 
 
 class Recorded(NamedTuple):
@@ -361,9 +365,8 @@ class Recorded(NamedTuple):
 
 def record_run(method: Method, constants: Arrays, run: Run) -> Recorded:
     """Run one body or many, and record the steps, from which derivatives are computed later."""
-    loop, (segment, spare) = loop_at_start(run), _segment_size(method, run)
-    count = -(-_most_rows(method, run) // segment) + 1
-    starts = [jnp.zeros((count, *a.shape), a.dtype) for a in pack_loop(loop)]
+    loop, (segment, spare, most) = loop_at_start(run), _segments(method, run)
+    starts = [jnp.zeros((most + 1, *a.shape), a.dtype) for a in pack_loop(loop)]
     ys = _unsaved(run)
     rows = jnp.zeros((segment + spare + _MOST, HEAD + run.y0.shape[0], *run.t0.shape), ys.dtype)
     zero = jnp.zeros((), jnp.int32)
@@ -488,7 +491,7 @@ def record_segment(
     The segment ends when the rows are full or the run ends; repeated for derivatives, at `until`.
     """
     many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))
-    segment, spare = _segment_size(method, run)
+    segment, spare, _ = _segments(method, run)
     room = segment + (0 if until is None else spare)
 
     def filled(body: Callable[..., Any], loop: LoopState, rows: Rows, most: int) -> Filled:

@@ -46,11 +46,6 @@ class Smooth(NamedTuple):
     y0: Array  # (n,) the state at t0
 
 
-def smooth_arrays(run: Run) -> Smooth:
-    """Return the arrays of a run that have derivatives."""
-    return Smooth(run.t0, run.stops, run.between, run.y0)
-
-
 def saved_before(run: Run, segment: Segment) -> Array:
     """Return (N + 1,) the number of saved times before each step and before the segment's end."""
     ends = jnp.concatenate([jnp.minimum(segment.times, segment.end[None]), segment.end[None]])
@@ -192,7 +187,8 @@ def pull_run(
 
         return lax.fori_loop(0, part.number, step, sums)
 
-    none = jax.tree.map(jnp.zeros_like, smooth_arrays(run))._replace(y0=state_cotangents[1])
+    zeros = (jnp.zeros_like(a) for a in (run.t0, run.stops, run.between))
+    none = Smooth(*zeros, state_cotangents[1])
     return lax.fori_loop(0, number, one, ([jnp.zeros_like(c) for c in constants], none))
 
 

@@ -115,9 +115,7 @@ def _for_bodies(
     held, one = lax.stop_gradient(constants), method.control
     halt = None if method.halt is None else partial(layout.vmap(method.halt), held)
 
-    def control(again: bool, *numbers: Any) -> Any:
-        return layout.vmap(partial(one, again))(held, *numbers)
-
+    control = lambda again, *numbers: layout.vmap(partial(one, again))(held, *numbers)  # noqa: E731
     project = jax.vmap(method.project, -1, -1) if layout.bodies else method.project
     field = layout.vmap(method.field)
     method = method._replace(field=field, project=project, halt=halt, control=control)
@@ -180,7 +178,7 @@ def _recorded(
 def _push(has_tangent: HasTangent, *bodies: Any) -> Arrays:
     """Return the tangents of the states of a recorded run (see `Replayed`), in forward mode."""
     method, chosen, run, record, along = _recorded(has_tangent, *bodies)
-    smooth = adjoint.smooth_arrays(run)
+    smooth = Smooth(run.t0, run.stops, run.between, run.y0)
     zeros = [jnp.zeros_like(a) for a in smooth]
     of_run = Smooth(*replaced(zeros, has_tangent[1][:SMOOTH], along[len(chosen) :]))
 

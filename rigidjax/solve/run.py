@@ -347,9 +347,8 @@ def require_complete(setup: AnyRun, ys: Any, result: dfx.RESULTS) -> Any:
     return setup.raise_reason(ys, result)
 
 
-def warn_of_missed(setup: AnyRun, state0: Any, ts: Array, stats: dict[str, Any]) -> None:
+def warn_of_missed(setup: AnyRun, state0: Any, ts: Array, missed: Array) -> None:
     """Warn if a torque switches in time so often that steps do not end at all of its switches."""
-    missed = stats.get("switches_missed", False)
     if not _checks.is_known((missed, state0, ts)) or not np.any(np.asarray(missed)):
         return
     state0 = with_own_states(setup.body, state0, setup.torque, ts[0])

@@ -324,7 +324,8 @@ def _solve_run(
             )
     except RuntimeError as error:
         raise explain_max_steps(setup, state0, times, _checks.plain_error(error)) from None
-    warn_of_missed(setup, state0, times, stats)
+    if "switches_missed" in stats:
+        warn_of_missed(setup, state0, times, stats["switches_missed"])
     if setup.throw and "ended" in stats:
         ys = raise_if_ended(setup.torque, ys, stats, times)
     motion, own = (ys.motion, ys.own) if isinstance(ys, Coupled) else (ys, None)

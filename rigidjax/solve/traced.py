@@ -23,11 +23,7 @@ class TracedProgram(NamedTuple):
 
     closed: ClosedJaxpr
     tree: Any  # the tree structure of the result of the function
-
-    @property
-    def jax_constants(self) -> Arrays:
-        """Return the JAX arrays that the traced function closes over, without its NumPy arrays."""
-        return [c for c in self.closed.consts if eqx.is_array(c)]
+    jax_constants: Arrays  # the JAX arrays that it closes over, without its NumPy arrays
 
     def replace_jax_constants(self, jax_arrays: Arrays) -> Arrays:
         """Return a list of all constants of the traced function, with new JAX arrays.
@@ -52,7 +48,8 @@ def trace_program(function: Callable[..., Any], *examples: Any) -> TracedProgram
         return function(*args)
 
     closed, out = jax.make_jaxpr(traced, return_shape=True)(*examples)
-    return TracedProgram(closed, jax.tree.structure(out))
+    constants = [c for c in closed.consts if eqx.is_array(c)]
+    return TracedProgram(closed, jax.tree.structure(out), constants)
 
 
 def extract_constants(

@@ -47,9 +47,7 @@ def checked_run(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> Ch
     )
     require_compatible(body, state0, torque)
     warn_of_scale(body, torque)
-    if body is not None:
-        body = real_or_nan(body, throw)
-    return Checked(body, state0, ts)
+    return Checked(body if body is None else real_or_nan(body, throw), state0, ts)
 
 
 def require_compatible(body: Any, state0: Any, torque: Any) -> None:
@@ -243,13 +241,12 @@ def checked_start(state0: Any, throw: bool) -> Any:
         state0, (Spin, Attitude, Rigid, Point), "state0", requirement=wanted
     )
     named, tree = jax.tree.flatten_with_path(state0)
-    leaves = [
+    state0 = tree.unflatten(
         _checks.require_finite(leaf, str(path[-1]).lstrip("."))
         if throw or _checks.is_known(leaf)
         else leaf
         for path, leaf in named
-    ]
-    state0 = tree.unflatten(leaves)
+    )
     if isinstance(state0, HasAttitude):
         xp = _checks.array_module(state0.q)
         off = xp.abs(xp.sqrt(xp.sum(xp.square(state0.q))) - 1)
