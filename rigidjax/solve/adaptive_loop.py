@@ -117,33 +117,29 @@ def pack_loop(loop: LoopState) -> Arrays:
 
     XLA makes a kernel for each array that goes into or comes out of a loop over blocks of bodies.
     """
-    rest = _by_dtype(loop._replace(y=None))
-    join = lambda leaves: jnp.concatenate([a.reshape(-1, *loop.t.shape) for a in leaves])  # noqa: E731
-    return [loop.y, *(join([a.astype(dtype) for a in leaves]) for dtype, leaves in rest.items())]
+    leaves = jax.tree.leaves(loop._replace(y=None))
+    row = lambda i, dtype: leaves[i].astype(dtype).reshape(-1, *loop.t.shape)  # noqa: E731
+    groups = _groups(leaves).items()
+    return [loop.y, *(jnp.concatenate([row(i, dtype) for i in own]) for dtype, own in groups)]
 
 
 def unpack_loop(arrays: Arrays, like: LoopState) -> LoopState:
     """Return the loop state from its packed arrays, with the shapes and dtypes of `like`."""
-    rest, tree = jax.tree.flatten(like._replace(y=None))
-    parts = {}
-    for (kind, leaves), array in zip(_by_dtype(rest).items(), arrays[1:], strict=True):
-        sizes = [a.size // max(like.t.size, 1) for a in leaves]
-        parts[kind] = iter(jnp.split(array, np.cumsum(sizes)[:-1]))
-    rest = [next(parts[_kind(a)]).reshape(a.shape).astype(a.dtype) for a in rest]
-    return tree.unflatten(rest)._replace(y=arrays[0])
+    leaves, tree = jax.tree.flatten(like._replace(y=None))
+    for own, array in zip(_groups(leaves).values(), arrays[1:], strict=True):
+        ends = np.cumsum([leaves[i].size // max(like.t.size, 1) for i in own])
+        for i, part in zip(own, jnp.split(array, ends[:-1]), strict=True):
+            leaves[i] = part.reshape(leaves[i].shape).astype(leaves[i].dtype)
+    return tree.unflatten(leaves)._replace(y=arrays[0])
 
 
-def _kind(array: Array) -> np.dtype:
-    """Return the dtype under which an array is packed: booleans go with the int32 numbers."""
-    return jnp.dtype(jnp.int32) if array.dtype == bool else array.dtype
-
-
-def _by_dtype(tree: PyTree) -> dict[np.dtype, Arrays]:
-    """Return the leaves of a tree in lists, one for each packed dtype."""
-    parts: dict[np.dtype, Arrays] = {}
-    for a in jax.tree.leaves(tree):
-        parts.setdefault(_kind(a), []).append(a)
-    return parts
+def _groups(leaves: Arrays) -> dict[np.dtype, list[int]]:
+    """Return which arrays are packed together, by dtype: booleans go with the int32 numbers."""
+    groups: dict[np.dtype, list[int]] = {}
+    for i, a in enumerate(leaves):
+        kind = jnp.dtype(jnp.int32) if a.dtype == bool else a.dtype
+        groups.setdefault(kind, []).append(i)
+    return groups
 
 
 class Record(NamedTuple):

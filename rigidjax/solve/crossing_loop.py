@@ -26,7 +26,6 @@ from rigidjax.solve.adaptive_loop import (
     accept_and_adapt,
     choose,
     rows_at,
-    starting_step,
     step_ends,
 )
 from rigidjax.solve.batching import Arrays, lift
@@ -378,12 +377,3 @@ def result_of_search(h: Array, t: Array, end: Array, is_full: Array) -> dfx.RESU
     ):
         result = dfx.RESULTS.where(there, word, result)
     return result
-
-
-def first_step(method: Method, constants: Arrays, run: Path) -> Array:
-    """Return the length of the first step of a search, s."""
-    y0 = run.y0
-    scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
-    slope = method.field(constants, run.t0, y0)
-    size, rate = (jnp.sqrt(jnp.mean((a / scale) ** 2, 0)) for a in (y0, slope))
-    return starting_step(size, rate, method.tableau.order).astype(run.t0.dtype)

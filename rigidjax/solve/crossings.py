@@ -48,15 +48,14 @@ from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import missing_part
 from rigidjax.solve import crossing_loop, validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
-from rigidjax.solve.adaptive_loop import Method, result_of_body
-from rigidjax.solve.batching import Arrays, Layout, bodies_last
+from rigidjax.solve.adaptive_loop import Method, result_of_body, starting_step
+from rigidjax.solve.batching import Arrays, Layout, bodies_last, lift
 from rigidjax.solve.crossing_loop import (
     Located,
     Measured,
     Motion,
     Path,
     Search,
-    first_step,
     result_of_search,
     step_with_error,
 )
@@ -306,13 +305,11 @@ def solve_until_event(setup: AnyRun, event: Event, state0: PyTree, ts: Array) ->
     s, y = chebyshev_step(crossed, numbers.constants, crossed.signed(end), y, met & ~jumps)
     met = met & (result == dfx.RESULTS.successful)
 
-    def rows(leaf: Array) -> Array:
-        there = before.reshape(-1, *[1] * (leaf.ndim - 1))
-        return jnp.where(there, leaf[:-1], jnp.full_like(leaf[:-1], jnp.nan))
-
+    there = lambda leaf: before.reshape(-1, *[1] * (leaf.ndim - 1))  # noqa: E731
+    ys = jax.tree.map(lambda leaf: jnp.where(there(leaf), leaf[:-1], jnp.nan), ys)
     time, y = (jnp.where(met, leaf, jnp.nan) for leaf in (crossed.signed(s), y))
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
-    ys = nan_derivatives(jax.tree.map(rows, ys), inputs)
+    ys = nan_derivatives(ys, inputs)
     time, state = _unknown_to_nan((time, crossed.state(time, y)), jumps, inputs)
     result = dfx.RESULTS.where(met, dfx.RESULTS.event_occurred, result)
     return EventRun(ys, stats, result, time, state)
@@ -324,13 +321,9 @@ def _unknown_to_nan(crossing: PyTree, jumps: Array, inputs: PyTree) -> PyTree:
     These are those of NaN itself, and of a crossing at which g jumps over zero: how such a crossing
     depends on the inputs is not known. The axes of `jumps` are the first axes of each array.
     """
-
-    def lost(leaf: Array) -> Array:
-        return jnp.where(
-            jumps.reshape(*jumps.shape, *[1] * (leaf.ndim - jumps.ndim)), jnp.nan, leaf
-        )
-
-    moved = nan_derivatives(jax.tree.map(lost, crossing), inputs)
+    over = lambda leaf: jumps.reshape(*jumps.shape, *[1] * (leaf.ndim - jumps.ndim))  # noqa: E731
+    moved = jax.tree.map(lambda leaf: jnp.where(over(leaf), jnp.nan, leaf), crossing)
+    moved = nan_derivatives(moved, inputs)
     return with_derivatives(lax.stop_gradient(crossing), moved)
 
 
@@ -473,8 +466,7 @@ def section_of_run(setup: AnyRun, event: Event, state0: Any, ts: Array) -> tuple
     if setup.max_step is not None:
         longest = jnp.minimum(longest, setup.max_step)
 
-    def slope(s: Array, y: Array) -> Array:
-        return program.field(program.constants, s, y)
+    slope = partial(program.field, program.constants)
 
     def rates(s: Array, y: Array) -> tuple[Array, Array, Array]:
         there = slope(s, y)
@@ -543,7 +535,10 @@ def _locate(
         method = Method(
             solver.tableau, motion, project, None, None, section.sizes, search.max_steps
         )
-        h0 = first_step(method, constants, run)
+        scale = lift(run.atol, run.y0) + lift(run.rtol, run.y0) * jnp.abs(run.y0)
+        both = run.y0, motion(constants, run.t0, run.y0)
+        norms = (jnp.sqrt(jnp.mean((a / scale) ** 2, 0)) for a in both)
+        h0 = starting_step(*norms, solver.tableau.order).astype(run.t0.dtype)
         h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), longest)
         run = run._replace(h0=h0)
         attempt, order = partial(step_with_error, method, constants, run), solver.tableau.order
