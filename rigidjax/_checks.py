@@ -309,6 +309,15 @@ def _not_finite(xp: ModuleType, rows: Array | np.ndarray) -> Array | np.ndarray:
     return ~xp.isfinite(rows).reshape(rows.shape[0], -1).all(axis=1)
 
 
+def common_dtype(tree: Any, name: str) -> Any:
+    """Return the one dtype of all arrays of a tree; raise `TypeError` if they have several."""
+    kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(tree)}
+    if len(kinds) != 1:
+        found = ", ".join(sorted(map(str, kinds)))
+        raise TypeError(f"{name}: wanted arrays of one dtype, got {found}; convert them to one")
+    return kinds.pop()
+
+
 def require_finite(value: Numbers, name: str) -> Numbers:
     """Return the array; raise `ValueError` (`equinox` error under `jit`) if it contains a NaN or an
     infinity.
