@@ -58,11 +58,12 @@ class ClosedFormRun(eqx.Module):
     max_steps: ClassVar[None] = None
     replays: ClassVar[bool] = False
 
-    def solve(self, state0: Any, ts: Array) -> "Solved":
+    def motion(self, state0: Any, ts: Array) -> "Trajectory":
         """Return the motion at the times `ts` (T,), s."""
         ys: Any = FreeMotion(self.body, state0)(ts - ts[0])
-        stats = dict.fromkeys(_COUNTS, jnp.zeros((), int))
-        return Solved(ys, stats, dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE))
+        stats: dict[str, Any] = dict.fromkeys(_COUNTS, jnp.zeros((), int))
+        result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
+        return Trajectory(Solved(ys, stats, result), None)
 
     def raise_reason(self, ys: Any, result: dfx.RESULTS) -> Any:
         """Return the states `ys`; raise an error with the reason if the run ended early."""
@@ -100,20 +101,53 @@ class DiffraxRun(eqx.Module):
         explicit = isinstance(self.solver, AbstractExplicit) and self.max_steps is not None
         return explicit and self.controller is None and isinstance(self.adjoint, ReplayAdjoint)
 
-    def solve(self, state0: Any, ts: Array) -> "Solved":
-        """Return the motion at the times `ts` (T,), s."""
+    def motion(self, state0: Any, ts: Array) -> "Trajectory":
+        """Return the motion at the times `ts` (T,), s, integrated step by step."""
         # If the torque has states of its own, they are integrated together with the state of the
         # body.
         state0 = with_own_states(self.body, state0, self.torque, ts[0])
         scene: Any = scene_of_force(self.torque) if isinstance(state0, Point) else None
-        watch = Ends(scene) if hasattr(scene, "ends") else None
-        ys, stats, result, end = _integrate(self, watch, state0, ts)
+        watch = halt = Ends(scene) if hasattr(scene, "ends") else None
+        form = integrated(self.body, state0, self.torque)
+        field, y0 = form.field, form.from_state(ts[0], state0)
+        control: Any = self.controller
+        if control is None:
+            control = StandardController(self.rtol, self.atol, self.max_step)
+        # Where steps end at jumps, the vector field is replaced by a traced program, and the run
+        # uses the time s = σt. `Magnus4`, `FreeSolver` and the splittings read attributes of the
+        # field, which a traced program does not have.
+        solver = self.solver.solver if isinstance(self.solver, Projected) else self.solver
+        stops = self.controller is None or isinstance(control, dfx.ConstantStepSize)
+        stops = stops and not isinstance(solver, AbstractSplitting | Magnus4 | FreeSolver)
+        if isinstance(control, dfx.AbstractAdaptiveStepSizeController):
+            control = Watched(control)
+        along, jumps, dt0, sign = ts, None, self.dt0, None
+        if stops:
+            sign = self.sign
+            field, halt, along, jumps = forward_time(sign, field, watch, ts)
+            if self.cuts is not None:
+                jumps = [*jumps, _signed(sign, self.cuts)]
+        else:
+            dt0 = None if dt0 is None else dt0 * jnp.sign(ts[-1] - ts[0])
+            if self.cuts is not None:
+                cuts = jnp.sort(self.cuts)
+                control = dfx.ClipStepSizeController(control, step_ts=cuts)  # pyright: ignore
+        out = integrate(
+            self.solver, field, along, y0, control, jumps=jumps, halt=halt, dt0=dt0,
+            max_steps=self.max_steps, adjoint=self.adjoint, progress_meter=self.progress_meter,
+        )  # fmt: skip
+        taken = (out.num_steps, out.num_steps - out.num_rejected, out.num_rejected)
+        stats: dict[str, Any] = dict(zip(_COUNTS, taken, strict=True))
+        ys, t = jax.vmap(form.to_state)(ts, out.ys), _signed(sign, out.last_time)
+        end = End(t, form.to_state(t, out.last), out.next_step)
+        if out.missed is not None:
+            stats["switches_missed"] = out.missed
         if watch is not None:
-            ended = result == dfx.RESULTS.event_occurred
+            ended = out.result == dfx.RESULTS.event_occurred
             stats |= {"ended": ended, "end_time": end.time, "end_state": end.state}
         if scene is not None:
             stats["drift"] = scene.drift(ts, ys)
-        return Solved(ys, stats, result)
+        return Trajectory(Solved(ys, stats, out.result), end)
 
     def raise_reason(self, ys: Any, result: dfx.RESULTS) -> Any:
         """Return the states `ys`; raise an error with the reason if the run ended early, but for an
@@ -241,20 +275,7 @@ class Solved(NamedTuple):
     result: dfx.RESULTS
 
 
-@eqx.filter_jit
-def solve(setup: AnyRun, state0: Any, ts: Array) -> Solved:
-    """Compute the motion of one body from `state0`, at the times `ts` (T,), s."""
-    # The whole function is under one `jit`, because a single operation outside of `jit` takes as
-    # long as a hundred steps.
-    state0 = project_to_group(state0)
-    ys, stats, result = setup.solve(state0, ts)
-    if setup.throw:
-        ys = require_complete(setup, ys, result)
-    ys = nan_derivatives(ys, (setup.body, setup.torque, state0, ts))
-    return Solved(ys, stats, result_of_body(result, setup.body))
-
-
-class _End(NamedTuple):
+class End(NamedTuple):
     """Hold the end of a run."""
 
     time: Array  # s
@@ -262,51 +283,24 @@ class _End(NamedTuple):
     step: Array  # the length of the step that would follow, s
 
 
-class _Integrated(NamedTuple):
-    """Hold the result of a run by diffrax."""
+class Trajectory(NamedTuple):
+    """Hold a motion and the end of its run, which the closed form has not."""
 
-    ys: Any
-    stats: dict[str, Any]
-    result: dfx.RESULTS
-    end: _End
+    solved: Solved
+    end: End | None
 
 
-def _integrate(setup: DiffraxRun, watch: Ends | None, state0: Any, ts: Array) -> _Integrated:
-    """Integrate the motion step by step, until `watch`, if any, becomes true."""
-    form = integrated(setup.body, state0, setup.torque)
-    field, y0, control = form.field, form.from_state(ts[0], state0), setup.controller
-    along, jumps, dt0, sign, halt = ts, None, setup.dt0, None, watch
-    if control is None:
-        control = StandardController(setup.rtol, setup.atol, setup.max_step)
-    # Where steps end at jumps, the vector field is replaced by a traced program, and the run uses
-    # the time s = σt. `Magnus4`, `FreeSolver` and the splittings read attributes of the field,
-    # which a traced program does not have.
-    solver = setup.solver.solver if isinstance(setup.solver, Projected) else setup.solver
-    stops = setup.controller is None or isinstance(control, dfx.ConstantStepSize)
-    stops = stops and not isinstance(solver, AbstractSplitting | Magnus4 | FreeSolver)
-    if isinstance(control, dfx.AbstractAdaptiveStepSizeController):
-        control = Watched(control)
-    if stops:
-        sign = setup.sign
-        field, halt, along, jumps = forward_time(sign, field, watch, ts)
-        if setup.cuts is not None:
-            jumps = [*jumps, _signed(sign, setup.cuts)]
-    else:
-        dt0 = None if dt0 is None else dt0 * jnp.sign(ts[-1] - ts[0])
-        if setup.cuts is not None:
-            control = dfx.ClipStepSizeController(control, step_ts=jnp.sort(setup.cuts))
-    out = integrate(
-        setup.solver, field, along, y0, control, jumps=jumps, halt=halt,
-        dt0=dt0, max_steps=setup.max_steps, adjoint=setup.adjoint,
-        progress_meter=setup.progress_meter,
-    )  # fmt: skip
-    taken = (out.num_steps, out.num_steps - out.num_rejected, out.num_rejected)
-    stats: dict[str, Any] = dict(zip(_COUNTS, taken, strict=True))
-    if out.missed is not None:
-        stats["switches_missed"] = out.missed
-    last_time = _signed(sign, out.last_time)
-    end = _End(last_time, form.to_state(last_time, out.last), out.next_step)
-    return _Integrated(jax.vmap(form.to_state)(ts, out.ys), stats, out.result, end)
+@eqx.filter_jit
+def solve(setup: AnyRun, state0: Any, ts: Array) -> Solved:
+    """Compute the motion of one body from `state0`, at the times `ts` (T,), s."""
+    # The whole function is under one `jit`, because a single operation outside of `jit` takes as
+    # long as a hundred steps.
+    state0 = project_to_group(state0)
+    ys, stats, result = setup.motion(state0, ts).solved
+    if setup.throw:
+        ys = require_complete(setup, ys, result)
+    ys = nan_derivatives(ys, (setup.body, setup.torque, state0, ts))
+    return Solved(ys, stats, result_of_body(result, setup.body))
 
 
 def _signed(sign: Array | None, t: Array) -> Array:
@@ -364,14 +358,7 @@ def warn_of_missed(setup: AnyRun, state0: Any, ts: Array, missed: Array) -> None
     )
 
 
-@eqx.filter_jit
-def _rerun(setup: DiffraxRun, state0: Any, ts: Array) -> tuple[_End, Array]:
-    """Return the end of a run that is done once more, and the number of its steps."""
-    state0 = with_own_states(setup.body, project_to_group(state0), setup.torque, ts[0])
-    *_, stats, _, end = _integrate(setup, None, state0, ts)
-    return end, stats["num_steps"]
-
-
+_motion: Any = eqx.filter_jit(lambda run, y, ts: run.motion(project_to_group(y), ts))
 # If the next step is shorter than this fraction of the mean step, the run makes no more progress.
 _STUCK = 1e-2
 
@@ -382,7 +369,8 @@ def explain_max_steps(setup: AnyRun, state0: Any, ts: Array, error: RuntimeError
         return error
     if not _checks.is_known((setup, state0, ts)):
         return error
-    (t, state, step), count = _rerun(dataclasses.replace(setup, throw=False), state0, ts)
+    (_, stats, _), end = _motion(setup, state0, ts)
+    (t, state, step), count = end, stats["num_steps"]
     # A torque that is a function may hold traced numbers, which are then in the result alone.
     if not _checks.is_known((t, state, step, count)):
         return error
