@@ -48,6 +48,7 @@ class Path(NamedTuple):
     rtol: Array  # the relative tolerance of a step
     atol: Array  # the absolute tolerance
     h0: Array  # the length of the first step; NaN if the search chooses it
+    longest: Array  # the length of the longest step
 
 
 class Measured(NamedTuple):
@@ -66,7 +67,6 @@ class Motion(NamedTuple):
     # tolerance.
     attempt: Callable[[Step], tuple[Array, Array]]
     order: int  # the order of this error
-    longest: Array  # the length of the longest step
     condition: Callable[[Array, Array], Measured]
     # counts(t, y, steps) returns whether a zero of g at the time t and the state y is a true zero,
     # and not caused by round-off alone. `steps` is the number of steps before it.
@@ -212,7 +212,7 @@ def _next(motion: Motion, search: Search, run: Path, body: _SearchState) -> _Sea
     stuck = jnp.where(jnp.isfinite(norm), 0.0, jnp.nan).astype(h.dtype)
     longer = jnp.where(last, jnp.maximum(following, lax.stop_gradient(h)), following)
     following = jnp.where(good, longer, jnp.where(following > unit, following, stuck))
-    following = jnp.minimum(following, motion.longest)
+    following = jnp.minimum(following, run.longest)
     good = step & good
     hidden, turn = _hidden_zeros(side, start, here, blur)
     shorter = good & hidden & (turn > unit) & (body.tries < _GUESSES)

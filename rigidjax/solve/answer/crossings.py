@@ -364,7 +364,7 @@ def _jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[PyT
     there = jnp.isfinite(found[0])
 
     def again(setup: Any, event: Event, state0: Any, ts: Array) -> tuple[Array, Array]:
-        crossed, (constants, *_) = section_of_run(setup, event, state0, ts)
+        crossed, (constants, _) = section_of_run(setup, event, state0, ts)
         start = lax.stop_gradient(crossed.signed(ts[0]))
         s = jnp.where(there, found[0], jnp.max(jnp.where(there, found[0], start)))
         t = crossed.signed(s)
@@ -444,7 +444,6 @@ class Numbers(NamedTuple):
 
     constants: Arrays  # those of the functions of the section
     run: Path
-    longest: Array  # the length of the longest step, s
 
 
 def section_of_run(setup: AnyRun, event: Event, state0: Any, ts: Array) -> tuple[Section, Numbers]:
@@ -486,7 +485,7 @@ def section_of_run(setup: AnyRun, event: Event, state0: Any, ts: Array) -> tuple
     stops = jnp.concatenate([program.stops, along[1:]])
     sizes = [leaf.size for leaf in jax.tree.leaves(state0)]
     crossed = Section(solver, of_motion, of_rates, tree, sizes, sign, form)
-    return crossed, Numbers(constants, Path(along[0], stops, y0, rtol, atol, h0), longest)
+    return crossed, Numbers(constants, Path(along[0], stops, y0, rtol, atol, h0, longest))
 
 
 def _sampling_interval(body: Any, state0: Any, length: Array) -> Array:
@@ -506,8 +505,8 @@ def _sampling_interval(body: Any, state0: Any, length: Array) -> Array:
 
 def locate(section: Section, search: Search, numbers: Numbers) -> Located:
     """Return the first crossings of a run, without derivatives."""
-    constants, run, longest = lax.stop_gradient(numbers)
-    return Located(*bodies_last(partial(_locate, section, search), constants, [*run, longest]))
+    constants, run = lax.stop_gradient(numbers)
+    return Located(*bodies_last(partial(_locate, section, search), constants, [*run]))
 
 
 def _locate(
@@ -515,10 +514,9 @@ def _locate(
 ) -> Arrays:
     """Return the fields of `Located` in a list: the crossings of one body, or of many at once.
 
-    `each` are the fields of `Path`, then the length of the longest step, s.
+    `each` are the fields of `Path`.
     """
-    run, longest = Path(*each[:-1]), each[-1]
-    solver, motion = section.solver, layout.vmap(section.motion)
+    run, solver, motion = Path(*each), section.solver, layout.vmap(section.motion)
     project = jax.vmap(section.project, -1, -1) if layout.bodies else section.project
     seen, clear = (partial(layout.vmap(f), constants) for f in (section.measure, section.clarity))
 
@@ -539,10 +537,10 @@ def _locate(
         both = run.y0, motion(constants, run.t0, run.y0)
         size, rate = (jnp.sqrt(jnp.mean((a / scale) ** 2, 0)) for a in both)
         h0 = starting_step(size, rate, solver.tableau.order).astype(run.t0.dtype)
-        h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), longest)
+        h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), run.longest)
         run = run._replace(h0=h0)
         attempt, order = partial(step_with_error, method, constants, run), solver.tableau.order
-    moving = Motion(attempt, order, longest, seen, counts, project)
+    moving = Motion(attempt, order, seen, counts, project)
     return list(crossing_loop.locate_zeros(moving, search, run))
 
 
