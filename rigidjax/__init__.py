@@ -55,7 +55,7 @@ from rigidjax.solve import (
     simulate as simulate,
     solvers as solvers,
 )
-from rigidjax.solve.error import error_of as error_of
+from rigidjax.solve.answer.error import error_of as error_of
 
 if TYPE_CHECKING:
     from rigidjax import (

@@ -157,17 +157,19 @@ def _si(value: Any, name: str, si_unit: str = "") -> Any:
     `Rotation` of SciPy as its quaternion (w, x, y, z), all else unchanged; raise `TypeError` for a
     unit of another dimension.
     """
+    if isinstance(value, jax.Array | float | int):
+        return value
+    if isinstance(value, (list, tuple)):
+        items = [_si(item, name, si_unit) for item in value]
+        same = all(a is b for a, b in zip(items, value, strict=True))
+        return value if same else type(value)(items)
     if is_rotation(value):
         # The order (w, x, y, z) is made here by indices, since `as_quat(scalar_first=True)` needs
         # SciPy 1.14.
         return value.as_quat()[..., [3, 0, 1, 2]]
     value = without_mask(value, name)
-    if isinstance(value, (list, tuple)):
-        items = [_si(item, name, si_unit) for item in value]
-        same = all(a is b for a, b in zip(items, value, strict=True))
-        return value if same else type(value)(items)
     unit = getattr(value, "unit", getattr(value, "units", None))
-    if unit is None or isinstance(value, jax.Array):
+    if unit is None:
         return value
     si_unit = si_unit or _UNITS.get(name, "")
     kind = _dimension(value, unit)
@@ -305,6 +307,15 @@ def _compiled_first(are_bad: Callable[[ModuleType, Any], Any], rows: Array) -> A
 def _not_finite(xp: ModuleType, rows: Array | np.ndarray) -> Array | np.ndarray:
     """Return, for each row, whether it contains a NaN or an infinity."""
     return ~xp.isfinite(rows).reshape(rows.shape[0], -1).all(axis=1)
+
+
+def common_dtype(tree: Any, name: str) -> Any:
+    """Return the one dtype of all arrays of a tree; raise `TypeError` if they have several."""
+    kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(tree)}
+    if len(kinds) != 1:
+        found = ", ".join(sorted(map(str, kinds)))
+        raise TypeError(f"{name}: wanted arrays of one dtype, got {found}; convert them to one")
+    return kinds.pop()
 
 
 def require_finite(value: Numbers, name: str) -> Numbers:

@@ -26,12 +26,12 @@ from rigidjax.motion.coupled import with_own_states
 from rigidjax.motion.torques import bind
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import equations_of_motion
-from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.fixed_loop import inputs_at_start, march_steps
-from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.pieces import steps_per_piece
-from rigidjax.solve.splitting import AbstractSplitting
-from rigidjax.solve.steppers import stepper_of
+from rigidjax.solve.steps.explicit import AbstractExplicit
+from rigidjax.solve.steps.fixed import inputs_at_start, march_steps
+from rigidjax.solve.steps.magnus import Magnus4
+from rigidjax.solve.steps.pieces import steps_per_piece
+from rigidjax.solve.steps.splitting import AbstractSplitting
+from rigidjax.solve.steps.steppers import stepper_of
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 Reduced = TypeVar("Reduced")

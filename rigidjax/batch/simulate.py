@@ -36,10 +36,11 @@ from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of, with_own_states
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation.barrier import platform
-from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
-from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_of_body
-from rigidjax.solve.explicit import DormandPrince8
-from rigidjax.solve.magnus import Magnus4
+from rigidjax.solve import equations_of_motion, simulate as simulate_one
+from rigidjax.solve.answer import validation
+from rigidjax.solve.engine.loop import NONFINITE, finite, result_of_body
+from rigidjax.solve.steps.explicit import DormandPrince8
+from rigidjax.solve.steps.magnus import Magnus4
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 

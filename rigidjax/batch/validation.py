@@ -19,7 +19,7 @@ from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.rotation.validation import rotation_tolerance
-from rigidjax.solve import validation
+from rigidjax.solve.answer import validation
 
 # The type of `torque_axes`, which says which arrays of a torque have a row for each body: 0 for
 # all, a function that selects the arrays, or a tree of 0 and `None`.
@@ -104,7 +104,7 @@ def check_batch(
                 f"states0: wanted {count} rows as in omega, got {str(path[-1]).lstrip('.')} of "
                 f"shape {leaf.shape}"
             )
-    dtype = validation.common_dtype(states0, "states0")
+    dtype = _checks.common_dtype(states0, "states0")
     _checks.numeric_array(states0.omega, "states0")
     if not isinstance(bodies, Inertia | MassProperties):
         raise TypeError(

@@ -22,7 +22,7 @@ from rigidjax.orbits.differential_correction import (
     numbers_of,
     state_after,
 )
-from rigidjax.solve.run import Ends
+from rigidjax.solve.answer.run import Ends
 
 if TYPE_CHECKING:
     from rigidjax.orbits.reversible_scene import AbstractReversible

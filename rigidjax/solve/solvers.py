@@ -2,15 +2,15 @@
 
 from rigidjax._names import define_dir_and_getattr
 from rigidjax.exact.diffrax_solver import FreeSolver as FreeSolver
-from rigidjax.solve.explicit import (
+from rigidjax.solve.engine.projection import Projected as Projected
+from rigidjax.solve.engine.replay import ReplayAdjoint as ReplayAdjoint
+from rigidjax.solve.steps.explicit import (
     DormandPrince8 as DormandPrince8,
     RungeKutta4 as RungeKutta4,
     Tsitouras5 as Tsitouras5,
 )
-from rigidjax.solve.magnus import Magnus4 as Magnus4
-from rigidjax.solve.projection import Projected as Projected
-from rigidjax.solve.replay_adjoint import ReplayAdjoint as ReplayAdjoint
-from rigidjax.solve.splitting import (
+from rigidjax.solve.steps.magnus import Magnus4 as Magnus4
+from rigidjax.solve.steps.splitting import (
     Splitting2 as Splitting2,
     Splitting4 as Splitting4,
     Splitting6 as Splitting6,

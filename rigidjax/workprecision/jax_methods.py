@@ -14,8 +14,8 @@ from rigidjax import _checks
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact import FreeBody
 from rigidjax.solve import adaptive, equations_of_motion, fixed, simulate, solvers
-from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.splitting import AbstractSplitting
+from rigidjax.solve.steps.explicit import AbstractExplicit
+from rigidjax.solve.steps.splitting import AbstractSplitting
 from rigidjax.workprecision.scene import BenchmarkScene, PreparedMethod, TimedMethod
 
 # TOLERANCES are the settings of methods with adaptive steps. EIGHT and FOUR are the settings of

@@ -14,7 +14,9 @@ from rigidjax import _checks
 from rigidjax.batch import sharding
 from rigidjax.identify.answer import fit as fits
 from rigidjax.rotation.barrier import platform
-from rigidjax.solve import adaptive_loop, batching, fixed_loop, pieces
+from rigidjax.solve.engine import loop as adaptive_loop
+from rigidjax.solve.programs import batching
+from rigidjax.solve.steps import fixed as fixed_loop, pieces
 
 CHANGES = jnp.asarray([1.0, -0.5, 0.25])
 

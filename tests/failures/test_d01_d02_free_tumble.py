@@ -1,6 +1,6 @@
 """Rows D1, D2: the order of the attitude under projection, and a motion that is right, not only conserved.
 
-D1 for our own methods: tests/solve/test_explicit.py, test_splitting.py. Here: diffrax's, projected.
+D1 for our own methods: tests/solve/steps/test_explicit.py, test_splitting.py. Here: diffrax's, projected.
 Measured slopes: Bosh3 2.94, Tsit5 5.03. D2: what is conserved to 1e-10 can still be wrong; so the
 rate itself is compared, against 50 digits, and has to fall with the step as the order says.
 """

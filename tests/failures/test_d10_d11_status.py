@@ -10,7 +10,7 @@ from once import filter_once
 from systems.tumble import BODY, OMEGA, TOP, Q
 
 import rigidjax as rj
-from rigidjax.solve.adaptive_loop import NONFINITE
+from rigidjax.solve.engine.loop import NONFINITE
 
 TS = jnp.array([0.0, 5.0, 20.0])
 SOLVERS = pytest.mark.parametrize("solver", [None, dfx.Dopri8()], ids=["default", "Dopri8"])

@@ -5,7 +5,7 @@
   Runge–Kutta methods at every error, and past h |Ω| ≈ 1 its equation has no solution.
 - D21, implicit midpoint: not offered either; diffrax's implicit methods pass through `simulate`,
   and where their equations are not solved the result says so.
-- D22, a million steps: tests/solve/test_splitting.py, slow.
+- D22, a million steps: tests/solve/steps/test_splitting.py, slow.
 - D23, fast tops: the free flow is exact in a splitting, whatever the spin.
 - D24, a rod has no Euler's equations: refused, in words.
 """

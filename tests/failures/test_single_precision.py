@@ -10,7 +10,7 @@ from systems import tops_mp
 from systems.tumble import BODY, OMEGA, TOP, Q
 
 import rigidjax as rj
-from rigidjax.solve.adaptive_loop import NONFINITE
+from rigidjax.solve.engine.loop import NONFINITE
 
 SINGLE = jnp.float32
 EQUAL = dfx.ConstantStepSize()

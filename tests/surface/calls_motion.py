@@ -349,7 +349,7 @@ row(
     arguments=("accuracy",),
     traced=("accuracy", "state0"),
     groups=(*KINDS, "nan", "inf"),
-    # Stated errors are not repeated to the last digit; tests/solve/test_error.py has them.
+    # Stated errors are not repeated to the last digit; tests/solve/answer/test_error.py has them.
     transforms=(),
 )
 row(

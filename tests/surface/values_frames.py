@@ -462,7 +462,7 @@ way(
 )  # fmt: skip
 
 leave_out(
-    "asked during a run: tests/orbits and tests/solve/test_ending.py look at it",
+    "asked during a run: tests/orbits and tests/solve/answer/test_ending.py look at it",
     *(f"orbits.{name}.{what}" for name in ("Hill", "ThreeBody") for what in ("ends", "end_words")),
 )
 

@@ -494,7 +494,7 @@ leave_out("holds what the rows of `adaptive` and of `BodyInFrame` compare", "sol
           "frames.FrameWrench")  # fmt: skip
 leave_out("a truth value beside `times`: the row of `crossings`", "solve.Crossings.full")
 leave_out(
-    "errors, held against true ones: tests/solve/test_error.py",
+    "errors, held against true ones: tests/solve/answer/test_error.py",
     *("error_of", "solve.Error", "solve.FunctionError", "solve.FunctionError.known"),
     *(
         "solve.Solution.error",

@@ -44,8 +44,8 @@ from rigidjax.motion.torques.composite import parts_of
 from rigidjax.rotation.kernels import to_unit_length
 from rigidjax.rotation.linalg3 import cross
 from rigidjax.solve import equations_of_motion
-from rigidjax.solve.equal_steps import state_after_step
-from rigidjax.solve.tableaus import KUTTA4
+from rigidjax.solve.steps.equal_steps import state_after_step
+from rigidjax.solve.steps.tableaus import KUTTA4
 
 
 class ExtendedState(eqx.Module):

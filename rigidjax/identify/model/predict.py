@@ -29,12 +29,12 @@ from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.motion.torques.states import freeze_own_states
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
-from rigidjax.solve.components import split_scalars
-from rigidjax.solve.equal_steps import loop_low_order, state_after_step
-from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.fixed_loop import equal_step, fill_rows, inputs_at_start
-from rigidjax.solve.steppers import cheapest_method, stepper_of
-from rigidjax.solve.tableaus import KUTTA4
+from rigidjax.solve.steps.components import split_scalars
+from rigidjax.solve.steps.equal_steps import loop_low_order, state_after_step
+from rigidjax.solve.steps.explicit import AbstractExplicit
+from rigidjax.solve.steps.fixed import equal_step, fill_rows, inputs_at_start
+from rigidjax.solve.steps.steppers import cheapest_method, stepper_of
+from rigidjax.solve.steps.tableaus import KUTTA4
 
 # If the body turns by TURN_A_STEP rad in each step, a method of order 5 has an error of 1e-9 for
 # each radian of the turn. A method of order 4 has this error with TURN_OF_ORDER_4 rad in each step,

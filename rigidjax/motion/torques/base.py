@@ -24,7 +24,7 @@ from rigidjax._types import (
     Vector,
 )
 from rigidjax.body.inertia import Body, Inertia, MassProperties, tensor_of as tensor_of
-from rigidjax.motion.torques.states import FrozenLaw, require_frozen_states
+from rigidjax.motion.torques.states import FrozenLaw, has_own_states
 
 
 class Wrench(eqx.Module):
@@ -213,7 +213,10 @@ def require_compatible(torque: Torque | None, state: object, body: object) -> No
     )
     if torque is not None:
         require_state_type(torque, state)
-        require_frozen_states(torque)
+        if has_own_states(torque):
+            words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate "
+            words += "and identify.fit integrate them; elsewhere call it with its states last"
+            raise TypeError(f"{type(torque).__name__} {words}: torque(t, state, body, own)")
         require_single(torque.law if isinstance(torque, FrozenLaw) else torque)
     _checks.require_unbatched_instance(body, (Inertia, MassProperties), "body")
 
@@ -304,12 +307,9 @@ def require_single(torque: Torque) -> None:
 
 def in_precision(tree: PyTree, dtype: DTypeLike) -> PyTree:
     """Return a pytree with every floating-point array converted to `dtype`; all else stays."""
-
-    def convert(leaf: PyTree) -> PyTree:
-        is_array = eqx.is_array_like(leaf) and hasattr(leaf, "dtype")
-        return leaf.astype(dtype) if is_array and jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
-
-    return jax.tree.map(convert, tree)
+    kind = lambda a: getattr(a, "dtype", bool) if eqx.is_array_like(a) else bool  # noqa: E731
+    floating = lambda a: jnp.issubdtype(kind(a), jnp.floating)  # noqa: E731
+    return jax.tree.map(lambda leaf: leaf.astype(dtype) if floating(leaf) else leaf, tree)
 
 
 def vector_at(source: PyTree, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:

@@ -133,16 +133,6 @@ def state_rates(
     return tuple(rates)
 
 
-def require_frozen_states(torque: PyTree) -> None:
-    """Raise `TypeError` if `torque` has states of its own that are not inserted (see
-    `freeze_own_states`).
-    """
-    if has_own_states(torque):
-        words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate and "
-        words += "identify.fit integrate them; elsewhere call it with its states last"
-        raise TypeError(f"{type(torque).__name__} {words}: torque(t, state, body, own)")
-
-
 def _inserted(torque: PyTree, states_of: Callable[[PyTree], PyTree]) -> PyTree:
     """Return a torque in which each one with states of its own is a `FrozenLaw` with the states
     that `states_of` returns, which is called for inner torques first.

@@ -1,0 +1,1 @@
+"""Compute a motion, its error, its crossings and its exponents."""

@@ -1,0 +1,1 @@
+"""Run adaptive steps, record them, and repeat them in derivatives."""

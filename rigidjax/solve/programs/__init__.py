@@ -1,0 +1,1 @@
+"""Trace functions, give linear maps a transpose, and run programs with the bodies last."""

@@ -1,0 +1,1 @@
+"""Take one step of a method, or equal steps."""
