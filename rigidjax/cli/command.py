@@ -239,6 +239,23 @@ OPTIONS: dict[str, dict[str, Any]] = {
         nargs="+", default=[], choices=("bias", "drag", "delay"),
         help="what else the fit may change: the bias of the sensors and the delay of the wheels, "
         "for each log; one linear drag for all logs"),
+    "--wrench": dict(
+        nargs=6, metavar=("FX", "FY", "FZ", "TX", "TY", "TZ"),
+        help="a body that is carried: columns of the force, N, and torque, N m, of the support on "
+        "the body, at the origin of its frame and in its axes; finds mass, centre and inertia"),
+    "--pose": dict(
+        nargs=7, metavar=("X", "Y", "Z", "QW", "QX", "QY", "QZ"),
+        default=["x", "y", "z", "qw", "qx", "qy", "qz"],
+        help="with --wrench: columns of the frame's place, m, and attitude, frame to world "
+        "(default: x y z qw qx qy qz)"),
+    "--motion": dict(
+        nargs=9, default=[], metavar=("WX", "WY", "WZ", "AX", "AY", "AZ", "ALX", "ALY", "ALZ"),
+        help="with --wrench: columns of the frame's rate, of the acceleration of its origin "
+        "(without gravity) and of the derivative of the rate, in its own axes (default: from "
+        "smoothed poses)"),
+    "--gravity": dict(
+        nargs=3, type=float, default=[0.0, 0.0, -9.81], metavar=("GX", "GY", "GZ"),
+        help="with --wrench: gravity in the frame of the poses, m/s² (default: 0 0 -9.81)"),
     "--starts": dict(type=int, help="how many starting points of the fit to try"),
     "--checkpoint": dict(
         type=Path, help="store the state of a long fit in this file, and resume the fit from it"),
@@ -327,6 +344,12 @@ def _read_logs(
     """
     if options.columns and options.time:
         raise LogError("--time: not together with --columns, whose first name is the time column")
+    if options.wrench:
+        how = dict(gravity=options.gravity, time=options.time or "t", window=options.window)
+        how |= dict(time_unit=options.time_unit, noise=options.noise, free=options.free)
+        columns = options.wrench, options.pose, options.motion
+        held = [spec.read_held(path, *columns, **how) for path in options.logs]
+        return [], held, spec.model_of_held(held, options.free, options.loss)
     wheels = [spec.parse_wheel(text) for text in options.wheel]
     if options.model in ("tensor", "principal") and not wheels:
         words = "free motion shows ratios only; a scale needs a --wheel"

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rigidjax.body.inertia import MassProperties
 from rigidjax.cli.logs.errors import LogError, warn
 from rigidjax.cli.logs.layouts import known_unit
 from rigidjax.cli.logs.table import read_table
@@ -23,8 +24,23 @@ from rigidjax.identify.model.free import Free
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.priors import Huber, SoftL1
 from rigidjax.identify.model.scene import Scene
-from rigidjax.identify.sensors import AbstractSensor, Accelerometer, AttitudeSensor, Gyro
-from rigidjax.motion.torques import Damping, Flywheel, Input, Series, Sum, Wheel
+from rigidjax.identify.sensors import (
+    AbstractSensor,
+    Accelerometer,
+    AttitudeSensor,
+    ForceTorque,
+    Gyro,
+)
+from rigidjax.motion.torques import (
+    Carried,
+    Damping,
+    Flywheel,
+    Input,
+    LoggedMotion,
+    Series,
+    Sum,
+    Wheel,
+)
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation import euler
 
@@ -265,6 +281,68 @@ def _sensor(
         return AttitudeSensor(noise), np.asarray(jax.vmap(turned)(jnp.asarray(values)))
     except ValueError as error:
         raise LogError(f"sensor {channel.kind}: {error}") from None
+
+
+def read_held(
+    path: str | Path,
+    wrench: Sequence[str],
+    pose: Sequence[str],
+    motion: Sequence[str] = (),
+    *,
+    gravity: Sequence[float],
+    time: str = "t",
+    time_unit: str | None = None,
+    window: tuple[float, float] | None = None,
+    noise: Sequence[float] | None = None,
+    free: Sequence[str] = (),
+) -> Recording:
+    """Return the recording of a body that is carried, from the columns of its `pose` (x y z qw qx
+    qy qz, world) and of the `wrench` on it (fx fy fz tx ty tz, N and N m, in its own axes).
+
+    The columns of `motion`, if there are any, are rate, acceleration of the origin and dΩ/dt (nine,
+    rad and m, in its own axes); without them the poses are smoothed. The `gravity` (3,) is in m/s²,
+    world frame; `noise` is that of force, N, and of torque, N m. **Raises** `LogError` as
+    `read_table`, and for poses or a wrench with gaps.
+    """
+    names = [*pose, *wrench, *motion]
+    table = read_table(path, [time, *dict.fromkeys(names)])
+    scale = UNITS[unit_of_time(path, time, time_unit)]
+    finite = np.flatnonzero(np.isfinite(table[time]))
+    t = (table[time] - (table[time][finite[0]] if finite.size else 0.0)) * scale
+    kept = increasing_rows(path, t, time, window)
+    t, rows = t[kept], np.stack([table[name] for name in names], axis=1)[kept]
+    whole = np.isfinite(rows).all(axis=1)
+    t, rows = t[whole], rows[whole]
+    if noise is not None and len(noise) != 2:
+        raise LogError("--noise: wanted two numbers with --wrench: of force, N, and torque, N m")
+    bias = np.zeros(6) if "bias" in free else None
+    sensor = ForceTorque(noise, gravity=gravity, bias=bias)
+    place, turn, logged = rows[:, :3], rows[:, 3:7], rows[:, 13:]
+    turn = turn / np.maximum(np.linalg.norm(turn, axis=1, keepdims=True), 1e-300)
+    try:
+        if motion:
+            given = LoggedMotion(t, place, turn, *np.split(logged, 3, axis=1))
+        else:
+            given = LoggedMotion.from_poses(t, place, turn)
+        return Recording(t, (sensor, rows[:, 7:13]), inputs={"motion": given})
+    except ValueError as error:
+        raise LogError(f"{path}: {error}") from None
+
+
+def model_of_held(recordings: Sequence[Recording], free: Sequence[str], loss: str) -> Model:
+    """Return the model of recordings of `read_held`: all ten numbers of the body, and the bias of
+    the sensor in each recording if `free` names it.
+    """
+    bias: Callable[[Any], Any] = lambda scene: scene.sensors[0].bias  # noqa: E731
+    where = Free(bias, "bias", unit="N, N m", each=True)
+    guess = MassProperties(1.0, [0.0, 0.0, 0.0], 1e-3 * np.eye(3))
+    return Model(
+        list(recordings),
+        charts.Mass(guess),
+        torque=Carried(),
+        free=[where] if "bias" in free else [],
+        loss=LOSSES[loss],
+    )
 
 
 def wheel_names(wheels: Sequence[WheelColumn]) -> list[str]:

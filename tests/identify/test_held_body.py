@@ -81,6 +81,9 @@ def test_noise_gives_intervals_and_a_possible_body():
     assert (np.linalg.eigvalsh(fit.body.second_moment) > -1e-12).all()
     low, high = fit.interval_of(lambda point: jnp.r_[point.body.mass, point.body.com])
     truth = ten_numbers(TOOL)[:4]
+    for quantity in fit.quantities:
+        low_end, high_end = quantity.interval()
+        assert low_end < quantity.value < high_end
     # Two of these four 95 % intervals may miss at once in one of seventy sets.
     assert ((low <= truth) & (truth <= high)).sum() >= 3
     assert ((high - low) < [0.02, 0.005, 0.005, 0.005]).all()
