@@ -14,6 +14,8 @@ from rigidjax.plot.style import (
     MARKERS,
     RATES,
     TIMES,
+    Channels,
+    channels_of,
     escape_formulas,
     pyplot,
     residuals_of,
@@ -49,7 +51,8 @@ def fit(
     seconds = unit_factor(time_unit, TIMES, "time_unit")
     rate = unit_factor(rate_unit, RATES, "rate_unit")
     record, left, _ = residuals_of(fit_result, index)
-    count = len(record.readings)
+    channels = channels_of([reading.sensor for reading in record.readings])
+    count = len(channels)
     size, how = (max(6.2 * count, 7.5), 6), dict(squeeze=False, layout="constrained")
     figure, axes = plt.subplots(2, count, figsize=size, sharex=True, height_ratios=(2, 1), **how)
     dense, model, body, state0 = None, fit_result.model, fit_result.body, fit_result.state0
@@ -61,9 +64,11 @@ def fit(
             body = body[model.body_names[index]]
         times = np.linspace(record.t[0], record.t[-1], 800)
         dense = times, simulate(body, state0, times).ys
-    for column, (reading, errors) in enumerate(zip(record.readings, left, strict=True)):
+    units = seconds, rate, rate_unit
+    for column, one in enumerate(channels):
         upper, lower = axes[:, column]
-        _draw_sensor(upper, lower, record.t, reading, errors, dense, (seconds, rate, rate_unit))
+        reading, errors = record.readings[one.sensor], left[one.sensor]
+        _draw_sensor(upper, lower, record.t, reading, errors, dense, units, one)
         lower.axhline(0, color="0.6", lw=0.8)
         lower.set_xlabel(f"time, {time_unit}")
         upper.margins(x=0.02, y=0.2)
@@ -82,9 +87,10 @@ def _draw_sensor(
     errors: np.ndarray,
     dense_states: tuple[np.ndarray, PyTree] | None,
     units: tuple[float, float, str],
+    channels: Channels,
 ) -> None:
-    """Draw the readings of one sensor and the fitted line in the upper axes, and the residuals, in
-    the unit of the sensor, in the lower axes.
+    """Draw the readings of at most three channels of one sensor and the fitted line in the upper
+    axes, and the residuals, in the unit of the sensor, in the lower axes.
 
     With dense times, s, and states the line is smooth; else it joins the predictions. The units are
     the number of s in that of time, the factor from rad/s to that of rates, and the name of the
@@ -93,8 +99,10 @@ def _draw_sensor(
     (seconds, rate, rate_unit), seen, sensor = units, reading.host_mask, reading.sensor
     t = np.asarray(ts) / seconds
     values = np.asarray(reading.values).reshape(len(t), -1)
+    scale, unit, line_t = 1.0, channels.unit, t
+    if sensor.components > 3:
+        values, errors = values[:, channels.part], errors[:, channels.part]
     names: tuple[str, ...] = ("x", "y", "z")[: values.shape[1]]
-    scale, unit, line_t = 1.0, sensor.unit, t
     if sensor.reading_shape == (4,):
         read, scale = np.asarray(_body_z(values)), 180 / np.pi
         # The predicted attitude is the attitude read, turned back by the residual, which is a

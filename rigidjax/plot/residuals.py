@@ -8,6 +8,7 @@ from rigidjax.plot.style import (
     COLOURS,
     TIMES,
     axes_of_shape,
+    channels_of,
     escape_formulas,
     residuals_of,
     unit_factor,
@@ -34,7 +35,8 @@ def residuals(
       model lacks.
 
     **Arguments:** `fit_result` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit`
-    `s`, `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
+    `s`, `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4), two rows for a
+    `ForceTorque`. **Returns** the axes.
 
     >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> residuals(found)[0, 2].get_xlabel()
@@ -42,12 +44,16 @@ def residuals(
     """
     seconds = unit_factor(time_unit, TIMES, "time_unit")
     record, left, noises = residuals_of(fit_result, index)
-    count = len(record.readings)
+    channels = channels_of([reading.sensor for reading in record.readings])
+    count = len(channels)
     ax = axes_of_shape(ax, (count, 4), nrows=count, ncols=4, figsize=(10.5, 2.8 * count))
     t = np.asarray(record.t) / seconds
-    for row, reading, errors, noise in zip(ax, record.readings, left, noises, strict=True):
-        _draw(row, t, errors / noise, np.asarray(reading.host_mask))
-        row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
+    for row, (index, part, unit) in zip(ax, channels, strict=True):
+        reading, standardised = record.readings[index], left[index] / noises[index]
+        _draw(row, t, standardised[:, part], np.asarray(reading.host_mask))
+        name = type(reading.sensor).__name__
+        name = name if unit == reading.sensor.unit else f"{name}, {unit}"
+        row[0].set_ylabel(f"{name}\nerror / noise")
         row[0].set_xlabel(f"time, {time_unit}")
         row[3].set_xlabel(f"frequency, {'Hz' if time_unit == 's' else f'1/{time_unit}'}")
     ax[0, 0].set_title(escape_formulas(title) or "residuals of the fit", loc="left")

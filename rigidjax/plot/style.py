@@ -1,5 +1,6 @@
 """Provide what all pictures share: colours, axes, the import of matplotlib, checks of arguments."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -67,6 +68,25 @@ def residuals_of(fit_result: Any, index: object) -> Residuals:
         for noise, one in zip(fit_result.noise, record.readings, strict=True)
     ]
     return Residuals(record, errors, noises)
+
+
+class Channels(NamedTuple):
+    """Hold components of a sensor that are drawn in one panel, at most three, and their unit."""
+
+    sensor: int  # its index
+    part: slice
+    unit: str
+
+
+def channels_of(sensors: Sequence[Any]) -> list[Channels]:
+    """Return the components of all sensors in panels: those of a force and of a torque are two."""
+    out = []
+    for index, sensor in enumerate(sensors):
+        starts, units = range(0, sensor.components, 3), sensor.unit.split(", ")
+        for number, start in enumerate(starts):
+            unit = units[number] if len(units) == len(starts) else sensor.unit
+            out.append(Channels(index, slice(start, start + 3), unit))
+    return out
 
 
 def axes_2d_or_new(ax: Any, **options: Any) -> Any:

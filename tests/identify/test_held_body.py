@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import rigidjax as rj
 from rigidjax import identify
+from rigidjax.cli import command
 from rigidjax.identify.data.stacking import pad_to_few
 from rigidjax.motion.torques import Carried, LoggedMotion
 
@@ -201,3 +202,37 @@ def test_intervals_hold_over_many_records():
         held.append((low <= truth) & (truth <= high))
     # 2 000 intervals, of which ten share a record: three standard deviations are about 2 %.
     assert 0.93 < np.mean(held) < 0.97
+
+
+def test_the_command_line_reads_poses_and_a_wrench(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(11)
+    readings = wrench_of(TOOL) + NOISE * rng.normal(size=(T.size, 6))
+    names = "t,x,y,z,qw,qx,qy,qz,fx,fy,fz,tx,ty,tz"
+    rows = np.column_stack([1e3 * T, X, Q, readings])
+    np.savetxt("tool.csv", rows, delimiter=",", header=names, comments="", fmt="%.10g")
+    wrench = ["--wrench", "fx", "fy", "fz", "tx", "ty", "tz", "--time-unit", "ms"]
+    noise = ["--noise", "0.05", "0.0025", "--figure", "tool.png", "--no-cache"]
+    assert command.main(["identify", "tool.csv", *wrench, *noise]) == 0
+    said = capsys.readouterr().out
+    assert "status: ok" in said
+    low, high = (
+        float(number)
+        for number in said.split("\nmass")[1].split("kg")[0].split(maxsplit=1)[1].split("…")
+    )
+    assert low < 0.7 < high < low + 0.01
+    assert (tmp_path / "tool.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [(["--noise", "0.1"], "two numbers"), (["--pose", *"abcdefg"], "no column")],
+)
+def test_mistakes_on_the_command_line_are_answered(more, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = "t,x,y,z,qw,qx,qy,qz,fx,fy,fz,tx,ty,tz"
+    rows = np.column_stack([T, X, Q, wrench_of(TOOL)])[:20]
+    np.savetxt("tool.csv", rows, delimiter=",", header=names, comments="", fmt="%.10g")
+    wrench = ["--wrench", "fx", "fy", "fz", "tx", "ty", "tz"]
+    assert command.main(["identify", "tool.csv", *wrench, *more, "--no-cache"]) == 2
+    assert words in capsys.readouterr().err

@@ -121,7 +121,8 @@ def labels(model: Model) -> list[Label]:
     for slot in model.slots:
         parts = [""]
         if slot.shape:
-            axes = dict(enumerate("xyz")) if len(slot.shape) == 1 else {}
+            channels = ("fx", "fy", "fz", "tx", "ty", "tz") if slot.shape == (6,) else "xyz"
+            axes = dict(enumerate(channels)) if slot.shape in ((3,), (6,)) else {}
             parts = [f" {axes.get(i[0], i)}" for i in np.ndindex(slot.shape)]
         ends = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
         ends = ends if slot.spread is None else [*ends, *(f", own{where}" for where in names)]
