@@ -21,7 +21,7 @@ from rigidjax.identify.answer.result import (
     verdict as verdict,
 )
 from rigidjax.identify.answer.table import (
-    Row as Row,
+    Row,
     html_rows,
     numbers as numbers,
     table as table,
@@ -207,7 +207,7 @@ img {{ max-width: 100%; margin: 1rem 0 }}
 
 
 __all__ = [
-    "Row", "as_dict", "as_html", "numbers", "rows", "table", "verdict", "write_html", "write_json",
+    "as_dict", "as_html", "numbers", "rows", "table", "verdict", "write_html", "write_json",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)
