@@ -3,7 +3,8 @@
 The modules are, from the ground up: `quaternion`, `so3`, `euler` and `body`; `motion` and
 `torques`; `frames`; `exact` and `solve` (the motion in closed form, or by a solver); and
 `identify`, `batch`, `workprecision` and `plot`, which use the others. `elliptic`, `lagrangian`,
-`orbits` and `tumblers` are loaded when they are first used. Most programs begin with `simulate`.
+`orbits`, `suspensions` and `tumblers` are loaded when they are first used. Most programs begin with
+`simulate`.
 
 Every function raises `TypeError` for an argument of a wrong type (also for half precision) and
 `ValueError` for a wrong shape; docstrings list the other errors. Under `jit` the errors are errors
@@ -37,7 +38,13 @@ from rigidjax.body import (
     volumes as volumes,
 )
 from rigidjax.frames import Point as Point, scenes as scenes
-from rigidjax.motion import Attitude as Attitude, Rigid as Rigid, Spin as Spin, torques as torques
+from rigidjax.motion import (
+    Attitude as Attitude,
+    Rigid as Rigid,
+    Spin as Spin,
+    Turn as Turn,
+    torques as torques,
+)
 from rigidjax.motion.conserved import conserved as conserved, drift as drift, energy as energy
 from rigidjax.rotation import (
     euler as euler,
@@ -64,6 +71,7 @@ if TYPE_CHECKING:
         lagrangian as lagrangian,
         orbits as orbits,
         plot as plot,
+        suspensions as suspensions,
         tumblers as tumblers,
         workprecision as workprecision,
     )
@@ -72,15 +80,25 @@ __version__ = "0.2.0"
 
 # These packages are loaded when they are first asked for: few programs draw, and fewer compare
 # methods.
-_LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "tumblers", "workprecision")
+_LATER = (
+    "datasets",
+    "elliptic",
+    "lagrangian",
+    "orbits",
+    "plot",
+    "suspensions",
+    "tumblers",
+    "workprecision",
+)
 
 __all__ = [
-    "Attitude", "Event", "Inertia", "MassProperties", "Point", "Rigid", "Spin", "angular_momentum",
-    "batch", "body", "conserved", "crossings", "datasets", "drift", "elliptic", "energy",
-    "equations_of_motion", "error_of", "euler", "exact", "frames", "identify", "kinetic_energy",
-    "lagrangian", "lyapunov_exponents", "motion", "mrp", "orbits", "parameters", "plot",
-    "quaternion", "rodrigues", "scenes", "set_xla_flags", "shapes", "simulate", "so3", "solve",
-    "solvers", "spatial_angular_momentum", "torques", "tumblers", "volumes", "workprecision",
+    "Attitude", "Event", "Inertia", "MassProperties", "Point", "Rigid", "Spin", "Turn",
+    "angular_momentum", "batch", "body", "conserved", "crossings", "datasets", "drift", "elliptic",
+    "energy", "equations_of_motion", "error_of", "euler", "exact", "frames", "identify",
+    "kinetic_energy", "lagrangian", "lyapunov_exponents", "motion", "mrp", "orbits", "parameters",
+    "plot", "quaternion", "rodrigues", "scenes", "set_xla_flags", "shapes", "simulate", "so3",
+    "solve", "solvers", "spatial_angular_momentum", "suspensions", "torques", "tumblers", "volumes",
+    "workprecision",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

@@ -403,6 +403,7 @@ def require_instance(
 _ONE = {
     "tensor": (3, 3), "mass": (), "com": (3,), "second_moment": (3, 3),
     "x": (3,), "v": (3,), "q": (4,), "omega": (3,),
+    "angle": (), "rate": (),
 }  # fmt: skip
 
 

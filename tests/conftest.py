@@ -9,7 +9,16 @@ from pathlib import Path
 import pytest
 
 # What `import rigidjax` leaves until it is asked for: imported here under the hook.
-LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "tumblers", "workprecision")
+LATER = (
+    "datasets",
+    "elliptic",
+    "lagrangian",
+    "orbits",
+    "plot",
+    "suspensions",
+    "tumblers",
+    "workprecision",
+)
 
 
 def pytest_configure(config):

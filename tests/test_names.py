@@ -127,7 +127,7 @@ def test_readme_and_guide_use_what_is_shown():
 LATER = """
 import sys, rigidjax
 heavy = "scipy.signal", "scipy.stats", "scipy.interpolate", "scipy.special", "scipy.optimize", "optax.contrib",
-heavy += "matplotlib", "rigidjax.plot", "rigidjax.workprecision", "rigidjax.elliptic", "rigidjax.orbits", "rigidjax.lagrangian", "rigidjax.tumblers"
+heavy += "matplotlib", "rigidjax.plot", "rigidjax.workprecision", "rigidjax.elliptic", "rigidjax.orbits", "rigidjax.lagrangian", "rigidjax.tumblers", "rigidjax.suspensions"
 print([name for name in heavy if name in sys.modules])
 rigidjax.plot.fit, rigidjax.workprecision.measure
 """

@@ -64,7 +64,7 @@ def sncndn(
     [0.803001824896, 0.595976567672, 0.823161001632]
     """
     u, m, m1 = common(u=u, **with_complement("m", m, m1))
-    s, c, d, _ = _functions(u, by_complement(m, m1), m1)
+    s, c, d, _ = functions(u, by_complement(m, m1), m1)
     return s, c, d
 
 
@@ -79,7 +79,7 @@ def am(u: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     0.932315079884
     """
     u, m, m1 = common(u=u, **with_complement("m", m, m1))
-    s, c, _, turns = _functions(u, by_complement(m, m1), m1)
+    s, c, _, turns = functions(u, by_complement(m, m1), m1)
     sign = power_of_minus_one(turns)
     return jnp.arctan2(sign * s, sign * c) + math.pi * turns
 
@@ -95,7 +95,7 @@ class Functions(NamedTuple):
     half_turns: Array
 
 
-def _functions(u: Array, m: Array, m1: Array) -> Functions:
+def functions(u: Array, m: Array, m1: Array) -> Functions:
     """Return Jacobi's functions for any real parameter."""
     # By DLMF 22.17.2–4, a parameter m > 1 is replaced by 1/m and u by u√m; cn and dn change places.
     above = m1 < 0

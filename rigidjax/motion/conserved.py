@@ -1,6 +1,6 @@
 """Compute the conserved quantities of a body under torques, and their drift in a simulation."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,8 @@ from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, V
 from rigidjax.body.energy import angular_momentum, kinetic_energy
 from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.motion.coupled import Coupled, motion_of
+from rigidjax.motion.equations import Turn
+from rigidjax.motion.suspension import AbstractSuspension
 from rigidjax.motion.torques import AbstractTorque, CentralGravity
 from rigidjax.motion.torques.base import Torque, in_precision, length_or_zero, require_compatible
 from rigidjax.motion.torques.composite import parts_of
@@ -21,8 +23,8 @@ from rigidjax.rotation.linalg3 import cross, dot
 
 def energy(
     body: Inertia | MassProperties,
-    state: HasSpin | Coupled,
-    torque: Torque | None = None,
+    state: HasSpin | Turn | Coupled,
+    torque: Torque | AbstractSuspension | None = None,
     t: ScalarLike = 0.0,
 ) -> Scalar:
     """Return the kinetic energy plus the potential energies of all torques and forces, J: `½ m |v|²
@@ -39,7 +41,10 @@ def energy(
     >>> energy(rj.Inertia.from_principal(1.0, 1.0, 1.0), start, top)
     Array(10.31, dtype=float64)
     """
-    motion, parts, t = _checked(body, state, torque, t)
+    law: Any = torque
+    if isinstance(law, AbstractSuspension):
+        return law.energy(law.require_body(body), cast(Turn, state))
+    motion, parts, t = _checked(body, state, law, t)
     for part in parts:
         if not hasattr(part, "energy"):
             words = f"energy: wanted torques with a potential, got {type(part).__name__}, which has"
@@ -51,8 +56,8 @@ def energy(
 
 def conserved(
     body: Inertia | MassProperties,
-    state: HasSpin | Coupled,
-    torque: Torque | None = None,
+    state: HasSpin | Turn | Coupled,
+    torque: Torque | AbstractSuspension | None = None,
     t: ScalarLike = 0.0,
 ) -> dict[str, Float[Array, "..."]]:
     """Return the quantities that the exact motion of a body under a torque conserves, at one state.
@@ -84,6 +89,9 @@ def conserved(
     >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))
     ['energy', 'momentum_squared']
     """
+    if isinstance(torque, AbstractSuspension):
+        free = torque.friction is None and torque.torque is None
+        return {"energy": energy(body, state, torque)} if free else {}
     motion, parts, t = _checked(body, state, torque, t)
     dtype = motion.omega.dtype
     body = in_precision(body, dtype)
@@ -125,7 +133,7 @@ def drift(
     ts: Float[Array, " times"],
     ys: PyTree,
     body: Inertia | MassProperties,
-    torque: Torque | None = None,
+    torque: Torque | AbstractSuspension | None = None,
 ) -> dict[str, Scalar]:
     """Return how far each conserved quantity drifts during a run, relative to its scale.
 
@@ -150,16 +158,23 @@ def drift(
     if not ts.size:
         raise ValueError("ts: wanted at least one time, got none")
     motion = motion_of(ys)
-    _checks.require_instance(motion, HasSpin, "ys", requirement="states with a leading time axis")
+    wanted = "states with a leading time axis"
+    _checks.require_instance(motion, (HasSpin, Turn), "ys", requirement=wanted)
     for leaf in jax.tree.leaves(ys):
         if leaf.shape[:1] != ts.shape:
             words = f"ys: wanted arrays with one row for each of the {ts.shape[0]} times in ts"
             raise ValueError(f"{words}, got shape {leaf.shape}")
     quantities = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
+    law: Any = torque
+    if isinstance(law, AbstractSuspension):
+        moments = jax.vmap(lambda y: law.moment(body, y.angle))(ys)
+        kinetic = jnp.max(0.5 * moments * ys.rate**2)
+        changes = {name: jnp.max(jnp.abs(q - q[0])) for name, q in quantities.items()}
+        return {name: c / jnp.where(kinetic > 0, kinetic, 1) for name, c in changes.items()}
     kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(motion)
 
     def momentum_length(t: ScalarLike, y: PyTree) -> Scalar:
-        motion, parts, t = _checked(body, y, torque, t)
+        motion, parts, t = _checked(body, y, law, t)
         own = in_precision(body, motion.omega.dtype)
         return length_or_zero(_momentum(own, motion, parts, t))
 

@@ -63,6 +63,29 @@ class Attitude(eqx.Module):
         _checks.require_same_batch(q=(self.q, 1), omega=(self.omega, 1))
 
 
+class Turn(eqx.Module):
+    """Hold the state of a body that turns about one axis of a suspension: an angle and its rate.
+
+    **Arguments:** `angle` γ, rad, about the `axis` of the suspension (`rigidjax.suspensions`), from
+    the place where the axes of the body are those of the world; `rate` dγ/dt, rad/s.
+
+    >>> Turn(0.1, 0.0).angle.shape
+    ()
+    """
+
+    angle: Float[Array, "*batch"]
+    rate: Float[Array, "*batch"]
+
+    __repr__ = _show.fields_as_text
+
+    def __init__(self, angle: _types.Scalars, rate: _types.Scalars):
+        angle = _checks.array_of_shape(angle, (), "angle", batched=True)
+        rate = _checks.array_of_shape(rate, (), "rate", batched=True)
+        _checks.require_same_batch(angle=(angle, 0), rate=(rate, 0))
+        dtype = jnp.promote_types(angle.dtype, rate.dtype)
+        self.angle, self.rate = angle.astype(dtype), rate.astype(dtype)
+
+
 class Rigid(eqx.Module):
     """Hold the state of a body that moves: position and velocity, attitude and body rate.
 

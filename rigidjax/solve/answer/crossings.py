@@ -39,10 +39,10 @@ from jaxtyping import Array, Float, Int, PyTree
 from rigidjax import _checks
 from rigidjax._names import suggest_arguments
 from rigidjax._types import ScalarLike
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import Point
-from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin, Turn
 from rigidjax.motion.coupled import Coupled, with_own_states
 from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import missing_part
@@ -61,6 +61,7 @@ from rigidjax.solve.answer.run import (
     ClosedFormRun,
     DiffraxRun,
     forward_time,
+    has_closed_form,
     hoist,
     solve,
     time_direction,
@@ -74,7 +75,7 @@ from rigidjax.solve.programs.traced import extract_constants
 from rigidjax.solve.steps.explicit import AbstractExplicit, require_explicit
 from rigidjax.solve.times.stops import program_with_stops
 
-State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
+State = TypeVar("State", Spin, Attitude, Rigid, Turn, Point, Coupled)
 
 
 class Event(eqx.Module):
@@ -230,8 +231,9 @@ def crossings(
     condition = hoist(condition, times[0], state0, body)
     event = Event(condition, direction, max_step)
     way = time_direction(times)
-    if torque is None and solver is None and body is not None:
-        return _crossings(ClosedFormRun(body, way, False), event, many, max_steps, state0, times)
+    if solver is None and has_closed_form(body, torque):
+        setup = ClosedFormRun(body, way, False, torque)
+        return _crossings(setup, event, many, max_steps, state0, times)
     solver = require_explicit(solver)
     rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
     setup = DiffraxRun(
@@ -477,9 +479,9 @@ def section_of_run(setup: AnyRun, event: Event, state0: Any, ts: Array) -> tuple
         rtol, atol = (jnp.asarray(a, y0.dtype) for a in (setup.rtol, setup.atol))
         h0 = jnp.asarray(jnp.nan if setup.dt0 is None else setup.dt0, dtype)
     else:
-        solver, free = None, FreeMotion(setup.body, state0)
+        solver, free = None, setup.moving(state0)
         motion = lambda s, _: ravel_pytree(free(sign.astype(s.dtype) * s - ts[0]))[0]  # noqa: E731
-        longest = jnp.minimum(longest, _sampling_interval(setup.body, state0, length))
+        longest = jnp.minimum(longest, _sampling_interval(free, setup.body, length))
         rtol, atol, h0 = jnp.zeros((), y0.dtype), jnp.zeros((), y0.dtype), longest
     (of_motion, of_rates), constants = extract_constants([motion, rates], along[0], y0)
     stops = jnp.concatenate([program.stops, along[1:]])
@@ -488,18 +490,20 @@ def section_of_run(setup: AnyRun, event: Event, state0: Any, ts: Array) -> tuple
     return crossed, Numbers(constants, Path(along[0], stops, y0, rtol, atol, h0, longest))
 
 
-def _sampling_interval(body: Any, state0: Any, length: Array) -> Array:
-    """Return the interval between two samples, s, of a condition along the motion of a free body.
+def _sampling_interval(motion: Any, body: Any, length: Array) -> Array:
+    """Return the interval between two samples, s, of a condition along a motion in closed form.
 
     It is a sixteenth of a turn at the largest rate that energy and momentum allow, or of the run if
     the body turns by less than a radian in it.
     """
-    inertia = body if isinstance(body, Inertia) else body.inertia
-    tensor, omega = lax.stop_gradient((inertia.tensor, state0.omega))
-    momentum = jnp.sum(tensor * omega[None], axis=1)
-    least = jnp.linalg.eigvalsh(tensor)[0]
-    by_energy = jnp.sqrt(jnp.sum(momentum * omega) / least)
-    rate = jnp.minimum(by_energy, jnp.sqrt(jnp.sum(momentum**2)) / least)
+    if isinstance(motion, FreeMotion):
+        tensor, omega = lax.stop_gradient((tensor_of(body), motion.state0.omega))
+        momentum = jnp.sum(tensor * omega[None], axis=1)
+        least = jnp.linalg.eigvalsh(tensor)[0]
+        by_energy = jnp.sqrt(jnp.sum(momentum * omega) / least)
+        rate = jnp.minimum(by_energy, jnp.sqrt(jnp.sum(momentum**2)) / least)
+    else:
+        rate = lax.stop_gradient(motion.pace)
     return jnp.where(rate * length > 1, 2 * np.pi / (_SAMPLES * rate), length / _SAMPLES)
 
 

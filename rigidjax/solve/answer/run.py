@@ -21,10 +21,11 @@ from rigidjax.exact.diffrax_solver import FreeSolver
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of_force
-from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin, Turn
 from rigidjax.motion.coupled import Coupled, motion_of, with_own_states
 from rigidjax.motion.equations import project_to_group
-from rigidjax.motion.torques.base import Torque
+from rigidjax.motion.suspension import AbstractSuspension
+from rigidjax.motion.torques.base import Torque, in_precision
 from rigidjax.motion.torques.composite import Sum
 from rigidjax.solve.answer import validation
 from rigidjax.solve.engine.adaptive import integrate
@@ -45,12 +46,12 @@ _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 class ClosedFormRun(eqx.Module):
-    """Hold the set-up of a run of a free body in closed form, without start and saved times."""
+    """Hold the set-up of a run in closed form, without start and saved times."""
 
-    body: Inertia | MassProperties
+    body: Any
     sign: Array | None  # as in `DiffraxRun`
     throw: bool = eqx.field(static=True)  # whether a run that fails raises an error
-    torque: None = None
+    torque: Any = None  # a suspension, or `None`
     # What follows is as in `DiffraxRun`: there are no steps.
     solver: ClassVar[None] = None
     rtol: ClassVar[None] = None
@@ -58,9 +59,16 @@ class ClosedFormRun(eqx.Module):
     max_steps: ClassVar[None] = None
     replays: ClassVar[bool] = False
 
+    def moving(self, state0: Any) -> Any:
+        """Return the motion from `state0`, a Module that is called with times since the start."""
+        if self.torque is None:
+            return FreeMotion(self.body, state0)
+        body, law = in_precision((self.body, self.torque), state0.angle.dtype)
+        return law.swing(body, state0)
+
     def motion(self, state0: Any, ts: Array) -> "Trajectory":
         """Return the motion at the times `ts` (T,), s."""
-        ys: Any = FreeMotion(self.body, state0)(ts - ts[0])
+        ys: Any = self.moving(state0)(ts - ts[0])
         stats: dict[str, Any] = dict.fromkeys(_COUNTS, jnp.zeros((), int))
         result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
         return Trajectory(Solved(ys, stats, result), None)
@@ -72,6 +80,13 @@ class ClosedFormRun(eqx.Module):
     def forward(self) -> "ClosedFormRun":
         """Return the run without errors, for derivatives in forward mode."""
         return dataclasses.replace(self, throw=False)
+
+
+def has_closed_form(body: Any, torque: Any) -> bool:
+    """Return whether the motion of a body is known in closed form."""
+    if isinstance(torque, AbstractSuspension):
+        return torque.closed_form
+    return torque is None and body is not None
 
 
 class DiffraxRun(eqx.Module):
@@ -107,7 +122,8 @@ class DiffraxRun(eqx.Module):
         # body.
         state0 = with_own_states(self.body, state0, self.torque, ts[0])
         scene: Any = scene_of_force(self.torque) if isinstance(state0, Point) else None
-        watch = halt = Ends(scene) if hasattr(scene, "ends") else None
+        law = self.torque if isinstance(state0, Turn) else scene
+        watch = halt = Ends(law, self.body) if hasattr(law, "ends") else None
         form = integrated(self.body, state0, self.torque)
         field, y0 = form.field, form.from_state(ts[0], state0)
         control: Any = self.controller
@@ -195,18 +211,21 @@ class ForwardRun(NamedTuple):
 
 
 class Ends(eqx.Module):
-    """Evaluate whether the scene of a particle ends its run, for example by a collision."""
+    """Evaluate whether the scene of a particle ends its run, for example by a collision, or the
+    suspension of a body that of the body.
+    """
 
-    scene: Any  # has ends(t, state) → bool and end_words(t, state) → str
+    scene: Any  # has ends(t, state) → bool, of a suspension (t, state, body), and end_words
+    body: Any
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None, **_: object) -> Bool[Array, ""]:
-        return self.scene.ends(t, y)
+        return self.scene.ends(t, y, *(() if self.body is None else (self.body,)))
 
 
 def equations_of_motion(
     body: Inertia | MassProperties | None,
-    state0: Spin | Attitude | Rigid | Point | Coupled,
-    torque: Torque | AbstractScene | MovingFrame | None = None,
+    state0: Spin | Attitude | Rigid | Turn | Point | Coupled,
+    torque: Torque | AbstractScene | MovingFrame | AbstractSuspension | None = None,
 ) -> Callable[..., Any]:
     """Return the vector field of a body as a function `f(t, y, args)`, for `diffrax.ODETerm`.
 

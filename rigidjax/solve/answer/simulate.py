@@ -15,6 +15,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame
 from rigidjax.motion.coupled import Coupled
+from rigidjax.motion.suspension import AbstractSuspension
 from rigidjax.solve.answer import validation
 from rigidjax.solve.answer.crossings import Event, checked_state, solve_until_event
 from rigidjax.solve.answer.error import estimate_error_of_run, solve_to_accuracy
@@ -23,6 +24,7 @@ from rigidjax.solve.answer.run import (
     ClosedFormRun,
     DiffraxRun,
     explain_max_steps,
+    has_closed_form,
     hoist,
     raise_if_ended,
     require_complete,
@@ -39,7 +41,7 @@ from rigidjax.solve.steps.splitting import AbstractSplitting
 
 # A function of the type `Law` must accept the type of the state. Type checkers therefore refuse
 # gravity on a `Spin`, which has no attitude.
-Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
+Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | AbstractSuspension | None
 
 # The solver `SOLVER` and the adjoint `ADJOINT` are made only once, because building a Module takes
 # as long as ten steps.
@@ -80,9 +82,10 @@ def simulate(
     **Arguments:**
 
     - `body`: the body. It is an `Inertia`, about the point that the body turns about, for a `Spin`
-      or an `Attitude`; `MassProperties` for a `Rigid`; and `None` for a `Point`.
+      or an `Attitude`; `MassProperties` for a `Rigid`, and for a `Turn` if gravity swings it; and
+      `None` for a `Point`.
     - `state0`: the state of one body at the time `ts[0]`: `Spin(omega)`, `Attitude(q, omega)`,
-      `Rigid(x, v, q, omega)`, or a `Point(x, v)`. For many bodies write
+      `Rigid(x, v, q, omega)`, `Turn(angle, rate)`, or a `Point(x, v)`. For many bodies write
       `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`; with `throw=False` return
       `.result`, too, which says of each body how its run ended.
     - `ts`: (T,) the times to save, s, of which the first is the start. They increase, or they
@@ -95,10 +98,12 @@ def simulate(
       end the run there by an `event`, and begin another one. If a torque has states of its own
       (`rigidjax.torques.AbstractTorque`), they are in `own` of the solution. For a `Point` the
       torque is a scene of `rigidjax.scenes`, a `MovingFrame`, or a force per mass
-      `(t, state, None) → (3,)`, m/s².
+      `(t, state, None) → (3,)`, m/s². For a `Turn` it is a suspension of `rigidjax.suspensions`,
+      which holds the other torques.
     - `solver`: any `diffrax.AbstractSolver`; a wrapper keeps attitudes unit quaternions, at every
       step and every saved time. `None` is the cheapest accurate choice, for any number of saved
-      times: the closed form (`rigidjax.exact`) for a free body, else
+      times: the closed form for a free body (`rigidjax.exact`) and for a free `Axle` or
+      `TorsionBar`, else
       `rigidjax.solvers.DormandPrince8` (order 8). With `max_steps=None` or
       `adjoint=diffrax.ForwardMode()` this choice is `diffrax.Dopri8` instead. Between the steps the
       error of `DormandPrince8` is up to ten times `rtol`; that of `Dopri8` is up to 26 times `rtol`
@@ -175,8 +180,8 @@ def simulate(
     if stepsize_controller is None:
         rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
     way = time_direction(times)
-    if torque is None and solver is None and stepsize_controller is None and body is not None:
-        found = _solve_run(ClosedFormRun(body, way, throw), event, state0, times)
+    if solver is None and stepsize_controller is None and has_closed_form(body, torque):
+        found = _solve_run(ClosedFormRun(body, way, throw, torque), event, state0, times)
         return found if accuracy is None else with_error(found, found.error, accuracy)
     # The tolerances are arrays, so that another tolerance does not compile again.
     if stepsize_controller is None:

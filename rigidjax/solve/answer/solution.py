@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks, _show
 from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
-from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin, Turn
 from rigidjax.motion.conserved import drift
 from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.manifold import dimension, minus_small, parts_by_name, plus, rotation_slices
@@ -23,7 +23,7 @@ from rigidjax.solve.answer.error import Error, estimate_error_of_run, largest_le
 from rigidjax.solve.answer.run import AnyRun, solve
 
 _drift: Any = eqx.filter_jit(drift)
-State = TypeVar("State", Spin, Attitude, Rigid, Point)
+State = TypeVar("State", Spin, Attitude, Rigid, Turn, Point)
 
 
 class Solution(eqx.Module, Generic[State]):
@@ -157,10 +157,11 @@ class Solution(eqx.Module, Generic[State]):
 
         Row i is the change of number i of the state at the time t, and column j is a small change
         of number j at the start t₀. These numbers are Ω for a `Spin` (n = 3); δθ, Ω for an
-        `Attitude` (n = 6); x, v, δθ, Ω for a `Rigid` (n = 12); and x, v for a `Point` (n = 6). The
-        three numbers δθ, rad, are a small turn in body axes, which changes q to q ⊗ exp(½δθ). The
-        columns are forward-mode derivatives, NaN at times that the run did not reach. If an event
-        ended the run, the derivatives are those of the run without the event.
+        `Attitude` (n = 6); x, v, δθ, Ω for a `Rigid` (n = 12); γ, dγ/dt for a `Turn` (n = 2); and
+        x, v for a `Point` (n = 6). The three numbers δθ, rad, are a small turn in body axes, which
+        changes q to q ⊗ exp(½δθ). The columns are forward-mode derivatives, NaN at times that the
+        run did not reach. If an event ended the run, the derivatives are those of the run without
+        the event.
 
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
         >>> rj.simulate(body, start, [0.0, 2.0]).transition_matrix()[1, 2].tolist()

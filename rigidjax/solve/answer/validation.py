@@ -15,7 +15,8 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.validation import require_physical_body
 from rigidjax.frames import AbstractScene, BodyInFrame, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of_force
-from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin, Turn
+from rigidjax.motion.suspension import AbstractSuspension
 from rigidjax.motion.torques import ChangingInertia, GravityGradient
 from rigidjax.motion.torques.base import require_state_type
 from rigidjax.motion.torques.composite import parts_of
@@ -47,11 +48,22 @@ def checked_run(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> Ch
     )
     require_compatible(body, state0, torque)
     warn_of_scale(body, torque)
-    return Checked(body if body is None else real_or_nan(body, throw), state0, ts)
+    if body is not None:
+        body = real_or_nan(body, throw, isinstance(state0, Turn))
+    return Checked(body, state0, ts)
 
 
 def require_compatible(body: Any, state0: Any, torque: Any) -> None:
     """Raise `TypeError` unless body, type of the state and torque of a run fit together."""
+    if isinstance(state0, Turn) != isinstance(torque, AbstractSuspension):
+        raise TypeError(
+            "a Turn and a suspension go together: wanted a Turn(angle, rate) and a suspension of "
+            f"rigidjax.suspensions, such as Axle(axis, point), got {type(state0).__name__} and "
+            f"{_checks.type_name(torque)}; other torques go into the suspension, torque=…"
+        )
+    if isinstance(torque, AbstractSuspension):
+        torque.require_body(body)
+        return
     if isinstance(state0, Point) and body is not None:
         raise TypeError(
             "body: wanted None, because a Point is no body and has no inertia; got "
@@ -121,11 +133,12 @@ def _advice(numbers: Any, moves: bool = False) -> str:
     return f"; rj.Inertia{'.from_principal(*moments)' if moments else '(tensor)'} makes one of them"
 
 
-def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
+def real_or_nan(body: Any, throw: bool = False, allow_zero_moment: bool = False) -> Any:
     """Return a body, with NaN for numbers that no real body can have, or raise an error."""
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
-    return require_physical_body(body, tensor, body.mass if matter else None, throw)
+    mass = body.mass if matter else None
+    return require_physical_body(body, tensor, mass, throw, allow_zero_moment=allow_zero_moment)
 
 
 def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
@@ -165,7 +178,7 @@ def checked_times(ts: Any, throw: bool) -> Array:
 
     Unless `throw`, bad traced times become NaN.
     """
-    if isinstance(ts, (Spin, Attitude, Rigid, Point)):
+    if isinstance(ts, (Spin, Attitude, Rigid, Turn, Point)):
         raise TypeError(f"ts: wanted times, got {type(ts).__name__}; the state comes before them")
     try:
         length = np.shape(ts)
@@ -227,9 +240,9 @@ def checked_start(state0: Any, throw: bool) -> Any:
 
     Unless `throw`, a traced quaternion of another length becomes NaN.
     """
-    wanted = "Spin, Attitude or Rigid, or Point without a body"
+    wanted = "Spin, Attitude or Rigid, Turn on a suspension, or Point without a body"
     _checks.require_unbatched_instance(
-        state0, (Spin, Attitude, Rigid, Point), "state0", requirement=wanted
+        state0, (Spin, Attitude, Rigid, Turn, Point), "state0", requirement=wanted
     )
     named, tree = jax.tree.flatten_with_path(state0)
     state0 = tree.unflatten(

@@ -21,6 +21,7 @@ from rigidjax.frames.frame_dynamics import scene_of_force
 from rigidjax.motion import Attitude
 from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of
 from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
+from rigidjax.motion.suspension import AbstractSuspension, TurnEquations
 from rigidjax.motion.torques import ChangingInertia, Sum
 from rigidjax.motion.torques.base import in_precision
 from rigidjax.motion.torques.composite import parts_of, tensor_or_nan
@@ -109,6 +110,8 @@ def equations_of(body: Any, state0: Any, torque: Any) -> Callable[..., Any]:
         warn_of_slow_loops()
     if isinstance(state0, Point):
         return scene_of_force(torque).field
+    if isinstance(torque, AbstractSuspension):
+        return TurnEquations(body, torque)
     kind: Any = AttitudeEquations if isinstance(state0, Attitude) else EulerEquations
     return (NewtonEuler if isinstance(body, MassProperties) else kind)(body, torque)
 
