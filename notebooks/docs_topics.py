@@ -7,7 +7,7 @@ Names are as the reference writes them. What a module holds beside its topics co
 FIRST = {
     "A motion": "rj.simulate rj.solve.Solution",
     "A body": "rj.Inertia rj.MassProperties rj.shapes.box",
-    "A state": "rj.Attitude rj.Spin rj.Rigid rj.Point",
+    "A state": "rj.Attitude rj.Spin rj.Rigid rj.Turn rj.Point",
     "A torque": "rj.torques.HeavyTop rj.torques.Sum",
     "A rotation": "rj.quaternion.rotate rj.quaternion.exp rj.so3.log",
     "Conserved quantities": "rj.energy rj.conserved rj.drift",
@@ -18,7 +18,15 @@ FIRST = {
 }
 
 GROUPS = {
-    "Motion": ("rj", "rj.motion", "rj.torques", "rj.solve", "rj.solvers", "rj.exact"),
+    "Motion": (
+        "rj",
+        "rj.motion",
+        "rj.torques",
+        "rj.solve",
+        "rj.solvers",
+        "rj.exact",
+        "rj.suspensions",
+    ),
     "Bodies": ("rj.body", "rj.shapes", "rj.volumes", "rj.parameters"),
     "Rotations": (
         "rj.quaternion",
@@ -53,8 +61,9 @@ GROUPS = {
 
 TOPICS = {
     "rj.motion": {
-        "States": "Spin Attitude Rigid",
+        "States": "Spin Attitude Rigid Turn",
         "What a state has": "HasSpin HasAttitude HasPose",
+        "Bound to an axis": "AbstractSuspension",
     },
     "rj.torques": {
         "Gravity and fields": "HeavyTop GravityGradient MagneticDipole FromPotential Tide",

@@ -1,16 +1,17 @@
 """Describe a body that turns about one axis: its state, its suspension, its equation of motion."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks, _show
 from rigidjax._types import Scalar, ScalarLike, Vec3
-from rigidjax.body.inertia import Body, MassProperties, apply, tensor_of
+from rigidjax.body.inertia import Body, Inertia, MassProperties, apply, tensor_of
 from rigidjax.motion.equations import Attitude, Rigid, Turn
 from rigidjax.motion.torques import base
 from rigidjax.motion.torques.states import require_no_own_states
@@ -74,6 +75,7 @@ class AbstractSuspension(eqx.Module):
     True
     """
 
+    bodies: ClassVar[tuple[type, ...]] = (MassProperties,)
     axis: eqx.AbstractVar[Float[Array, "3"]]
     friction: eqx.AbstractVar[Friction | None]
     torque: eqx.AbstractVar[Any]
@@ -82,6 +84,8 @@ class AbstractSuspension(eqx.Module):
 
     def __check_init__(self) -> None:
         name = type(self).__name__
+        if _checks.is_known(self.axis) and not np.any(self.axis):
+            raise ValueError("axis: wanted a direction, got zero")
         if self.friction is not None:
             _checks.require_instance(self.friction, Friction, f"{name}.friction")
         if self.torque is not None:
@@ -119,9 +123,12 @@ class AbstractSuspension(eqx.Module):
         return self.axis / jnp.sqrt(dot(self.axis, self.axis))
 
     def require_body(self, body: PyTree) -> Any:
-        """Return the `body`; raise `TypeError` unless it has a mass."""
-        hint = "the suspension needs the mass and its place: an Inertia has none"
-        return _checks.require_unbatched_instance(body, MassProperties, "body", hint=hint)
+        """Return the `body`; raise an error unless it is one of the classes in `bodies`, and this
+        suspension is that of one body.
+        """
+        base.require_single(self)
+        hint = "gravity needs the mass and its place" if isinstance(body, Inertia) else ""
+        return _checks.require_unbatched_instance(body, self.bodies, "body", hint=hint)
 
     def state(self, body: Body, turn: Turn) -> Attitude | Rigid:
         """Return attitude and rate, also place and velocity of a body with mass (a `Rigid`)."""

@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
@@ -19,7 +21,8 @@ def period(
     friction and the law `torque` of the suspension are not counted. For an `Axle` the period is
     `4K/ω₀`, by the arithmetic–geometric mean; for `Strings` an integral, with the energy of the
     lift. First and second derivatives by all numbers are right. **Raises:** `ValueError` for an
-    amplitude of π or more, `TypeError` if body and suspension do not fit together.
+    amplitude of π or more, and if the body cannot swing so far; `TypeError` if body and suspension
+    do not fit together.
 
     >>> plate = rj.shapes.box(1.2, [0.3, 0.3, 0.02])
     >>> bifilar = rj.suspensions.Strings(2, 0.1, 0.1, 0.8)
@@ -32,4 +35,10 @@ def period(
     if _checks.is_known(angle) and not abs(angle) < math.pi:
         raise ValueError(f"amplitude: wanted an angle below π, rad, got {float(angle):.6g}")
     dtype = tensor_of(body).dtype
-    return in_precision(suspension, dtype).period(body, angle.astype(dtype))
+    found = in_precision(suspension, dtype).period(body, angle.astype(dtype))
+    if _checks.is_known(found) and np.isnan(found):
+        raise ValueError(
+            f"period: {suspension} does not swing this body by {float(angle):.4g} rad: are its "
+            "axis, gravity and stiffness not zero, and its strings long enough?"
+        )
+    return found

@@ -1,10 +1,10 @@
 """Bind a body to a torsion bar or a wire."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3, Vector
@@ -30,6 +30,7 @@ class TorsionBar(AbstractSuspension):
     Array(0.4032892, dtype=float64)
     """
 
+    bodies: ClassVar[tuple[type, ...]] = (Inertia, MassProperties)
     axis: Float[Array, "3"] = eqx.field(converter=base.vector_converter("axis"))
     stiffness: Float[Array, ""]
     friction: Friction | None
@@ -48,9 +49,6 @@ class TorsionBar(AbstractSuspension):
             _checks.require_positive, stiffness, "stiffness", "κ ≥ 0, N m/rad", allow_zero=True
         )
         self.friction, self.torque = friction, torque
-
-    def require_body(self, body: PyTree) -> Any:
-        return _checks.require_unbatched_instance(body, (Inertia, MassProperties), "body")
 
     def moment(self, body: Body, angle: ScalarLike) -> Scalar:
         return moment_about(self.unit, body)

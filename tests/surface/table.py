@@ -8,4 +8,5 @@ from surface import (
     calls_identify as calls_identify,
     calls_motion as calls_motion,
     calls_numbers as calls_numbers,
+    calls_suspensions as calls_suspensions,
 )

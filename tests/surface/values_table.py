@@ -11,6 +11,7 @@ from surface import (
     values_motion as values_motion,
     values_numbers as values_numbers,
     values_solve as values_solve,
+    values_suspensions as values_suspensions,
 )
 from surface.values import WAYS, draws_of, judged
 

@@ -289,11 +289,11 @@ def missing_part(caller: str, error: AttributeError) -> str | None:
     return f"{caller} looks at state.{error.name}, {has_none}: start from {state_with_field}"
 
 
-def require_single(torque: Torque) -> None:
+def require_single(torque: PyTree) -> None:
     """Raise `ValueError` if a field has the shape of many torques, as in a batch by `jax.vmap`. A
     user's own torque may have fields of any shape.
     """
-    if not type(torque).__module__.startswith(__package__ or ""):
+    if not type(torque).__module__.startswith(("rigidjax.motion.torques", "rigidjax.suspensions")):
         return
     for field in dataclasses.fields(torque):  # pyright: ignore[reportArgumentType]
         value, kind = getattr(torque, field.name), field.type
