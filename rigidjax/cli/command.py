@@ -1,4 +1,6 @@
-"""Run the command `python -m rigidjax`, which identifies a body from logs, or compares methods."""
+"""Run the command `python -m rigidjax`, which identifies a body from logs, gives a moment of
+inertia from a period, or compares methods.
+"""
 
 import _thread
 import argparse
@@ -18,7 +20,7 @@ import numpy as np
 
 import rigidjax as rj
 from rigidjax import _checks, _show
-from rigidjax.cli import spec
+from rigidjax.cli import spec, swing
 from rigidjax.cli.logs.errors import LogError, LogWarning
 from rigidjax.cli.logs.layouts import imu_columns
 from rigidjax.cli.logs.units import TIME_UNITS, unit_in_name
@@ -48,6 +50,8 @@ def main(arguments: list[str] | None = None) -> int:
     # JAX computes in float64 from here on. A library must not change this setting of JAX, but this
     # is a program of its own.
     jax.config.update("jax_enable_x64", True)
+    if options.command == "swing":
+        return swing.run_subcommand(options, parser)
     if options.command == "identify" and options.demo == bool(options.logs):
         parser.error("identify: give either log FILES or --demo")
     _check_outputs(options, parser)
@@ -292,6 +296,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     for name, how in OPTIONS.items():
         identify.add_argument(name, **how)
+    swing.add_command(commands)
     workprecision.add_subcommand(commands)
     return parser
 
