@@ -89,7 +89,7 @@ def check_batch(
     if not isinstance(states0, Spin | Attitude | Rigid):
         raise TypeError(
             f"states0: wanted Spin, Attitude or Rigid, got {type(states0).__name__}; for points in "
-            "moving frames use jax.vmap over rigidjax.simulate"
+            "moving frames and bodies on an axis use jax.vmap over rigidjax.simulate"
         )
     if states0.omega.ndim != 2 or not states0.omega.shape[0]:
         raise ValueError(

@@ -1,6 +1,6 @@
 """Compute the conserved quantities of a body under torques, and their drift in a simulation."""
 
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,10 +31,11 @@ def energy(
     + ½ Ω·IΩ + U`, with the mass m, velocity v, body rate Ω, inertia I and the sum U of potentials.
 
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for torques that depend on
-    time. Wheels add no energy, except for `ReactionWheels`. If the torque has states of its own
-    (such as the speed of a wheel), `state` is a `Coupled`, which holds the state of the body
-    together with these states; `rigidjax.batch.rollout` and `rigidjax.crossings` return such
-    states. Source: notes, eq 79. **Raises:** `TypeError` for a torque without a potential.
+    time. For a `Turn` it is the energy of the suspension, `½ M γ̇² + V`. Wheels add no energy,
+    except for `ReactionWheels`. If the torque has states of its own (such as the speed of a wheel),
+    `state` is a `Coupled`, which holds the state of the body together with these states;
+    `rigidjax.batch.rollout` and `rigidjax.crossings` return such states. Source: notes, eq 79.
+    **Raises:** `TypeError` for a torque without a potential.
 
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
@@ -43,7 +44,8 @@ def energy(
     """
     law: Any = torque
     if isinstance(law, AbstractSuspension):
-        return law.energy(law.require_body(body), cast(Turn, state))
+        turn = _checks.require_unbatched_instance(state, Turn, "state")
+        return law.energy(law.require_body(body), turn)
     motion, parts, t = _checked(body, state, law, t)
     for part in parts:
         if not hasattr(part, "energy"):
@@ -143,7 +145,7 @@ def drift(
     for each quantity that `conserved` names the largest distance from its value at `ts[0]`, divided
     by its scale, which is the largest value during the run of
 
-    - the kinetic energy, for `energy`;
+    - the kinetic energy, for `energy`; of a `Turn` also half of |angle · dV/d angle|;
     - the magnitude of the quantity itself, for `linear_momentum` and `momentum_about_origin`;
     - the squared magnitude of the angular momentum, for `momentum_squared`;
     - the magnitude of the angular momentum, for the other momenta.
@@ -167,10 +169,16 @@ def drift(
     quantities = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
     law: Any = torque
     if isinstance(law, AbstractSuspension):
-        moments = jax.vmap(lambda y: law.moment(body, y.angle))(ys)
-        kinetic = jnp.max(0.5 * moments * ys.rate**2)
+
+        def size(y: Turn) -> Scalar:
+            # In a small swing about the angle 0 the two terms are the energy, at the turning points
+            # as well as between them.
+            slope = jax.grad(lambda a: law.potential(body, a))(y.angle)
+            return 0.5 * (law.moment(body, y.angle) * y.rate**2 + jnp.abs(slope * y.angle))
+
+        scale = jnp.max(jax.vmap(size)(ys))
         changes = {name: jnp.max(jnp.abs(q - q[0])) for name, q in quantities.items()}
-        return {name: c / jnp.where(kinetic > 0, kinetic, 1) for name, c in changes.items()}
+        return {name: c / jnp.where(scale > 0, scale, 1) for name, c in changes.items()}
     kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(motion)
 
     def momentum_length(t: ScalarLike, y: PyTree) -> Scalar:

@@ -44,9 +44,9 @@ class Strings(AbstractSuspension):
     Strings pull only: a run in which they would push, or in which |γ| reaches π (the strings
     touch), ends there with a `ValueError`; with `throw=False` `simulate` keeps what came before,
     and `sol.stats` has the `end_time`. This is looked at at the ends of steps. The body is a
-    `MassProperties`. **Raises:** `ValueError` for a number that is not positive, and for strings
-    that are too short. Source: Kane and Tseng 1967, Dynamics of the
-    bifilar pendulum, Int. J. Mech. Sci. 9.
+    `MassProperties`; its centre of mass is taken to be at the level of the lower ends. **Raises:**
+    `ValueError` for a number that is not positive, and for strings that are too short. Source: Kane
+    and Tseng 1967, Dynamics of the bifilar pendulum, Int. J. Mech. Sci. 9.
 
     >>> plate = rj.shapes.box(1.2, [0.3, 0.3, 0.02])
     >>> two = Strings(2, 0.1, 0.1, 0.8)

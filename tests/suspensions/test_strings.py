@@ -105,6 +105,8 @@ def test_motion_beside_scipy_and_its_strings_keep_their_length():
     sol = rj.simulate(PLATE, rj.Turn(1.4, 0.5), ts, two, rtol=1e-11)
     np.testing.assert_allclose(sol.ys.angle, want.y[0], atol=1e-9)
     assert sol.drift["energy"] < 1e-10
+    at_rest = [0.0, float(rj.suspensions.period(PLATE, two, 1.4))]
+    assert rj.simulate(PLATE, rj.Turn(1.4, 0.0), at_rest, two).drift["energy"] < 1e-8
     turn = jax.tree.map(lambda leaf: leaf[3], sol.ys)
     pose = two.state(PLATE, turn)
     for sign in (1.0, -1.0):
