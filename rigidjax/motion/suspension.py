@@ -1,7 +1,7 @@
 """Describe a body that turns about one axis: its state, its suspension, its equation of motion."""
 
 import abc
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import equinox as eqx
 import jax
@@ -77,20 +77,20 @@ class AbstractSuspension(eqx.Module):
 
     bodies: ClassVar[tuple[type, ...]] = (MassProperties,)
     axis: eqx.AbstractVar[Float[Array, "3"]]
-    friction: eqx.AbstractVar[Friction | None]
-    torque: eqx.AbstractVar[Any]
 
     __repr__ = _show.fields_as_text
 
     def __check_init__(self) -> None:
-        name = type(self).__name__
+        # `friction` and `torque` are not declared here: type checkers would put them before the
+        # fields of a subclass.
+        law, name = cast(Any, self), type(self).__name__
         if _checks.is_known(self.axis) and not np.any(self.axis):
             raise ValueError("axis: wanted a direction, got zero")
-        if self.friction is not None:
-            _checks.require_instance(self.friction, Friction, f"{name}.friction")
-        if self.torque is not None:
-            base.require_torque(self.torque)
-            require_no_own_states(self.torque, name)
+        if law.friction is not None:
+            _checks.require_instance(law.friction, Friction, f"{name}.friction")
+        if law.torque is not None:
+            base.require_torque(law.torque)
+            require_no_own_states(law.torque, name)
 
     @abc.abstractmethod
     def moment(self, body: PyTree, angle: ScalarLike) -> Scalar:
@@ -115,7 +115,8 @@ class AbstractSuspension(eqx.Module):
     @property
     def closed_form(self) -> bool:
         """Return whether the motion is known in closed form."""
-        return self.friction is None and self.torque is None
+        law: Any = self
+        return law.friction is None and law.torque is None
 
     @property
     def unit(self) -> Vec3:
@@ -171,7 +172,7 @@ class TurnEquations(eqx.Module):
 
 
 def applied(
-    suspension: AbstractSuspension, t: ScalarLike, turn: Turn, body: Body
+    suspension: Any, t: ScalarLike, turn: Turn, body: Body
 ) -> tuple[Vec3 | None, Vec3 | None]:
     """Return force (N, world) and torque (N m, body) of the law `torque`, `None` if there are
     none.

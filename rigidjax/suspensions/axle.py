@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rigidjax._types import Scalar, ScalarLike, Vec3, Vector
+from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import MassProperties
 from rigidjax.elliptic import ellipk
 from rigidjax.elliptic.jacobi import functions
@@ -17,8 +17,6 @@ from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
 from rigidjax.rotation.stumpff import power_of_minus_one
-
-_DOWN = (0.0, 0.0, -9.80665)
 
 
 class Axle(AbstractSuspension):
@@ -47,21 +45,11 @@ class Axle(AbstractSuspension):
     axis: Float[Array, "3"] = eqx.field(converter=base.vector_converter("axis"))
     point: Float[Array, "3"] = eqx.field(converter=base.vector_converter("point"))
     gravity: Float[Array, "3"] = eqx.field(
-        converter=base.vector_converter("gravity", hint=base.GRAVITY_HINT)
+        converter=base.vector_converter("gravity", hint=base.GRAVITY_HINT),
+        default=(0.0, 0.0, -9.80665),
     )
-    friction: Friction | None
-    torque: Any
-
-    def __init__(
-        self,
-        axis: Vector,
-        point: Vector,
-        gravity: Vector = _DOWN,
-        friction: Friction | None = None,
-        torque: base.Torque | None = None,
-    ):
-        self.axis, self.point, self.gravity = axis, point, gravity  # pyright: ignore
-        self.friction, self.torque = friction, torque
+    friction: Friction | None = None
+    torque: Any = None
 
     def moment(self, body: MassProperties, angle: ScalarLike) -> Scalar:
         arm = cross(self.unit, body.com - self.point)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, _show
-from rigidjax._types import Scalar, ScalarLike, Vec3, Vector
+from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import Body, MassProperties
 from rigidjax.motion import Turn
 from rigidjax.motion.suspension import (
@@ -54,43 +54,26 @@ class Strings(AbstractSuspension):
     1.0075
     """
 
-    number: int = eqx.field(static=True)
-    radius_above: Float[Array, ""]
-    radius_below: Float[Array, ""]
-    length: Float[Array, ""]
-    axis: Float[Array, "3"] = eqx.field(converter=base.vector_converter("axis"))
-    gravity: Float[Array, ""]
-    friction: Friction | None
-    torque: Any
+    number: int = eqx.field(static=True, converter=lambda n: _checks.integer(n, "number", 2))
+    radius_above: Float[Array, ""] = eqx.field(converter=base.positive_converter("radius_above"))
+    radius_below: Float[Array, ""] = eqx.field(converter=base.positive_converter("radius_below"))
+    length: Float[Array, ""] = eqx.field(converter=base.positive_converter("length"))
+    axis: Float[Array, "3"] = eqx.field(
+        converter=base.vector_converter("axis"), default=(0.0, 0.0, 1.0)
+    )
+    gravity: Float[Array, ""] = eqx.field(
+        converter=base.positive_converter("gravity"), default=9.80665
+    )
+    friction: Friction | None = None
+    torque: Any = None
 
-    def __init__(
-        self,
-        number: int,
-        radius_above: ScalarLike,
-        radius_below: ScalarLike,
-        length: ScalarLike,
-        axis: Vector = (0.0, 0.0, 1.0),
-        gravity: ScalarLike = 9.80665,
-        friction: Friction | None = None,
-        torque: base.Torque | None = None,
-    ):
-        self.number = _checks.integer(number, "number", 2)
-        sizes = dict(
-            radius_above=radius_above, radius_below=radius_below, length=length, gravity=gravity
-        )
-        for name, value in sizes.items():
-            value = _checks.array_of_shape(value, (), name)
-            value = _checks.check_if_known(
-                _checks.require_positive, value, name, "a positive number"
-            )
-            setattr(self, name, value)
-        apart = self.length - jnp.abs(self.radius_above - self.radius_below)
-        if _checks.is_known(apart) and not apart > 0:
+    def __check_init__(self) -> None:
+        reach = self.length - jnp.abs(self.radius_above - self.radius_below)
+        if _checks.is_known(reach) and not reach > 0:
             raise ValueError(
-                f"length: wanted strings longer than |radius_above − radius_below|, got {length}"
+                "length: wanted strings longer than |radius_above − radius_below|, got "
+                f"{float(self.length):.6g}"
             )
-        self.axis = axis  # pyright: ignore
-        self.friction, self.torque = friction, torque
 
     @property
     def closed_form(self) -> bool:

@@ -6,8 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
-from rigidjax._types import Scalar, ScalarLike, Vec3, Vector
+from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.motion import Turn
 from rigidjax.motion.suspension import AbstractSuspension, Friction, moment_about
@@ -32,23 +31,11 @@ class TorsionBar(AbstractSuspension):
 
     bodies: ClassVar[tuple[type, ...]] = (Inertia, MassProperties)
     axis: Float[Array, "3"] = eqx.field(converter=base.vector_converter("axis"))
-    stiffness: Float[Array, ""]
-    friction: Friction | None
-    torque: Any
-
-    def __init__(
-        self,
-        axis: Vector,
-        stiffness: ScalarLike,
-        friction: Friction | None = None,
-        torque: base.Torque | None = None,
-    ):
-        self.axis = axis  # pyright: ignore
-        stiffness = _checks.array_of_shape(stiffness, (), "stiffness")
-        self.stiffness = _checks.check_if_known(
-            _checks.require_positive, stiffness, "stiffness", "κ ≥ 0, N m/rad", allow_zero=True
-        )
-        self.friction, self.torque = friction, torque
+    stiffness: Float[Array, ""] = eqx.field(
+        converter=base.positive_converter("stiffness", "κ ≥ 0, N m/rad", allow_zero=True)
+    )
+    friction: Friction | None = None
+    torque: Any = None
 
     def moment(self, body: Body, angle: ScalarLike) -> Scalar:
         return moment_about(self.unit, body)

@@ -327,6 +327,18 @@ def number_converter(name: str) -> Callable[[Any], Array]:
     return lambda value: _checks.finite_array(value, (), name)
 
 
+def positive_converter(
+    name: str, requirement: str = "a positive number", *, allow_zero: bool = False
+) -> Callable[[Any], Array]:
+    """Return a converter for `equinox.field` that makes one positive number of a value."""
+
+    def convert(value: Any) -> Array:
+        number, check = _checks.array_of_shape(value, (), name), _checks.require_positive
+        return _checks.check_if_known(check, number, name, requirement, allow_zero=allow_zero)
+
+    return convert
+
+
 def source_converter(name: str) -> Callable[[Any], Any]:
     """Return a converter for `equinox.field` that makes a finite vector of a value, and leaves a
     function of time.
