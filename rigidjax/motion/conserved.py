@@ -1,6 +1,6 @@
 """Compute the conserved quantities of a body under torques, and their drift in a simulation."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -91,10 +91,11 @@ def conserved(
     >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))
     ['energy', 'momentum_squared']
     """
-    if isinstance(torque, AbstractSuspension):
-        free = torque.friction is None and torque.torque is None
-        return {"energy": energy(body, state, torque)} if free else {}
-    motion, parts, t = _checked(body, state, torque, t)
+    law: Any = torque
+    if isinstance(law, AbstractSuspension):
+        lossless = cast(Any, law).friction is None and cast(Any, law).torque is None
+        return {"energy": energy(body, state, law)} if lossless else {}
+    motion, parts, t = _checked(body, state, law, t)
     dtype = motion.omega.dtype
     body = in_precision(body, dtype)
     quantities: dict[str, Float[Array, "..."]] = {}
