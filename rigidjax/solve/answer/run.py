@@ -216,7 +216,7 @@ class Ends(eqx.Module):
     """
 
     scene: Any  # has ends(t, state) → bool, of a suspension (t, state, body), and end_words
-    body: Any
+    body: Any = None
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None, **_: object) -> Bool[Array, ""]:
         return self.scene.ends(t, y, *(() if self.body is None else (self.body,)))
