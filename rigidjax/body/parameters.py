@@ -150,19 +150,19 @@ def curvature_rows_near_flat_body(
     shape: Float[ArrayLike, "5"] | Numbers, misfit_gradient: Float[ArrayLike, "5"] | Numbers
 ) -> Float[Array, "3 5"]:
     """Return three rows b of five numbers, (3, 5), for a fit of a body that is nearly flat. The
-    Gauss–Newton method approximates the second derivative of the misfit by products of first
+    Gauss–Newton method approximates the second derivative of the cost by products of first
     derivatives; the sum of the matrices b bᵀ is what this approximation leaves out near a flat
     body.
 
     Let A = 1 + V be the root of the second moment, where V is the matrix of `pack_shape`, a the
     least eigenvalue of A, and n its unit eigenvector. The least second moment is the square λ = a².
     The sum of b bᵀ is its second derivative, `d²λ = 2 |dA n|²`, multiplied by the derivative of the
-    misfit with respect to λ, which follows from the component along n nᵀ of the derivative with
-    respect to A. The rows are zero for a body that is not flat, and for a misfit that does not
+    cost with respect to λ, which follows from the component along n nᵀ of the derivative with
+    respect to A. The rows are zero for a body that is not flat, and for a cost that does not
     decrease as λ decreases.
 
     **Arguments:** `shape` (5,) as in `pack_shape`; `misfit_gradient` (5,) the derivative of
-    the misfit with respect to `shape`.
+    the cost with respect to `shape`.
 
     >>> plate = pack_shape(jnp.diag(jnp.array([4.0, 4.0, 1e-12])))
     >>> curvature_rows_near_flat_body(plate, -1e-6 * jnp.ones(5)).shape
@@ -180,15 +180,15 @@ def curvature_rows_near_flat_body(
     n = longest / jnp.sqrt(jnp.sum(longest * longest) + jnp.finfo(root.dtype).tiny)
     a = n @ apply(root, n)
     d1, d2, s12, s23, s13 = misfit_gradient
-    # `misfit_gradient` does not contain the trace of `pull`, the derivative of the misfit with
-    # respect to A. The misfit does not depend on the size of A: its derivative along A = 1 + V is
+    # `misfit_gradient` does not contain the trace of `pull`, the derivative of the cost with
+    # respect to A. The cost does not depend on the size of A: its derivative along A = 1 + V is
     # zero, which gives the trace.
     trace = -(shape @ misfit_gradient)
     d3 = (trace - d1 - d2) / 3.0
     pull = from_components(d1 + d3, d2 + d3, d3, 0.5 * s12, 0.5 * s13, 0.5 * s23)
     square = jnp.sum(root * root)
     gained = a * (n @ apply(pull, n)) / 2.0
-    # `gained` is the least second moment λ times the derivative of the misfit with respect to λ. If
+    # `gained` is the least second moment λ times the derivative of the cost with respect to λ. If
     # `gained` is NaN, `gained > 0` would be false and the rows zero; `~(gained <= 0)` is true, so
     # that the rows are NaN and the caller sees it.
     flat = (a * a < FLAT * square) & ~(gained <= 0)

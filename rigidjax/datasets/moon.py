@@ -134,7 +134,7 @@ class Moon(eqx.Module):
         return whole - self._core_inertia if core else whole
 
     def chart(self, *, core: bool = False) -> AbstractBodyChart:
-        """Return a chart for a fit: a map from two free numbers, for β = (C − A)/B and γ = (B −
+        """Return a chart for a fit: a map from two parameters, for β = (C − A)/B and γ = (B −
         A)/C with the principal moments A ≤ B ≤ C, to the inertia that `body` returns.
         """
         return _BetaGammaChart(self, core)

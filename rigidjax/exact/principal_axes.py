@@ -1,7 +1,7 @@
 """Compute principal axes as a fixed frame, which is never differentiated.
 
 In this frame the off-diagonal entries of the inertia tensor are exactly zero in value, but their
-tangents (the changes in a derivative) are not.
+tangents are not.
 """
 
 from typing import NamedTuple

@@ -30,7 +30,7 @@ differentiate it in principal axes, where T = diag(τ₁, τ₂, τ₃) and g = 
 the even terms.
 
 The functions are evaluated in principal axes of K. The off-diagonal entries of K are therefore zero
-in value, and only their tangents (the changes in a derivative) are not. The differences of the
+in value, and only their tangents are not. The differences of the
 diagonal entries are arguments, and so they are accurate. If an entry of a matrix can be written in
 several equal forms, the form without cancellation is used.
 """

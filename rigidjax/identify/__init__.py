@@ -1,6 +1,6 @@
 """Find a body from recordings of its motion, with its uncertainty.
 
-`fit` finds the body and all other free numbers of a `Model`. `filter`, `step` and `smooth` follow a
+`fit` finds the body and all other parameters of a `Model`. `filter`, `step` and `smooth` follow a
 model with an unknown torque: they give states, torques and sensor errors with their standard
 deviations. `log_likelihood` is the logarithm of the density of the readings, after integration over
 the unknown torques; `sample` draws a motion under random torques. `LogDensity` is the posterior

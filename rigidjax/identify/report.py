@@ -199,7 +199,7 @@ img {{ max-width: 100%; margin: 1rem 0 }}
 <p>{read}</p>
 {as_html(fit, rate_unit, more)}
 <table><tr><th>sensor</th><th>rms error an axis</th><th>unit</th></tr>{html_rows(sizes)}</table>
-<table><tr><th>start</th><th>misfit</th><th></th><th></th></tr>{starts}</table>
+<table><tr><th>start</th><th>cost</th><th></th><th></th></tr>{starts}</table>
 {pictures}
 </html>
 """

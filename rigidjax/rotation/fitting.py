@@ -173,11 +173,11 @@ def _estimate(
     angle = jnp.arctan2((light * around).sum(), (light * across).sum())
     limit = product(quaternion.to_matrix(quaternion.exp(angle * axis)), aligned)
     both = nearest_rotation(_outer_sum(weights, world, body)), limit
-    misfits = []
+    costs = []
     for rotation in both:
         _, ratio, apart = _turned(rotation, world, body)
-        misfits.append((weights * (apart * apart).sum(-1) / jnp.where(ratio > 0, ratio, 1)).sum())
-    return jnp.where(misfits[1] < misfits[0], *reversed(both))
+        costs.append((weights * (apart * apart).sum(-1) / jnp.where(ratio > 0, ratio, 1)).sum())
+    return jnp.where(costs[1] < costs[0], *reversed(both))
 
 
 class Turned(NamedTuple):

@@ -87,7 +87,7 @@ class Alias(eqx.Module):
         return (
             f"{self.mode}-axis mode, rotation {self.rotation:.6g} s, precession "
             f"{self.precession:.6g} s, moments {self.ratios[0]:.3f} : {self.ratios[1]:.3f} : 1, "
-            f"misfit {self.cost:.6g}"
+            f"cost {self.cost:.6g}"
         )
 
 
@@ -97,7 +97,7 @@ class LightCurve(eqx.Module):
     **Fields:**
 
     - `fit`: the fit of the best motion; its covariance allows for a body that is not an ellipsoid.
-    - `aliases`: all motions that were found, in the order of their misfits.
+    - `aliases`: all motions that were found, in the order of their costs.
     - `deviations`: (4,) the relative standard deviations of four numbers of the best motion: the
       rotation period, the precession period and the two ratios of moments.
     - `pairs`: the pairs of frequencies that `two_frequencies` found.
@@ -202,7 +202,7 @@ def fit_light_curve(
     whole = stacking.pad_to_few(model)
     ends = search_starts(whole, starts, noise_of(reading, flux, pairs.scatter), tolerance)
     aliases = _distinct(whole, ends)
-    say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
+    say(f"{len(aliases)} motions, cost {aliases[0].cost:.6g}")
     best = fit(whole, starts=1, initial=aliases[0].x, tolerance=tolerance)
     result = _result(best, aliases, pairs, used >= count)
     # The result has the readings without the padding that the search added.
@@ -282,7 +282,7 @@ def _distinct(model: Model, ends: list[Attempt]) -> list[Alias]:
             out.append(alias)
     if not out:
         raise ValueError(
-            "fit_light_curve: wanted a start with a finite misfit, got none; are the readings in "
+            "fit_light_curve: wanted a start with a finite cost, got none; are the readings in "
             "the unit of the sensor?"
         )
     return out
@@ -366,7 +366,7 @@ def _result(
     # belong to the same noise; the fit may have estimated another noise.
     first = _alias(best.model, best.x, aliases[0].cost)
     others = [alias for alias in aliases if not _same(alias, first, near)]
-    # A motion whose misfit exceeds that of the best motion by less than a margin explains the data
+    # A motion whose cost exceeds that of the best motion by less than a margin explains the data
     # nearly as well. The margin is wider if the errors of the best motion are larger than the
     # noise, or autocorrelated.
     count = int(best.model.records.readings[0].host_mask.sum())

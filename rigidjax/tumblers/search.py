@@ -89,12 +89,12 @@ def starts_of_pairs(
             candidates = starts.candidates(pair, mode, light, middle, areas, 3)
             # `best_of` gets the starts of the best body for this pair and this mode, and `others`
             # the starts of the other bodies. All starts of `best_of` are used, those of `others`
-            # only to fill the last chunk, since misfits on a grid cannot decide between pairs and
+            # only to fill the last chunk, since χ² on a grid cannot decide between pairs and
             # modes.
             best_of += candidates[: len(starts.ABOUT)]
             others += candidates[len(starts.ABOUT) :]
     chunks = max(1, -(-len(best_of) // FIRST))
-    in_order = [one for group in (best_of, others) for one in sorted(group, key=lambda c: c.misfit)]
+    in_order = [one for group in (best_of, others) for one in sorted(group, key=lambda c: c.chi2)]
     chosen = in_order[: chunks * FIRST]
     # The columns of this rotation are the axes of the body in the order of ascending moments.
     principal_to_body = np.eye(3)[:, order]

@@ -43,7 +43,7 @@ class Candidate(NamedTuple):
     moments: Float[np.ndarray, "3"]  # the principal moments divided by the largest
     q: Float[np.ndarray, "4"]  # the initial attitude of the principal axes
     omega: Float[np.ndarray, "3"]  # the initial rate along these axes, rad/s
-    misfit: float  # χ²
+    chi2: float
 
 
 class GridMotions(NamedTuple):
@@ -67,7 +67,7 @@ def candidates(
     count: int,
 ) -> list[Candidate]:
     """Return the best motions on a grid of bodies and phases that have a given pair of frequencies,
-    the smallest misfit first, for `count` bodies of the grid.
+    the smallest χ² first, for `count` bodies of the grid.
 
     - `pair`: the frequency of the mean precession, and twice that of the rotation, 1/s.
     - `mode`: "long" or "short", for a momentum that circulates in the body about the axis of the
@@ -87,9 +87,9 @@ def candidates(
     forms = forms / forms.mean(axis=1, keepdims=True)
     arrays = jnp.asarray(moments), jnp.asarray(forms), jnp.asarray(pair), *light
     motions = _grid_motions(jnp.asarray(mode == "long"), *arrays)
-    misfits, sides, q, omega = (np.asarray(v) for v in motions)
-    # Each body is used with the phase of its smallest misfit.
-    phase, least = misfits.argmin(axis=1), misfits.min(axis=1)
+    chi2, sides, q, omega = (np.asarray(v) for v in motions)
+    # Each body is used with the phase of its smallest χ².
+    phase, least = chi2.argmin(axis=1), chi2.min(axis=1)
     out = []
     for k in np.argsort(least)[:count]:
         if not np.isfinite(least[k]):
@@ -205,8 +205,8 @@ def _grid_motions(
             # need a second compilation.
             states: Any = jax.vmap(motion)(since + jnp.concatenate([jnp.zeros(1, t.dtype), t]))
             rows = jax.vmap(row_of_quadratic_form)(states.q[1:]).T * weights[None, :]
-            misfit, n = remainder(rows, squared_flux * weights)
-            chi2 = jnp.where(exists, misfit, jnp.inf)
+            chi2, n = remainder(rows, squared_flux * weights)
+            chi2 = jnp.where(exists, chi2, jnp.inf)
             return GridMotions(chi2, n, states.q[0], states.omega[0])
 
         parts = jnp.arange(PHASES, dtype=t.dtype) / PHASES

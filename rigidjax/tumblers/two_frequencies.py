@@ -46,13 +46,13 @@ AROUND = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
 
 
 class TwoFrequencies(eqx.Module):
-    """Hold the result of `two_frequencies`: pairs of frequencies, in the order of their misfits.
+    """Hold the result of `two_frequencies`: pairs of frequencies, in the order of their χ².
 
     **Fields:**
 
     - `frequencies`: (n, 2) the pairs, 1/s.
     - `misfits`: (n,) χ² of the best Fourier series of each pair. If the noise is not known, it is
-      chosen such that the smallest misfit equals `dof`.
+      chosen such that the smallest χ² equals `dof`.
     - `dof`: the degrees of freedom of each χ².
     - `scatter`: the standard deviation of the residuals of the best pair, in the values' unit.
     - `lines`: (m,) the strongest lines of the spectrum, 1/s.
@@ -268,7 +268,7 @@ def with_aliases(
 
 def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
     """Return the indices of the best pairs whose first or second frequencies differ by more than
-    `NEAR`, in the order of their misfits.
+    `NEAR`, in the order of their χ².
     """
     chosen: list[int] = []
     for index in np.argsort(misfits)[:20_000]:

@@ -10,7 +10,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.search.stages import cost_of
-from rigidjax.identify.search.stochastic_gradient import chosen, misfit_of
+from rigidjax.identify.search.stochastic_gradient import chosen, cost_of_recordings
 
 TS = jnp.linspace(0.0, 4.0, 25)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -33,10 +33,10 @@ NOISE = (jnp.full((24, 3), SIGMA),)
 
 
 @pytest.mark.oldest
-def test_few_recordings_show_the_whole_misfit_without_bias(problem):
-    # Every recording once in batches of one: their mean is the misfit of all.
+def test_few_recordings_show_the_whole_cost_without_bias(problem):
+    # Every recording once in batches of one: their mean is the cost of all.
     point = problem.start(rj.Inertia.from_principal(1.2, 1.5, 1.9)) + 0.1
-    of = eqx.filter_jit(misfit_of)
+    of = eqx.filter_jit(cost_of_recordings)
     parts = [of(point, problem, NOISE, jnp.array([row])) for row in range(24)]
     whole = 0.5 * np.sum((np.asarray(problem.errors(point)[0]) / SIGMA) ** 2)
     np.testing.assert_allclose(np.mean(parts), whole, rtol=1e-12)
@@ -46,8 +46,8 @@ def test_few_recordings_show_the_whole_misfit_without_bias(problem):
 def test_the_slope_is_that_of_differences(problem):
     point = problem.start(BODY) + 0.1
     rows = jnp.array([3, 7])
-    slope = eqx.filter_jit(jax.grad(misfit_of))(point, problem, NOISE, rows)
-    of = eqx.filter_jit(misfit_of)
+    slope = eqx.filter_jit(jax.grad(cost_of_recordings))(point, problem, NOISE, rows)
+    of = eqx.filter_jit(cost_of_recordings)
     # Two numbers of the body, one of a recording that counts, one of a recording that does not.
     for index in (0, 1, 2 + 3 * 3, 2):
         step = jnp.zeros(point.size).at[index].set(1e-5)
@@ -63,11 +63,11 @@ def test_a_batch_holds_the_recordings_it_names(problem):
     kept, whole = (jax.tree.leaves(eqx.filter(p.records, eqx.is_array)) for p in (few, problem))
     for a, b in zip(kept, whole, strict=True):
         np.testing.assert_array_equal(a, b[rows])
-    # The whole misfit as both show it is the mean of what each shows alone.
+    # The whole cost as both show it is the mean of what each shows alone.
     point = problem.start(BODY)
-    alone = [float(misfit_of(point, problem, NOISE, row[None])) for row in rows]
+    alone = [float(cost_of_recordings(point, problem, NOISE, row[None])) for row in rows]
     assert not np.isclose(*alone, rtol=1e-3)
-    both = float(misfit_of(point, problem, NOISE, rows))
+    both = float(cost_of_recordings(point, problem, NOISE, rows))
     np.testing.assert_allclose(both, np.mean(alone), rtol=1e-12)
 
 
@@ -89,7 +89,7 @@ def test_descent_alone_comes_near_and_a_fit_ends_at_the_bottom(problem):
 
 
 @pytest.mark.slow
-def test_where_the_misfit_is_lost_the_point_before_is_kept(problem):
+def test_where_the_cost_is_lost_the_point_before_is_kept(problem):
     how = identify.Descent(optax.sgd(1e300), steps=100, batch=2)
     start = problem.start(BODY)
     kept = identify.descend(problem, how, initial=start)
@@ -119,5 +119,5 @@ def test_too_many_numbers_for_least_squares_are_named():
     free = [identify.Free(lambda s: s.torque.weights, "weights")]
     law = Wide(jnp.zeros((400, 3)))
     wide = identify.Model(record, identify.Known(BODY), torque=law, free=free)
-    with pytest.raises(ValueError, match=r"1200 free numbers .* Use identify\.descend"):
+    with pytest.raises(ValueError, match=r"1200 parameters .* Use identify\.descend"):
         identify.fit(wide)

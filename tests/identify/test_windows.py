@@ -284,7 +284,7 @@ def test_a_guess_whose_runs_are_not_finite_says_so():
     cut = identify.windows(np.arange(10.0), SPINS, length=2)
     found = fitted(cut, torques.Damping(-1e200 * jnp.ones(3)), [DRAG])
     assert found.search.word == "not ended"
-    assert found.search.reasons == ("no start gave a finite misfit",)
+    assert found.search.reasons == ("no start gave a finite cost",)
 
 
 SPINS = rj.Spin(np.ones((10, 3)))

@@ -322,7 +322,7 @@ def assess(
         model, numbers, -white.determined @ linear.misfit_gradient, [one.suffix for one in charts]
     )
     # A search has ended if it converged, or if the minimum of the linearised problem is near: in a
-    # long curved valley the steps of a search stay short, although the misfit can hardly fall any
+    # long curved valley the steps of a search stay short, although the cost can hardly fall any
     # more. If a body would be unreal at this minimum (`limit.free` is negative), the distance to
     # the minimum is measured with the flatness of the body held constant.
     held = [limit.slope for limit in limits if limit.free < 0]
@@ -372,7 +372,7 @@ def assess(
     )
     words = f"{words} {describe_large_biases(model, quantities)}".rstrip()
     if not np.isfinite(best_cost):
-        search = Answer(NOT_ENDED, ("no start gave a finite misfit",))
+        search = Answer(NOT_ENDED, ("no start gave a finite cost",))
     elif not done:
         why = interrupted or ("max_steps reached",)
         search = Answer(NOT_ENDED, (*why, *remarks, "this is the best point found"))

@@ -83,11 +83,11 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None
         return None
     known = [attitudes(recording) for recording in recordings]
     if all(len(t) > 10 for t, _ in known):
-        bound = BETTER * _rate_misfit(recordings, known, _SAME)
-        ratios = {name: _rate_misfit(recordings, known, turn) for name, turn in RATES.items()}
+        bound = BETTER * _rate_difference(recordings, known, _SAME)
+        ratios = {name: _rate_difference(recordings, known, turn) for name, turn in RATES.items()}
         for name, change in ATTITUDES.items():
             changed = [(t, change(q)) for t, q in known]
-            ratios[name] = _rate_misfit(recordings, changed, _SAME)
+            ratios[name] = _rate_difference(recordings, changed, _SAME)
     elif rate_only(torque):
         bound, margin = _euler_residual(recordings, torque, _SAME)
         # The body that fits the uncorrected rates best may be unreal. Sensor errors alone can make
@@ -140,7 +140,7 @@ def _euler_residual(
     return _EulerResidual(float(left / np.linalg.norm(momentum @ components)), margin)
 
 
-def _rate_misfit(
+def _rate_difference(
     recordings: Sequence[Recording],
     attitudes: Sequence[tuple[np.ndarray, np.ndarray]],
     correction: Float[np.ndarray, "3 3"],

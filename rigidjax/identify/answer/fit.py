@@ -41,7 +41,7 @@ from rigidjax.identify.search.stages import (
 from rigidjax.identify.search.starts import starting_points
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 
-# At most this number of free numbers may be shared by all recordings, because the normal equations
+# At most this number of parameters may be shared by all recordings, because the normal equations
 # are dense.
 MOST_SHARED = 1000
 # A fit of a model whose arrays hold fewer numbers takes ten times as long on a GPU as on a CPU,
@@ -74,12 +74,12 @@ def fit(
     checkpoint: str | Path | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> Fit:
-    """Fit the free numbers of a model to its recordings: the body, the initial states and all
+    """Fit the parameters of a model to its recordings: the body, the initial states and all
     `Free`s (numbers of torques or sensors that the fit may move).
 
     **Arguments:**
 
-    - `model`: the readings and the free numbers.
+    - `model`: the readings and the parameters.
     - `starts`: the number of starting points. The first one comes from a regression, all others are
       scattered at random. The search from each point fits the whole record. If this fit does not
       explain the readings, the search fits a quarter, a half and then the whole of the record. A
@@ -87,9 +87,9 @@ def fit(
     - `initial`: (n,) a starting point of your own, which is tried first.
     - `key`: the random key of the scattered starting points; without a key these points are the
       same at each call.
-    - `tolerance`: the search has converged if the next Levenberg–Marquardt step changes each free
-      number by less than `tolerance` standard deviations of this number, computed with all other
-      numbers fixed.
+    - `tolerance`: the search has converged if the next Levenberg–Marquardt step changes each
+      parameter by less than `tolerance` standard deviations of this parameter, computed with all
+      other parameters fixed.
     - `max_steps`: the largest number of Levenberg–Marquardt steps.
     - `checkpoint`: a file in which the end of the search from each starting point is saved. A
       second call with the same model and options continues after the last saved search, and ends at
@@ -112,8 +112,8 @@ def fit(
     on a device, the fit runs on that device.
 
     **Raises:** `TypeError` unless `model` is a `Model`. `ValueError` for fewer than one start or
-    more than 10 000; for a body whose rates in a recording are all zero; for more than 1000 free
-    numbers that recordings share (`descend` takes any number); and for a checkpoint that is
+    more than 10 000; for a body whose rates in a recording are all zero; for more than 1000
+    parameters that recordings share (`descend` takes any number); and for a checkpoint that is
     damaged, belongs to another model, or lies in a folder that does not exist.
 
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -138,7 +138,7 @@ def fit(
     shared = model.size - len(model.index.alone) * model.count
     if shared > MOST_SHARED:
         raise ValueError(
-            f"fit: {shared} free numbers that recordings share are too many for least squares, "
+            f"fit: {shared} parameters that recordings share are too many for least squares, "
             f"which is made for {MOST_SHARED} and fewer: its matrices are dense. Use "
             "identify.descend(model, Descent(optax.adam(1e-2), steps=…, batch=…)), which takes "
             "gradients of a few recordings at a time"
@@ -268,7 +268,7 @@ def _search(
             latest = like
             # Once one search has explained the record, later searches only have to show whether
             # another motion explains the record as well. A later search is therefore given up if it
-            # is not likely to reach the least misfit so far.
+            # is not likely to reach the least cost so far.
             ended = [float(one.cost) for one in attempts if bool(one.converged)]
             aim = min(ended, default=np.inf)
             aim = aim if aim <= accepted_cost(task.model) else 0.0
@@ -278,7 +278,7 @@ def _search(
             best = min(attempts, key=_finite_cost)
             attempts[:] = [one if one is best else without_arrays(one) for one in attempts]
             keep.save(attempts)
-            words = f"misfit {float(attempts[-1].cost):.6g}, best {_finite_cost(best):.6g}"
+            words = f"cost {float(attempts[-1].cost):.6g}, best {_finite_cost(best):.6g}"
             report_progress(progress, f"start {number}/{len(points)}: {words}")
     except KeyboardInterrupt:
         interrupts.append(f"interrupted after {len(attempts)} of {len(points)} starts")

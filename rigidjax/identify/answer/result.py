@@ -30,7 +30,7 @@ class Start(eqx.Module):
 
     **Fields:**
 
-    - `x`: (n,) the free numbers at the end.
+    - `x`: (n,) the parameters at the end.
     - `cost`: half of the sum of squared residuals at x.
     - `converged`: whether the search converged.
     - `fits`: whether x explains the data as well as the best point of all starts does.
@@ -205,7 +205,7 @@ class Fit(eqx.Module):
         """Return the fitted body, or a dict of name → body for several bodies.
 
         The field `scale` of a body is "arbitrary" if the fit finds its inertia only up to a factor.
-        This happens if the chart, which maps free numbers to the body, describes ratios of moments.
+        This happens if the chart, which maps parameters to the body, describes ratios of moments.
         """
         return self.model.unpack(self.x).body
 

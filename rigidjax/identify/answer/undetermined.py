@@ -41,7 +41,7 @@ ROUND_OFF = 1e-5
 # Several numbers change by the same factor if their relative changes differ by less than this
 # fraction of the largest relative change.
 EVEN = 0.01
-# Readings change along a direction if a small step along it (of at most 0.01 in each free number)
+# Readings change along a direction if a small step along it (of at most 0.01 in each parameter)
 # moves all readings together by more than this number of standard deviations.
 CHANGED = 0.01
 # A step that tells a constant sum from a constant product changes each number by this fraction.
@@ -297,7 +297,7 @@ def _mask(
     rows = bodies_at(point.model, point.derivative_point)
     mask = np.ones(len(names), bool)
     for (where, chart), body in zip(named_charts(point.model), rows, strict=True):
-        # A name of a tensor component may occur twice in `names`: a chart, which maps free numbers
+        # A name of a tensor component may occur twice in `names`: a chart, which maps parameters
         # to a body, may report the components, and `_labels` adds them in any case. The last entry
         # with the name is the one added.
         every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]

@@ -1,6 +1,6 @@
 """Find a reference state of each recording from its first readings.
 
-The free numbers of an initial state are changes of this reference state.
+The parameters of an initial state are changes of this reference state.
 """
 
 from collections.abc import Sequence

@@ -109,7 +109,7 @@ def first_belief(
     **Arguments:**
 
     - `model`: a `Model` of one recording.
-    - `x`: (n,) the free numbers of the model, such as `fit(model).x`. With `None` the body must be
+    - `x`: (n,) the parameters of the model, such as `fit(model).x`. With `None` the body must be
       known.
     - `state`: the initial state, a `Spin`, `Attitude` or `Rigid`; `None` takes the initial state
       that x represents or, without x, the state that the first readings show.
@@ -198,7 +198,7 @@ def scene_and_recording(model: Model, x: Float[Array, " n"] | None) -> tuple[Sce
     if x is None:
         if model.index.bodies:
             raise ValueError(
-                "x: wanted the free numbers of the model, since its body is not known, got None; "
+                "x: wanted the parameters of the model, since its body is not known, got None; "
                 "fit(model).x or model.start(body) makes them"
             )
         x = model.start()
@@ -357,7 +357,7 @@ def filter(
     - `model`: a `Model` of one recording; each of its sensors must have a `noise`. Masked readings
       and channels at full scale are left out. The clock `offset` of a sensor is taken into account.
     - `belief`: the belief before the first reading, such as `first_belief` returns.
-    - `x`: (n,) the free numbers of the model, such as `fit(model).x`, which give the body, the
+    - `x`: (n,) the parameters of the model, such as `fit(model).x`, which give the body, the
       torques and the sensors. `None` for a model whose body is known.
     - `substeps`: the number of fixed steps from one time to the next; `None` chooses this number by
       the body rate and by the correlation times of unknown torques, and takes 1 if JAX traces
@@ -447,7 +447,7 @@ def step(
     - `readings`: one reading of each sensor, in the order of the recording.
     - `mask`: a truth value for each sensor, false if the sensor has no reading at t (then the value
       in `readings` is not used). `None` if all sensors have one.
-    - `x`: (n,) the free numbers of the model; `None` for a model whose body is known.
+    - `x`: (n,) the parameters of the model; `None` for a model whose body is known.
 
     **Returns** the `Belief` at t. **Raises:** `ValueError` for a number of readings that is not the
     number of sensors; unless JAX traces the numbers, also for a t before the time of the belief and

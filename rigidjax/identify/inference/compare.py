@@ -31,7 +31,7 @@ class Comparison(eqx.Module):
     **Fields:**
 
     - `name`: the name of the model.
-    - `free`: the number of free numbers of the model.
+    - `free`: the number of parameters of the model.
     - `rms`: the root mean square error of each sensor.
     - `correlation`: the number of samples over which the errors of the model are autocorrelated.
     - `information`: the Bayesian information criterion of the model minus the criterion of the best
@@ -48,7 +48,7 @@ class Comparison(eqx.Module):
 def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     """Compare models of the same data by Schwarz's criterion, and return the best model first.
 
-    The criterion is `Σ Nₛ log s² + p log N` for p free numbers (Schwarz 1978,
+    The criterion is `Σ Nₛ log s² + p log N` for p parameters (Schwarz 1978,
     doi:10.1214/aos/1176344136). The sum is over the sensors. For each sensor, s² is its mean square
     error, and Nₛ its number of independent readings. Nₛ is the number of components read, divided
     by the autocorrelation time (in samples) of the model for which this time is shortest. N is the
@@ -76,9 +76,9 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     rows = []
     for name, one in fits.items():
         independent_readings = np.array(counts[name]) / shortest
-        misfit = independent_readings @ _log_mean_squares(one)
+        deviance = independent_readings @ _log_mean_squares(one)
         penalty = one.x.size * np.log(max(independent_readings.sum(), 2.0))
-        rows.append((misfit + penalty, name, one))
+        rows.append((deviance + penalty, name, one))
     rows.sort(key=lambda row: row[0])
     best = rows[0][0]
     return tuple(

@@ -45,7 +45,7 @@ class LogDensity(eqx.Module):
     """Compute the logarithm of the posterior density of a fitted model, as a function of one vector
     x.
 
-    Call the object with x (n,), real numbers without bounds. The entries of x are the free numbers
+    Call the object with x (n,), real numbers without bounds. The entries of x are the parameters
     of the fitted model and the logarithms of additional factors. One factor multiplies each noise
     that the fit estimates, and one factor multiplies each number of the process (a random torque).
     `unpack(x)` returns the body, the states and the values that x represents.
@@ -120,8 +120,8 @@ class LogDensity(eqx.Module):
             what = " ".join(one.in_words for one in fit.undetermined_combinations)
             hint = "" if process is None else _GUESS
             raise ValueError(
-                "fit: neither the data nor a prior determine some combination of the free "
-                "numbers, so there is no posterior; give a prior or fewer free numbers"
+                "fit: neither the data nor a prior determine some combination of the "
+                "parameters, so there is no posterior; give a prior or fewer parameters"
                 f"{hint}. {what}".rstrip()
             )
         known = process is None or deviation is None

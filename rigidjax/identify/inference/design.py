@@ -33,7 +33,7 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
 
     - `model`: a model whose recordings hold the planned times and the sensors, with known noise;
       the values of the readings do not matter.
-    - `x`: (n,) the free numbers of the planned motion, such as `Model.start` returns.
+    - `x`: (n,) the parameters of the planned motion, such as `Model.start` returns.
 
     **Returns** the same quantities as `Fit.quantities` (`name`, `value`, and `deviation` in the
     same `unit`). The standard deviations are the least that an unbiased estimate can have (the
@@ -72,13 +72,13 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
 
 
 def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """Return Fisher's information matrix `Jᵀ Σ⁻¹ J` (n, n) of the free numbers x.
+    """Return Fisher's information matrix `Jᵀ Σ⁻¹ J` (n, n) of the parameters x.
 
     J holds the derivatives of all predictions with respect to x, and Σ is the covariance of the
     noise. The result is differentiable with respect to x, for a design by gradients.
 
-    **Arguments:** `model` is a model whose sensors have known noise; `x` (n,) holds the free
-    numbers of the motion. **Raises** `ValueError` for a sensor without noise.
+    **Arguments:** `model` is a model whose sensors have known noise; `x` (n,) holds the
+    parameters of the motion. **Raises** `ValueError` for a sensor without noise.
 
     >>> model = rj.datasets.toutatis.model()
     >>> fisher(model, model.start()).shape

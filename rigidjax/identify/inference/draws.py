@@ -400,7 +400,7 @@ def refit(
 
     The draws come from a wide Student's t distribution about the maximum. The weight of a draw is
     proportional to the posterior density over the density of the t distribution (importance
-    sampling: Geweke 1989, doi:10.2307/1913710). For more than a few dozen free numbers such draws
+    sampling: Geweke 1989, doi:10.2307/1913710). For more than a few dozen parameters such draws
     are worth few independent draws (`effective_count`). Intervals then come from the covariance,
     which is good enough if each recording is long; `identify.posterior` draws from any density.
 
@@ -412,7 +412,7 @@ def refit(
     - `key`: a key of `jax.random` for the draws; without a key the draws are the same at each call.
 
     **Returns** a `Refit`. Its `converged` is false if the search ended early, or if some change of
-    the free numbers changes neither readings nor priors; in the second case `weights` are NaN.
+    the parameters changes neither readings nor priors; in the second case `weights` are NaN.
 
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)

@@ -1,1 +1,1 @@
-"""Compute bodies, motions and the errors of all readings from free numbers."""
+"""Compute bodies, motions and the errors of all readings from parameters."""

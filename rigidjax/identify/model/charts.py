@@ -87,7 +87,7 @@ class AbstractBodyChart(eqx.Module):
         0) leaves the curvature out.
 
         - `vector`: (size,) the numbers of the body in the chart.
-        - `misfit_gradient`: (size,) the derivative of the misfit with respect to these numbers.
+        - `misfit_gradient`: (size,) the derivative of the cost with respect to these numbers.
         """
         return jnp.zeros((0, self.size), vector.dtype)
 
@@ -302,7 +302,7 @@ class Mass(AbstractBodyChart):
 
     @property
     def _free_indices(self) -> list[int]:
-        """Return the sorted indices of the free numbers among the ten of
+        """Return the sorted indices of the numbers of this chart among the ten of
         `rigidjax.body.parameters.pack`.
         """
         return sorted(place for name in self.free for place in _PARTS[name])

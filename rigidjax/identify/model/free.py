@@ -1,4 +1,4 @@
-"""Find the free numbers of a scene: which leaf of the scene each number changes, and how."""
+"""Find the parameters of a scene: which leaf of the scene each number changes, and how."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ from rigidjax.identify.sensors.base import extras
 
 
 class Free(eqx.Module):
-    """Define a free number, which a fit moves: a number or an array in the torque or in the sensors
+    """Define a parameter, which a fit moves: a number or an array in the torque or in the sensors
     of a `Scene` (the body, torques, sensors and initial state of a recording).
 
     **Arguments:**

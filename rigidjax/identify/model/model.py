@@ -1,4 +1,4 @@
-"""Map the free numbers of a fit to the scene of each recording, by a model."""
+"""Map the parameters of a fit to the scene of each recording, by a model."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -53,12 +53,12 @@ BodyIndex = Array | None
 
 
 class Unpacked(eqx.Module):
-    """Hold the quantities that the free numbers of a model represent, such as the body and the
+    """Hold the quantities that the parameters of a model represent, such as the body and the
     initial state.
 
     **Fields:**
 
-    - `x`: (n,) the free numbers.
+    - `x`: (n,) the parameters.
     - `body`: the body; several bodies as a dict by name.
     - `state0`: the initial state; the initial states of several recordings have a leading axis.
     - `values`: the values of the `Free`s (other numbers that a fit may move) by name, in their
@@ -83,7 +83,7 @@ class Unpacked(eqx.Module):
 
 
 class Model(eqx.Module):
-    """Hold the recordings of one body or of several bodies, and describe by n free numbers x
+    """Hold the recordings of one body or of several bodies, and describe by n parameters x
     everything that their readings depend on.
 
     **Arguments:**
@@ -104,7 +104,7 @@ class Model(eqx.Module):
       its mean, zero.
     - `walks`: sensor errors that drift, a sequence of `Walk(where, deviation, density)`. `filter`,
       `smooth` and `LogDensity` follow the drift; `fit` takes the errors as constant.
-    - `free`: other free numbers, a sequence of `Free(where, name, …)`: one value for all, or one
+    - `free`: other parameters, a sequence of `Free(where, name, …)`: one value for all, or one
       for each body, group or recording.
     - `loss`: a robust loss, `SoftL1()` or `Huber()`; `None` for plain least squares.
     - `prior`: `Entropic(guess, weight)`, a prior about a roughly known body, or `None`.
@@ -189,7 +189,7 @@ class Model(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return n, how many free numbers this model has."""
+        """Return n, how many parameters this model has."""
         return self.index.size
 
     @property
@@ -219,12 +219,12 @@ class Model(eqx.Module):
         """Return the typical body rate of the first recording of this model, rad/s, as its readings
         show it (1 if they show no rate).
 
-        The free numbers of the initial rate of this recording are in units of the typical rate.
+        The parameters of the initial rate of this recording are in units of the typical rate.
         """
         return self.reference.rate[0]
 
     def start(self, body: PyTree = None, omega: NumbersLike | None = None) -> Float[Array, " n"]:
-        """Return free numbers (n,) with which a fit of this model may start, or which describe a
+        """Return parameters (n,) with which a fit of this model may start, or which describe a
         planned motion of a given body at a given rate.
 
         Each number of a `Free` has its starting value.
@@ -264,14 +264,14 @@ class Model(eqx.Module):
         rest = self.size - vector.size - spin.size
         own = sum(s.own.size for s in self.slots if s.own is not None)
         zeros = xp.zeros(rest - own, kind), xp.zeros(own, kind)
-        # `Index` describes the order of the free numbers: first the numbers of the bodies, and of
+        # `Index` describes the order of the parameters: first the numbers of the bodies, and of
         # the `Free`s that recordings share; then the initial states, whose rates come last; then
         # the numbers of the `Free`s that one recording has alone.
         parts = [xp.asarray(vector, kind), zeros[0], spin.reshape(-1), zeros[1]]
         return jnp.asarray(xp.concatenate(parts))
 
     def unpack(self, x: Float[Array, " n"]) -> Unpacked:
-        """Return the quantities that the free numbers x (n,) represent: body, initial state, values
+        """Return the quantities that the parameters x (n,) represent: body, initial state, values
         of the `Free`s.
 
         For several recordings the states have a leading axis.
@@ -283,7 +283,7 @@ class Model(eqx.Module):
         return unpack_at(self, x)
 
     def bodies(self, x: Float[Array, " n"]) -> Any:
-        """Return the body that the free numbers x (n,) represent, or for several bodies a dict of
+        """Return the body that the parameters x (n,) represent, or for several bodies a dict of
         name → body.
         """
         parts = split_numbers(self.charts, x[: self.index.bodies])
@@ -293,13 +293,13 @@ class Model(eqx.Module):
         return dict(zip(dict.fromkeys(self.body_names), bodies, strict=True))
 
     def scenes(self, x: Float[Array, " n"]) -> Scene:
-        """Return the scene (body, torques, sensors, initial state) of each recording at the free
-        numbers x (n,), with a leading axis of recordings.
+        """Return the scene (body, torques, sensors, initial state) of each recording at the
+        parameters x (n,), with a leading axis of recordings.
         """
         return scenes_of(self, checked_x(self, x))
 
     def values(self, x: Float[Array, " n"]) -> dict[str, Array]:
-        """Return the values of all `Free`s at the free numbers x (n,), as a dict of name → array,
+        """Return the values of all `Free`s at the parameters x (n,), as a dict of name → array,
         in their units.
 
         The shape is (R, …) if each recording has a value, and (groups, …) if each group of
@@ -309,7 +309,7 @@ class Model(eqx.Module):
         return values_of(self, checked_x(self, x))
 
     def motion(self, x: Float[Array, " n"]) -> Any:
-        """Return the states at the times of the recording for the free numbers x (n,), with a
+        """Return the states at the times of the recording for the parameters x (n,), with a
         leading time axis.
 
         For several recordings an axis of recordings comes before the time axis.
@@ -324,7 +324,7 @@ class Model(eqx.Module):
         return stacking.pick(states, 0) if self.count == 1 else states
 
     def errors(self, x: Float[Array, " n"]) -> tuple[Float[Array, "*records times _"], ...]:
-        """Return reading minus prediction for each sensor at the free numbers x, in the sensor's
+        """Return reading minus prediction for each sensor at the parameters x, in the sensor's
         unit.
 
         The difference is zero for a masked reading.
@@ -414,7 +414,7 @@ def checked_x(model: Model, x: NumbersLike) -> Float[Array, " n"]:
         hint += "; the x of a LogDensity, such as refit(density).x, goes with density.model"
     if numbers.shape != (model.size,):
         raise ValueError(
-            f"x: wanted the {model.size} free numbers of this model, got shape {numbers.shape}; "
+            f"x: wanted the {model.size} parameters of this model, got shape {numbers.shape}; "
             f"{hint}"
         )
     if numbers.dtype != model.records.t.dtype:
@@ -587,8 +587,8 @@ def _map_rows_jvp(
     (rows, model, function), (step, *rest) = primals, tangents
     if jax.tree.leaves(rest):
         raise TypeError(
-            "model: wanted derivatives in the free numbers x alone, not in the numbers of the "
-            "model; make them free by a Free(where, name)"
+            "model: wanted derivatives in the parameters x alone, not in the numbers of the "
+            "model; make one a parameter by a Free(where, name)"
         )
     out, slopes = _row_jacobians(model, rows, function)
     along = jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, step), slopes)

@@ -18,7 +18,7 @@ Process = RandomTorque | CorrelatedTorque | Sum
 class Scene(eqx.Module):
     """Hold the scene of a recording, which is everything that its readings depend on.
 
-    `Model.scenes(x)` makes the scenes of the free numbers x. A `Free(where, …)` picks a number of a
+    `Model.scenes(x)` makes the scenes of the parameters x. A `Free(where, …)` picks a number of a
     scene, such as `lambda s: s.torque.coefficient` or `lambda s: s.sensors[0].bias`.
 
     **Fields:**

@@ -1,1 +1,1 @@
-"""Find the free numbers of a model with the least misfit."""
+"""Find the parameters of a model with the least cost."""

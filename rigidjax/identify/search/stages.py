@@ -1,4 +1,4 @@
-"""Find the least misfit from one start: Levenberg–Marquardt fits to longer and longer beginnings of
+"""Find the least cost from one start: Levenberg–Marquardt fits to longer and longer beginnings of
 the records.
 """
 
@@ -35,13 +35,13 @@ HORIZONS = (0.25, 0.5, 1.0)
 MANY = 16
 # One run of the compiled search takes this many steps. An interrupt is noticed between two runs.
 STRIDE = 25
-# A search has reached the minimum if one run of STRIDE steps lowers the misfit by less than this
-# fraction of the misfit.
+# A search has reached the minimum if one run of STRIDE steps lowers the cost by less than this
+# fraction of the cost.
 SETTLED = 1e-7
-# The result of a fit to the beginning of a record is used only if it raises the misfit of the whole
+# The result of a fit to the beginning of a record is used only if it raises the cost of the whole
 # record by less than this factor. A start is given up if its fit to the beginning does not
-# converge, and its misfit there exceeds, by more than this factor, the share of the beginning in
-# the misfit of another start.
+# converge, and its cost there exceeds, by more than this factor, the share of the beginning in
+# the cost of another start.
 WILD = 100.0
 # A search over windows ends at a distance of about TOLERANCES times the tolerance from the minimum.
 # By default this distance is 0.05 standard deviations. The search ends when the gain of a step
@@ -286,20 +286,20 @@ def search_whole(
         before = float(attempt.cost)
         end = _take_steps(attempt.x, task, weights, BOLD if first else damping, aim)
         if not np.isfinite(float(end.cost)):
-            # The misfit has become infinite or NaN. The search returns to the point before this
+            # The cost has become infinite or NaN. The search returns to the point before this
             # run.
             attempt = Attempt(attempt.x, cost_of(task.model, attempt.x, task.noise))
             watch(attempt)
             break
         attempt = _best(end)
         # At the minimum every step may be refused because of round-off. The search therefore also
-        # ends if the misfit does not fall any more. This test needs a whole run: with a small
+        # ends if the cost does not fall any more. This test needs a whole run: with a small
         # `max_steps`, one or two steps may all be refused only because they are too long.
         stands = before - float(attempt.cost) < SETTLED * (1.0 + abs(before))
         stands = stands and task.stride == STRIDE
         settled = bool(attempt.converged) or stands
-        # The search is hopeless if the misfit would still be above `aim`, the cost that the search
-        # from another start reached, after another run that lowers the misfit by the same factor as
+        # The search is hopeless if the cost would still be above `aim`, the cost that the search
+        # from another start reached, after another run that lowers the cost by the same factor as
         # this run.
         hopeless = aim > 0 and not settled and float(attempt.cost) ** 2 > aim * before
         attempt = dataclasses.replace(attempt, converged=settled)
@@ -347,8 +347,8 @@ def fit_in_stages(
         # start of the next fit.
         weights = first_weights(model, part)
         end = _take_steps(x, task, weights, CAREFUL, aim * part, aim * part)
-        # Free numbers that explain the beginning of the record may be far off later in the record,
-        # for instance if the drag has the wrong sign. They are used only if the misfit of the whole
+        # Parameters that explain the beginning of the record may be far off later in the record,
+        # for instance if the drag has the wrong sign. They are used only if the cost of the whole
         # record does not grow too much.
         after = cost_of(model, end.point, noise)
         if after < WILD * max(level, 1e-300):
@@ -363,7 +363,7 @@ def fit_in_stages(
     if not float(at_once.cost) < (1.0 - SETTLED) * float(attempt.cost):
         return attempt
     # The fits to the beginning of the record may have led away from the minimum of the whole
-    # record's misfit. The first fit to the whole record, which has a lower misfit, is then the
+    # record's cost. The first fit to the whole record, which has a lower cost, is then the
     # result, after further steps if it has not converged.
     return at_once if bool(at_once.converged) else search_whole(at_once, task, aim=aim, watch=watch)
 

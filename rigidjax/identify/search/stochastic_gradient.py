@@ -24,7 +24,7 @@ from rigidjax.identify.search.noise import initial_noise
 if TYPE_CHECKING:
     import optax
 
-# One run of the compiled program takes this many steps. An interrupt (Ctrl-C), or a misfit that is
+# One run of the compiled program takes this many steps. An interrupt (Ctrl-C), or a cost that is
 # not finite, is noticed between two runs.
 STRIDE = 50
 
@@ -33,8 +33,8 @@ class Descent(eqx.Module):
     """Hold the options of a stochastic gradient descent, which uses a few recordings in each step.
 
     Each step draws `batch` recordings without replacement. The optimiser gets the gradient of the
-    misfit of these recordings with respect to all free numbers (Robbins and Monro 1951,
-    doi:10.1214/aoms/1177729586). The free numbers are unconstrained and of order one, so that a
+    cost of these recordings with respect to all parameters (Robbins and Monro 1951,
+    doi:10.1214/aoms/1177729586). The parameters are unconstrained and of order one, so that a
     learning rate of 0.01 moves each number by about a hundredth of its size in a step.
 
     **Arguments:**
@@ -74,21 +74,21 @@ def descend(
     key: PRNGKeyArray | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> Float[Array, " n"]:
-    """Fit the free numbers of a model by stochastic gradient descent alone.
+    """Fit the parameters of a model by stochastic gradient descent alone.
 
-    It is for models with many free numbers, such as the weights of a network in the torque, for
+    It is for models with many parameters, such as the weights of a network in the torque, for
     which the dense matrices of `fit` are too large. It gives no intervals.
 
     **Arguments:**
 
-    - `model`: the readings and the free numbers. The noise of a sensor whose noise is `None` is
+    - `model`: the readings and the parameters. The noise of a sensor whose noise is `None` is
       taken as a tenth of its signal.
     - `descent`: the optimiser, the number of steps and the size of a batch.
-    - `initial`: (n,) the free numbers to begin with, `model.start()` unless given.
+    - `initial`: (n,) the parameters to begin with, `model.start()` unless given.
     - `key`: random key of the batches; without a key the batches are the same at each call.
     - `progress`: a function such as `print`, called with a line of text after every 50 steps.
 
-    **Returns** the free numbers x (n,) after the last step. If a misfit becomes infinite or NaN,
+    **Returns** the parameters x (n,) after the last step. If a cost becomes infinite or NaN,
     the result is x before the 50 steps in which this happens. After an interrupt (Ctrl-C) it is the
     last x that was reached. `model.unpack(x)` returns the body and the values, `model.scenes(x)`
     the scenes. **Raises:** `ValueError` for a batch of more recordings than there are.
@@ -129,7 +129,7 @@ def descend(
                 break
             x = after
             done = first + keys.shape[0]
-            line = f"descent {done}/{descent.steps}: misfit {float(costs.mean()):.6g}"
+            line = f"descent {done}/{descent.steps}: cost {float(costs.mean()):.6g}"
             report_progress(progress, line)
     except KeyboardInterrupt:
         pass
@@ -153,7 +153,7 @@ def _descent_steps(
         x, optimiser_state = carry
         update: Any = descent.optimiser.update
         rows = jax.random.choice(key, model.count, (descent.batch,), replace=False)
-        cost, slope = jax.value_and_grad(misfit_of)(x, model, noise, rows)
+        cost, slope = jax.value_and_grad(cost_of_recordings)(x, model, noise, rows)
         # optax multiplies its integer count of steps by floats, which strict promotion would
         # refuse.
         with jax.numpy_dtype_promotion("standard"):
@@ -164,7 +164,7 @@ def _descent_steps(
     return x, optimiser_state, costs
 
 
-def misfit_of(
+def cost_of_recordings(
     x: Float[Array, " n"], model: Model, noise: Noise, recording_indices: Array
 ) -> Float[Array, ""]:
     """Return the cost of some recordings, scaled up to the number of all, plus the cost of the

@@ -226,7 +226,7 @@ def reported_quantities(
     deviations = standard_deviations(slope, covariance, null_directions)
     cuts = flatness_cuts(slope, covariance, deviations, limits)
     freedom = np.broadcast_to(degrees_of_freedom, quantities[0].shape)
-    # A quantity that does not depend on any free number, such as a known quantity, gets no
+    # A quantity that does not depend on any parameter, such as a known quantity, gets no
     # deviation (NaN).
     deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
     close = _deviations_of_close_moments(model, names, values, slope, covariance)

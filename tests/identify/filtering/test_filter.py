@@ -487,9 +487,9 @@ class TestBadInput:
 
     def test_a_body_that_is_not_known(self):
         model = identify.Model(self.record, identify.Ratios())
-        with pytest.raises(ValueError, match=r"x: wanted the free numbers.*fit\(model\)\.x"):
+        with pytest.raises(ValueError, match=r"x: wanted the parameters.*fit\(model\)\.x"):
             identify.first_belief(model, rate=0.1)
-        with pytest.raises(ValueError, match="x: wanted the 8 free numbers of this model"):
+        with pytest.raises(ValueError, match="x: wanted the 8 parameters of this model"):
             identify.filter(model, self.start(), jnp.zeros(3))
 
     def test_a_walk_that_finds_nothing(self):

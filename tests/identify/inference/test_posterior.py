@@ -21,7 +21,7 @@ from rigidjax.identify.filtering.terms import curvature
 from rigidjax.identify.model.model import error_jacobians
 from rigidjax.identify.uncertainty.covariance import linearise
 
-# The places of the initial rate among the free numbers of `model`.
+# The places of the initial rate among the parameters of `model`.
 SPIN = slice(2, 5)
 
 
@@ -529,7 +529,7 @@ def test_the_information_is_the_covariance_of_the_gradient(fitted, process):
 
 def test_a_fit_that_failed_without_the_torque_is_refused_with_the_way_out(fitted):
     lost = changed(fitted, covariance=jnp.full((5, 5), jnp.inf))
-    with pytest.raises(ValueError, match=r"fewer free numbers\. *"):
+    with pytest.raises(ValueError, match=r"fewer parameters\. *"):
         identify.LogDensity(lost)
     with pytest.raises(ValueError, match="begin from a first guess"):
         identify.LogDensity(lost, rj.torques.RandomTorque(1e-4))
