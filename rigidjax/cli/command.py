@@ -325,7 +325,7 @@ def _run_demo(options: argparse.Namespace) -> int:
 
 def _channels(options: argparse.Namespace, rate_columns: Sequence[str]) -> list[spec.Channel]:
     """Return the sensors of a log: those of `--sensor`, else one gyro, which `--unit`, `--noise`
-    and `--limit` describe.
+    and `--limit` describe; raise `LogError` for both together, or one that is not positive.
     """
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]

@@ -263,7 +263,7 @@ def _sensor(
     channel: Channel, values: np.ndarray, factor: float, has_bias: bool
 ) -> tuple[AbstractSensor, np.ndarray]:
     """Return the sensor that a channel describes, and its readings: the SI values of its columns,
-    or quaternions.
+    or quaternions; raise `LogError` for Euler angles in an unknown order.
     """
     zero = [0.0, 0.0, 0.0] if has_bias else None
     noise = None if channel.noise is None else factor * np.array(channel.noise)

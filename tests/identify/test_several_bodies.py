@@ -181,3 +181,12 @@ def test_a_spread_needs_a_shared_value():
         identify.Free(lambda s: s.sensors[0].bias, "b", each="throw")
     with pytest.raises(TypeError, match="each: wanted True, False"):
         identify.Free(lambda s: s.sensors[0].bias, "b", each=None)
+
+
+@pytest.mark.parametrize(
+    ("body", "got"), [({"cone": BODIES["box"]}, "'cone'"), (BODIES["rod"], "Inertia$")]
+)
+def test_a_start_names_the_bodies_that_it_takes(records, body, got):
+    charts = {name: identify.Known(body) for name, body in BODIES.items()}
+    with pytest.raises(ValueError, match=r"a dict such as \{'box': .* among box, rod, .*" + got):
+        identify.Model(records, charts, torque=LAW).start(body)

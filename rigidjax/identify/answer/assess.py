@@ -119,7 +119,8 @@ def _goodness_of_sensor(
     Errors count as larger than a given noise if their χ² exceeds the expected χ² by more than five
     standard deviations. Under a robust loss the median of the squared errors takes the place of χ².
     The errors are also compared with the variance of the readings. Ljung and Box's test (1978,
-    doi:10.1093/biomet/65.2.297) says whether they are white.
+    doi:10.1093/biomet/65.2.297) says whether they are white, and `time_stamp_cause` whether they
+    come from scattered time stamps.
     """
     reading, error, e = model.records.readings[index], linear.raw[index], linear.errors[index]
     weight, mask = linear.weights[index], linear.mask[index]

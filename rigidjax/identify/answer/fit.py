@@ -99,8 +99,10 @@ def fit(
     **Returns** a `Fit` of the best point reached. It holds two answers:
 
     - `fit.search`: `found`, `not alone` (another motion fits as well), or `not ended`.
-    - `fit.explanation`: `explains the readings` (the errors are white and as large as the sensor's
-      noise), `leaves a part` (how large, and at which times), or `does not explain the readings`.
+    - `fit.explanation`: `explains the readings` (the errors are white, as large as the sensor's
+      noise, and not those of scattered time stamps, which lie along the derivative of the readings
+      with respect to time), `leaves a part` (how large, and at which times), or `does not explain
+      the readings`.
 
     `fit.status` holds both answers in one line, or `ok` if all is well. `fit.causes` names what
     most likely makes the errors, and `fit.advice` says whether the intervals can be trusted. An

@@ -590,9 +590,12 @@ def checked_input(
     """Return the arguments of `filter` and `smooth` after checks, which raise their errors."""
     scene, recording = scene_and_recording(model, x)
     _checks.require_instance(belief, Belief, "belief", hint="identify.first_belief makes it")
-    for sensor in scene.sensors:
+    for index, sensor in enumerate(scene.sensors):
         if not isinstance(belief.x.motion, sensor.feels):
-            kind, got = sensor.feels.__name__, type(belief.x.motion).__name__
-            raise TypeError(f"belief: a sensor needs a state with {kind}, got a {got}")
+            raise TypeError(
+                f"belief: sensor {index}, {type(sensor).__name__}, needs a state with "
+                f"{sensor.feels.__name__}, got {type(belief.x.motion).__name__}; give "
+                "first_belief(…, state=…) an Attitude, or a Rigid for what depends on the position"
+            )
     grid = step_grid(scene.process, recording, belief, substeps)
     return FilterInput(scene, model.walks, recording, belief, grid)

@@ -37,7 +37,9 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
 
     **Returns** the same quantities as `Fit.quantities` (`name`, `value`, and `deviation` in the
     same `unit`). The standard deviations are the least that an unbiased estimate can have (the
-    Cramér–Rao bound), and infinite for a quantity that the motion does not determine. **Raises:**
+    Cramér–Rao bound), and infinite for a quantity that the motion does not determine. Their
+    `freedom` is infinite, also for windows, where a fit has C − 1 degrees of freedom for C
+    stretches of neighbouring windows: with few stretches its intervals are wider. **Raises:**
     `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
 
     >>> model = rj.datasets.toutatis.model()

@@ -246,8 +246,13 @@ class Model(eqx.Module):
         else:
             by_name = dict(body) if isinstance(body, Mapping) else {}
             named = dict(zip(dict.fromkeys(self.body_names), self.charts, strict=True))
-            if not isinstance(body, Mapping | None) or set(by_name) - set(named):
-                raise ValueError(f"body: wanted bodies by name, of {', '.join(named)}, or None")
+            wrong = [name for name in by_name if name not in named]
+            if not isinstance(body, Mapping | None) or wrong:
+                names, got = ", ".join(named), wrong or type(body).__name__
+                raise ValueError(
+                    f"body: wanted a dict such as {{{next(iter(named))!r}: Inertia(…)}}, whose "
+                    f"names are among {names}, or None; got {got}"
+                )
             parts = (_chart_vector(chart, by_name.get(name)) for name, chart in named.items())
             vector = jnp.concatenate(list(parts))
         kind = jnp.result_type(float)

@@ -22,9 +22,10 @@ class AttitudeSensor(ClockedSensor):
     attitude.
 
     The error is the rotation vector, in the sensor's axes, from the predicted attitude to the
-    reading, `log((q exp(mounting))⁻¹ q_read)`: its length is the angle between the two attitudes.
-    Here q is the predicted attitude of the body, and q_read the reading. Readings are quaternions
-    (T, 4) or rotation matrices (T, 3, 3). Euler angles (T, 3) in degrees become quaternions by
+    reading. It stands on the right, `q_read = q exp(mounting) exp(error)`, where q is the predicted
+    attitude of the body and q_read the reading: its length is the angle between the two attitudes.
+    Readings are quaternions (T, 4) or rotation matrices (T, 3, 3). Euler angles (T, 3) in degrees
+    become quaternions by
     `jax.vmap(lambda a: rj.euler.to_quaternion(a, "ZYX"))(jnp.deg2rad(angles))`.
 
     **Arguments:**

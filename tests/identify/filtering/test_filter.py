@@ -540,7 +540,8 @@ class TestBadInput:
         record = identify.Recording(
             [0.0, 0.1], (identify.Direction([0.0, 0, 1], 0.1), [[0.0, 0, 1]] * 2)
         )
-        with pytest.raises(TypeError, match="needs a state with HasAttitude"):
+        words = r"sensor 0, Direction, needs a state with HasAttitude, got Spin; .* an Attitude"
+        with pytest.raises(TypeError, match=words):
             identify.filter(records.known(record), self.start())
 
     def test_a_lost_filter(self):
