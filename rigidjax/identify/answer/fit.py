@@ -3,6 +3,7 @@ between recordings.
 """
 
 import dataclasses
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -170,7 +171,7 @@ def fit(
         finer = _converged_integrator(first, task, rough)
         task = task if rough else task._replace(model=_with_integrator(padded, finer))
     attempts = _search(points, task, checkpoint, progress, interrupts)
-    best = min(attempts, key=_finite_cost)
+    best = min(attempts, key=lambda one: float(one.cost))
     lowest = float(best.cost)
     for estimated in (_noise_in_turn, _spreads_in_turn):
         best, task = estimated(best, task)
@@ -213,12 +214,6 @@ def _cpu_if_faster(model: Model) -> Any:
     return jax.devices("cpu")[0]
 
 
-def _finite_cost(attempt: Attempt) -> float:
-    """Return the cost at the end of a search, or infinity in place of NaN."""
-    cost = float(attempt.cost)
-    return cost if np.isfinite(cost) else np.inf
-
-
 def _noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     """Estimate the unknown noise of sensors and the best point alternately.
 
@@ -259,33 +254,28 @@ def _search(
         costs = [cost_of(task.model, point, task.noise) for point in points]
         print_of = fingerprint(points, task, costs)
     keep = Checkpoint(checkpoint, like, print_of)
-    attempts, latest = list(keep.done), like
-
-    def watch(attempt: Attempt) -> None:
-        nonlocal latest
-        latest = attempt
-
+    # The last point of the present search, for an interrupt.
+    attempts, latest = list(keep.done), deque([like], maxlen=1)
     try:
         for number, point in enumerate(points[len(keep.done) :], len(keep.done) + 1):
-            latest = like
             # Once one search has explained the record, later searches only have to show whether
             # another motion explains the record as well. A later search is therefore given up if it
             # is not likely to reach the least cost so far.
             ended = [float(one.cost) for one in attempts if bool(one.converged)]
             aim = min(ended, default=np.inf)
             aim = aim if aim <= accepted_cost(task.model) else 0.0
-            attempts.append(fit_in_stages(point, task, aim=aim, watch=watch))
-            latest = like
+            attempts.append(fit_in_stages(point, task, aim=aim, watch=latest.append))
+            latest.append(like)
             # Only the best search so far keeps its errors and their derivatives, which need memory.
-            best = min(attempts, key=_finite_cost)
+            best = min(attempts, key=lambda one: float(one.cost))
             attempts[:] = [one if one is best else without_arrays(one) for one in attempts]
             keep.save(attempts)
-            words = f"cost {float(attempts[-1].cost):.6g}, best {_finite_cost(best):.6g}"
+            words = f"cost {float(attempts[-1].cost):.6g}, best {float(best.cost):.6g}"
             report_progress(progress, f"start {number}/{len(points)}: {words}")
     except KeyboardInterrupt:
         interrupts.append(f"interrupted after {len(attempts)} of {len(points)} starts")
-        if np.isfinite(float(latest.cost)):
-            attempts.append(latest)
+        if np.isfinite(float(latest[0].cost)):
+            attempts.append(latest[0])
         if not attempts:
             raise
     return attempts

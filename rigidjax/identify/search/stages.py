@@ -83,11 +83,6 @@ class Task(NamedTuple):
     tolerance: float
     max_steps: int
 
-    @property
-    def stride(self) -> int:
-        """Return how many steps one compiled run takes; an interrupt is noticed after the run."""
-        return min(STRIDE, self.max_steps)
-
 
 @eqx.filter_jit
 def marquardt(
@@ -238,7 +233,7 @@ def _take_steps(
     Without `noise_gain_fraction` (`Settings.level`) the search of a model of windows ends at a
     distance of about `TOLERANCES` tolerances from the minimum.
     """
-    steps = task.stride if steps is None else steps
+    steps = min(STRIDE, task.max_steps) if steps is None else steps
     level = noise_gain_fraction
     level = (TOLERANCES * task.tolerance) ** 2 if level is None else level
     count = unit_noise_count(task.model)
@@ -296,7 +291,7 @@ def search_whole(
         # ends if the cost does not fall any more. This test needs a whole run: with a small
         # `max_steps`, one or two steps may all be refused only because they are too long.
         stands = before - float(attempt.cost) < SETTLED * (1.0 + abs(before))
-        stands = stands and task.stride == STRIDE
+        stands = stands and task.max_steps >= STRIDE
         settled = bool(attempt.converged) or stands
         # The search is hopeless if the cost would still be above `aim`, the cost that the search
         # from another start reached, after another run that lowers the cost by the same factor as

@@ -180,20 +180,15 @@ def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
     return jnp.concatenate([part.astype(x.dtype) for part in parts])
 
 
-def quantities_at(model: Model, x: Float[Array, " n"]) -> FirstOrder:
+@eqx.filter_jit
+def _quantities_at(model: Model, x: Float[Array, " n"]) -> FirstOrder:
     """Return the reported quantities (q,) of a `model`, positive ones as logarithms.
 
     The last entries are the flatness (I1 + I2 − I3) / I3 of each body.
     """
-    return _quantities_at(shortened(model), x)
-
-
-@eqx.filter_jit
-def _quantities_at(model: Model, x: Float[Array, " n"]) -> FirstOrder:
-    def value(x: Array) -> Array:
-        return jnp.concatenate([quantity_vector(model, x), flat_limit.flatness(model, x)])
-
-    return value_and_jacfwd(value, x)
+    return value_and_jacfwd(
+        lambda x: jnp.concatenate([quantity_vector(model, x), flat_limit.flatness(model, x)]), x
+    )
 
 
 def quantities_on_host(
@@ -202,9 +197,10 @@ def quantities_on_host(
     """Return the reported quantities at the parameters x in NumPy, with the derivatives at a
     thicker body, the `derivative_point`, if a body is flat at x.
     """
-    values, slopes = map(np.asarray, quantities_at(model, x))
+    model = shortened(model)
+    values, slopes = map(np.asarray, _quantities_at(model, x))
     if derivative_point is not None:
-        slopes = np.asarray(quantities_at(model, derivative_point).jacobian)
+        slopes = np.asarray(_quantities_at(model, derivative_point).jacobian)
     return FirstOrder(values, slopes)
 
 
