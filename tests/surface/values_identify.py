@@ -631,8 +631,7 @@ leave_out(
     "identify.Linearisation",
     *(f"identify.Linearisation.{name}" for name in (
         "squared_residual_change", "covariance_by_recording", "first_times", "free_count",
-        "information_by_sensor", "weighted_jacobian", "weighted_jacobians_by_sensor",
-        "weighted_residuals",
+        "weighted_jacobian", "weighted_jacobians_by_sensor", "weighted_residuals",
         "misfit_gradients_by_recording",
         "misfit_gradient")),
 )  # fmt: skip

@@ -122,8 +122,6 @@ def _shares(
         taken = [np.array([x.size])]
     else:
         linear = linearise(model, x, noise, blocks)
-        taken = effective_parameters(
-            linear, linear.information_by_sensor, white_covariance(linear).determined
-        )
+        taken = effective_parameters(linear, white_covariance(linear).determined)
         taken = [np.bincount(groups, each) for each in taken]
     return [np.maximum(1.0 - n / np.maximum(m, 1), 0.1) for n, m in zip(taken, sizes, strict=True)]

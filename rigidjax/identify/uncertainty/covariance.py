@@ -115,11 +115,6 @@ class Linearisation(eqx.Module):
         parts = [(error * np.sqrt(weight)[..., None]) for error, weight in pairs]
         return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
 
-    @property
-    def information_by_sensor(self) -> tuple[np.ndarray, ...]:
-        """Return for each sensor the information matrices JᵀWJ (R, m, m) of its residuals."""
-        return tuple(rows.swapaxes(1, 2) @ rows for rows in self.weighted_jacobians_by_sensor)
-
     def squared_residual_change(self, step: np.ndarray) -> float:
         """Return the sum of the squared changes of all residuals, those of priors included, by a
         `step` (n,) along which they are taken as linear.

@@ -63,7 +63,7 @@ def prepare_freedom(
         # neighbouring windows), so that they have C − 1 degrees of freedom.
         return Freedom(covariance, max(float(np.max(np.asarray(model.clusters))), 1.0), ())
     groups, least = np.asarray(model.noise_groups), np.inf
-    taken = effective_parameters(linear, linear.information_by_sensor, covariance)
+    taken = effective_parameters(linear, covariance)
     for sensor, mask, spans, lost in zip(
         model.records.sensors, linear.mask, times.spans, taken, strict=True
     ):
@@ -80,7 +80,7 @@ def prepare_freedom(
 
 
 def effective_parameters(
-    linear: Linearisation, information: tuple[np.ndarray, ...], covariance: np.ndarray
+    linear: Linearisation, covariance: np.ndarray
 ) -> list[Float[np.ndarray, " records"]]:
     """Return for each sensor how many parameters its readings determine in each recording.
 
@@ -88,7 +88,11 @@ def effective_parameters(
     priors, other sensors or other recordings counts as a fraction.
     """
     known = linear.covariance_by_recording(covariance)
-    return [np.sum(block * known, axis=(1, 2)) for block in information]
+    # The information of the readings of a sensor in a recording is JᵀWJ (m, m).
+    return [
+        np.sum((rows.swapaxes(1, 2) @ rows) * known, axis=(1, 2))
+        for rows in linear.weighted_jacobians_by_sensor
+    ]
 
 
 def student_quantile(level: float, degrees_of_freedom: np.ndarray | float) -> np.ndarray:
