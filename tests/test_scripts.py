@@ -11,7 +11,7 @@ import rigidjax as rj
 
 TESTS = Path(__file__).parent
 NAMES = ("bench_*.py", "table.py", "peers.py", "speed.py", "accuracy.py")
-FOUND = sorted(path for name in NAMES for path in TESTS.glob(f"*/{name}"))
+FOUND = sorted(path for name in NAMES for path in TESTS.glob(f"**/{name}"))
 SCRIPTS = [path for path in FOUND if "rigidjax" in path.read_text(encoding="utf-8")]
 
 

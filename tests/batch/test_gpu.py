@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from batch.bench_gpu import main, written
 from batch.test_rollout import batch, far
+from benchmarks.batch.bench_gpu import main, written
 
 import rigidjax as rj
 from rigidjax import _checks

@@ -128,7 +128,7 @@ def test_the_bars_of_a_published_method(found, model, group):
 @pytest.fixture(scope="module")
 def bench():
     spec = importlib.util.spec_from_file_location(
-        "bench_throws", Path(__file__).with_name("bench_throws.py")
+        "bench_throws", Path(__file__).parents[1] / "benchmarks" / "identify" / "bench_throws.py"
     )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -1,4 +1,4 @@
-"""A neural torque in `simulate` beside plain diffrax by hand: `python tests/solve/bench_neural_torque.py`.
+"""A neural torque in `simulate` beside plain diffrax by hand: `python tests/benchmarks/solve/bench_neural_torque.py`.
 
 An `eqx.nn.MLP` (6, 16, 3) gives the torque from the direction of gravity and the body rate. Printed for
 each scene (bodies, seconds, saved times, tolerance), in ms of CPU time: the value of a loss, and a training

@@ -1,7 +1,7 @@
 """The throws of `shared/data/tudelft_throw` as one problem of four bodies with one sensor.
 
-    python tests/identify/bench_throws.py [EVERY] [END] [--white | --correlated] [--whole]
-    python tests/identify/bench_throws.py [EVERY] [END] --copies COUNT
+    python tests/benchmarks/identify/bench_throws.py [EVERY] [END] [--white | --correlated] [--whole]
+    python tests/benchmarks/identify/bench_throws.py [EVERY] [END] --copies COUNT
 
 The recipe. All throws together: each group has a body of its own (six numbers) and a drag of its
 own; all share the gyro (bias, scale an axis, three skew terms) and the wheel's tilt; each throw has
@@ -38,7 +38,9 @@ jax.config.update("jax_enable_x64", True)
 import rigidjax as rj
 from rigidjax import identify
 
-_spec = importlib.util.spec_from_file_location("throws", Path(__file__).with_name("throws.py"))
+_spec = importlib.util.spec_from_file_location(
+    "throws", Path(__file__).parents[2] / "identify" / "throws.py"
+)
 throws = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(throws)
 

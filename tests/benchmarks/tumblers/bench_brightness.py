@@ -1,6 +1,6 @@
 """Tumblers from their brightness alone, blind: how many of 100 are found, and what is said of each.
 
-    python tests/tumblers/bench_brightness.py [how many] [first]
+    python tests/benchmarks/tumblers/bench_brightness.py [how many] [first]
 
 Right is: both periods to 0.1 % and both ratios of moments to 5 %. Then: with which status, whether
 a wrong alias was ever called "ok", and for those that are not right whether it is another motion or
@@ -10,10 +10,13 @@ this one with errors that the data do not do better (deviations of the fit).
 import sys
 import time
 from collections import Counter
+from pathlib import Path
 
 import jax
 
 jax.config.update("jax_enable_x64", True)
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tumblers"))
 
 from simulated import HOUR, off, problem, tumbler
 

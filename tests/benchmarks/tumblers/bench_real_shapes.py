@@ -1,6 +1,6 @@
 """Tumblers that are no ellipsoids, found by a fit of ellipsoids: status, errors, intervals.
 
-    python tests/tumblers/bench_real_shapes.py [how many] [first] [rough] [noise] [told]
+    python tests/benchmarks/tumblers/bench_real_shapes.py [how many] [first] [rough] [noise] [told]
 
 Convex polyhedra about ellipsoids (`simulated.polyhedron`): distances are moved by `rough` (0.05: by
 5 %). Magnitudes with `noise` (0.02: 2 %); the fit is told so where `told` is 1. For each status: how many, how
@@ -9,12 +9,16 @@ those, and how often each of the four true numbers is inside its 95 % interval.
 """
 
 import sys
+from pathlib import Path
 
 import jax
 
 jax.config.update("jax_enable_x64", True)
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tumblers"))
+
 from simulated import apart, of_unknown_noise, problem, tumbler
 
 from rigidjax import tumblers

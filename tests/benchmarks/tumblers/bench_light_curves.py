@@ -1,6 +1,6 @@
 """What light curves of tumbling ellipsoids cost: 5000 bodies at 1000 times, by the closed form.
 
-python tests/tumblers/bench_light_curves.py [bodies] [times]
+python tests/benchmarks/tumblers/bench_light_curves.py [bodies] [times]
 """
 
 import sys

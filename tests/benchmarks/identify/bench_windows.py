@@ -1,6 +1,6 @@
 """How long fits of windows take, beside numba with finite differences, and beside MJX.
 
-    python tests/identify/bench_windows.py FOLDER [--count 1359] [--repeats 5] [--fit] [--mjx]
+    python tests/benchmarks/identify/bench_windows.py FOLDER [--count 1359] [--repeats 5] [--fit] [--mjx]
 
 FOLDER with the csv files of the nano-drone benchmark (see `bench_nanodrone.py`; no part of this
 project). 1359 windows of 50 steps, 25 free numbers: errors and their derivatives, summed to normal

@@ -1,6 +1,6 @@
 """What a GPU takes, beside plain scans and diffrax, and whether its numbers are those of a CPU.
 
-`python tests/batch/bench_gpu.py` on a machine with a GPU: about four minutes. Rows are printed as
+`python tests/benchmarks/batch/bench_gpu.py` on a machine with a GPU: about four minutes. Rows are printed as
 soon as they are there; at the end the table is written into notebooks/figures.md, and to a file
 given by `--table`. `--small` has the same programs in small, for a CPU, and writes nothing.
 """
@@ -23,7 +23,7 @@ from rigidjax import identify
 
 H, END = 0.01, 10.0
 TOP = rj.torques.HeavyTop(1.0, [0.0, 0.0, 1.0], [0.0, 0.0, -1.0])
-FIGURES = Path(__file__).parents[2] / "notebooks" / "figures.md"
+FIGURES = Path(__file__).parents[3] / "notebooks" / "figures.md"
 MARKS = "<!-- bench_gpu -->\n", "<!-- /bench_gpu -->\n"
 
 

@@ -1,6 +1,6 @@
 """How many 95 % intervals hold where a noise or a width is estimated from few errors.
 
-`python tests/identify/bench_few.py` prints one line a scene; 100 simulated experiments each.
+`python tests/benchmarks/identify/bench_few.py` prints one line a scene; 100 simulated experiments each.
 """
 
 from typing import ClassVar

@@ -1,6 +1,6 @@
 """`ReplayAdjoint` beside plain diffrax: a body under `simulate`, and a field of one's own.
 
-`python tests/solve/bench_engine.py [--quick] [TIMES …]` prints for the asymmetric heavy top at 1e-9
+`python tests/benchmarks/solve/bench_engine.py [--quick] [TIMES …]` prints for the asymmetric heavy top at 1e-9
 with so many saved times (2, 30 and 300 unless given): CPU seconds to trace and compile, and CPU time
 to run, each over that of a field written by hand under `diffrax.Dopri8`. "own field" is the
 same field with `DormandPrince8` and `adjoint=ReplayAdjoint()`. Medians of interleaved repeats, in

@@ -1,6 +1,6 @@
 """The bars of speed that were set for adaptive and equal steps, and what is measured today.
 
-    python tests/solve/bench_bars.py [--repeats 9]
+    python tests/benchmarks/solve/bench_bars.py [--repeats 9]
 
 One table: each row says what is compared, the bar, and the ratio measured here. Adaptive runs are
 those of `bench_loop.py` (heavy top at 1e-9, with 2 and with 30 saved times, beside a field written
@@ -161,7 +161,7 @@ def started(what):
 
 
 def new_processes():
-    """The rows of first answers; those of fits are in `tests/identify/bench_fit.py`."""
+    """The rows of first answers; those of fits are in `tests/benchmarks/identify/bench_fit.py`."""
     beyond, value = started("last")
     _, gradient = started("jax.grad(last)")
     say("new process: first forced value / gradient, CPU s", "4 / 7", value, gradient)

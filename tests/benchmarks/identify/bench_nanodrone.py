@@ -1,6 +1,6 @@
 """A quadrotor from windows: fitted on all runs but two, predicted open-loop on those two.
 
-Run `python tests/identify/bench_nanodrone.py FOLDER [--stride 40] [--only square]`, FOLDER with the csv files of
+Run `python tests/benchmarks/identify/bench_nanodrone.py FOLDER [--stride 40] [--only square]`, FOLDER with the csv files of
 the nano-drone benchmark (arXiv 2512.14450): prints the mean absolute errors of a component, and the
 mean lengths of the vectors, at 1, 10 and 50 samples ahead and their sum, beside a prediction that
 holds the state, the free numbers with their deviations, and times. The files have no licence and are not part of this project.

@@ -1,6 +1,6 @@
 """How often the intervals of a fit of windows hold, where errors last and windows overlap.
 
-    python tests/identify/bench_window_intervals.py [--records 150] [--samples 801]
+    python tests/benchmarks/identify/bench_window_intervals.py [--records 150] [--samples 801]
 
 A driven, damped body (four free numbers) whose rates are read with white noise, alone and with an
 unknown torque that is correlated over 1 s or 4 s, as large as a tenth of the driving one. Each row
@@ -9,12 +9,16 @@ intervals that hold, and the rms of the deviations over that of the errors.
 """
 
 import argparse
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 jax.config.update("jax_enable_x64", True)
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "identify"))
 
 from test_windows import BODY, DAMPING, GAIN, TRUE, H, Push
 

@@ -1,6 +1,6 @@
 """How long fits of throws take, beside SciPy with numba and beside `mujoco.sysid`.
 
-    python tests/identify/bench_fit.py [--repeats 9] [--joint] [--many] [--real]
+    python tests/benchmarks/identify/bench_fit.py [--repeats 9] [--joint] [--many] [--real]
 
 One throw: 0.7 s at 1 kHz with a wheel inside, twelve free numbers (`Tensor`, rates, drag). All
 from the same start but where it says otherwise, times of the processor, medians of interleaved
@@ -80,7 +80,7 @@ def law(drag):
 
 def real():
     """Of each throw of an object what SciPy needs, the problem of twelve numbers, its start."""
-    places = Path(__file__).parent
+    places = Path(__file__).parents[2] / "identify"
     loaded = importlib.util.spec_from_file_location("throws", places / "throws.py")
     throws = importlib.util.module_from_spec(loaded)
     loaded.loader.exec_module(throws)

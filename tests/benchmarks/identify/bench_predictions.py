@@ -1,6 +1,6 @@
 """Predictions onward from a fit and from a filter: how many 95 % intervals hold.
 
-    python tests/identify/bench_predictions.py [COUNT]
+    python tests/benchmarks/identify/bench_predictions.py [COUNT]
 
 The recordings are those of the guide's page "Predict with intervals", drawn anew COUNT times. Of the
 fit: by time, the share of intervals of the three rates that contain the true rates, by the covariance

@@ -1,6 +1,6 @@
 """What the first answer costs, and the next ones: `simulate` beside plain diffrax, in one process.
 
-`python tests/solve/bench_loop.py [--quick] [TIMES …]` prints, for the asymmetric heavy top at 1e-9
+`python tests/benchmarks/solve/bench_loop.py [--quick] [TIMES …]` prints, for the asymmetric heavy top at 1e-9
 with so many saved times (2 and 30 unless given), CPU seconds to trace and compile and CPU time to
 run, each over that of a vector field written by hand under `diffrax.Dopri8`; beside them our solver
 inside `diffeqsolve`, the closed form, `simulate` with a solver of diffrax, and Jacobians through

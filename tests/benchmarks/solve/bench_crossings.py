@@ -1,6 +1,6 @@
 """What a Poincaré section costs: 200 heavy tops, 1000 crossings each, and their motion alone.
 
-python tests/solve/bench_crossings.py [tops] [crossings]
+python tests/benchmarks/solve/bench_crossings.py [tops] [crossings]
 """
 
 import sys

@@ -1,6 +1,6 @@
 """How large the library is: lines, names, and how many functions a first call goes through.
 
-`python tests/bench_house.py` prints one line a figure. Lines of code have no docstring, comment or
+`python tests/benchmarks/bench_house.py` prints one line a figure. Lines of code have no docstring, comment or
 blank; the longest function is counted in such lines. Functions entered are named ones of ours,
 each counted once, in a call that nothing was compiled for (`sys.setprofile`).
 """

@@ -1,6 +1,6 @@
 """Throws with time stamps that scatter: a plain gyro beside one that expects it.
 
-    python tests/identify/bench_jitter.py [COUNT]
+    python tests/benchmarks/identify/bench_jitter.py [COUNT]
 
 Each throw is 1 s at 100 Hz and 8 rad/s; the gyro has a noise of 0.02 rad/s, its stamps scatter by 5
 ms (`none`: a regular clock). Readings are made at the scattered times by SciPy's `solve_ivp`. Per

@@ -1,6 +1,6 @@
 """Many bodies: body-steps a second beside C++, numba, naive scans, diffrax and MJX, in one process.
 
-Run `python tests/batch/bench_batch.py [--quick] [--float32] [--flag] [--devices 2] [--any-core]
+Run `python tests/benchmarks/batch/bench_batch.py [--quick] [--float32] [--flag] [--devices 2] [--any-core]
 [--numba-python /venv/bin/python]`.
 Everything is timed in turn, round after round, on one pinned core, as processor time (on a GPU as
 wall time); medians are printed, and ratios to the first row of each table. Compilation is apart.

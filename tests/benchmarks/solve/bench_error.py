@@ -1,6 +1,6 @@
 """Is the error that a run states its true one? Random scenes of every class, the truth in more digits.
 
-    python tests/solve/bench_error.py [--scenes 200] [--seed 0] [--what states,gradients,accuracy,cost] [--only top,orbit]
+    python tests/benchmarks/solve/bench_error.py [--scenes 200] [--seed 0] [--what states,gradients,accuracy,cost] [--only top,orbit]
 
 Scenes: free bodies of every class (closed form, and by steps; a third beside the middle axis), heavy
 tops, sleeping tops that pass the vertical, gravity gradient, wheels, damping, pulses with jumps; 1 to
@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 jax.config.update("jax_enable_x64", True)
 from systems import extrapolated
 

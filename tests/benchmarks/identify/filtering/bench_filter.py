@@ -1,4 +1,4 @@
-"""What the filter and the smoother cost: `python tests/identify/filtering/bench_filter.py [readings]`.
+"""What the filter and the smoother cost: `python tests/benchmarks/identify/filtering/bench_filter.py [readings]`.
 
 A tumbling body under a white torque, read by a gyro (3 numbers of state), and by a gyro and a
 direction (6). Beside them an extended Kalman filter for the gyro written by hand, its loops compiled

@@ -1,4 +1,4 @@
-"""Cost of the closed form against a solver: `python tests/exact/bench_free_body.py`. Ratios count."""
+"""Cost of the closed form against a solver: `python tests/benchmarks/exact/bench_free_body.py`. Ratios count."""
 
 import statistics
 import time
