@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import once
 
 import rigidjax as rj
 from rigidjax.body import shapes
@@ -62,7 +63,7 @@ def test_eigenvalues_of_a_second_moment_count_its_dimensions():
 def test_second_moment_turns_as_a_tensor_and_shifts_by_a_square():
     body, q = many_bodies(1), turns(2)
     r = jnp.asarray(np.random.default_rng(3).normal(size=(50, 3)))
-    m = np.asarray(jax.vmap(quaternion.to_matrix)(jnp.asarray(q)))
+    m = np.asarray(once(jax.vmap(quaternion.to_matrix))(jnp.asarray(q)))
 
     @jax.jit
     @jax.vmap

@@ -48,7 +48,7 @@ def test_moments_and_axes_rebuild_the_tensor_at_every_scale(dtype):
     tolerance = 30 * jnp.finfo(dtype).eps
     tensors = jnp.asarray([a * s for a in BODIES.values() for s in SCALES], dtype)
     moments, q = jax.jit(jax.vmap(principal))(tensors)
-    axes = jax.vmap(quaternion.to_matrix)(q)
+    axes = once(jax.vmap(quaternion.to_matrix))(q)
     back = jnp.einsum("nij,nj,nkj->nik", axes, moments, axes, precision="highest")
     size = jnp.max(jnp.abs(tensors), axis=(1, 2))[:, None, None]
     assert float(jnp.max(jnp.abs(back / size - tensors / size))) < tolerance

@@ -1,9 +1,9 @@
 """Attitudes and rates from readings alone; SciPy's `align_vectors` is the oracle."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import turns
 from scipy.spatial.transform import Rotation
 
 import rigidjax as rj
@@ -26,7 +26,7 @@ def markers(motion, places, sigma):
     drift = np.outer(TS, [1.0, 2.0, 3.0])
     out = []
     for place in places:
-        at = jax.vmap(lambda q, r=place: rj.quaternion.rotate(q, jnp.asarray(r)))(motion.q)
+        at = turns.to_world(motion.q, jnp.asarray(place))
         out.append(
             (identify.Marker(place), np.asarray(at) + drift + sigma * rng.normal(size=(30, 3)))
         )
@@ -36,11 +36,9 @@ def markers(motion, places, sigma):
 def directions(motion, worlds, mounting=None):
     out = []
     for world in worlds:
-        seen = jax.vmap(lambda q, w=world: rj.quaternion.rotate_inverse(q, jnp.asarray(w)))(
-            motion.q
-        )
+        seen = turns.to_body(motion.q, jnp.asarray(world))
         if mounting is not None:
-            seen = jax.vmap(lambda v: rj.so3.exp(-jnp.asarray(mounting)) @ v)(seen)
+            seen = seen @ rj.so3.exp(-jnp.asarray(mounting)).T
         out.append((identify.Direction(world, mounting=mounting), np.asarray(seen)))
     return identify.Recording(TS, *out)
 
@@ -95,7 +93,7 @@ def test_rates_between_attitudes_are_the_body_rate(motion):
 
 def test_an_attitude_sensor_that_is_mounted_askew(motion):
     mounting = jnp.array([0.3, -0.2, 0.1])
-    read = jax.vmap(lambda q: rj.quaternion.multiply(q, rj.quaternion.exp(mounting)))(motion.q)
+    read = turns.perturbed(motion.q, jnp.tile(mounting, (30, 1)))
     # Every other reading with the other sign: the same attitude.
     read = np.asarray(read) * np.where(np.arange(30) % 2, -1.0, 1.0)[:, None]
     record = identify.Recording(TS, (identify.AttitudeSensor(mounting=mounting), read))
@@ -109,8 +107,7 @@ def test_an_attitude_sensor_that_is_mounted_askew(motion):
 def test_a_model_starts_at_the_attitude_that_markers_or_directions_show(motion):
     fall, box = rj.torques.UniformGravity([0.0, 0.0, 0.0]), rj.shapes.box(1.0, [0.3, 0.2, 0.1])
     dots = markers(motion, PLACES, 0.0)
-    rotate_back = jax.vmap(rj.quaternion.rotate_inverse, (0, None))
-    along = [(identify.Direction(w, 0.01), rotate_back(motion.q, jnp.asarray(w))) for w in WORLD]
+    along = [(identify.Direction(w, 0.01), turns.to_body(motion.q, jnp.asarray(w))) for w in WORLD]
     for record in (dots, identify.Recording(TS, *along)):
         model = identify.Model(record, identify.Known(box), torque=fall)
         q = model.reference.state.q[0]

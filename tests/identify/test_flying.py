@@ -1,9 +1,9 @@
 """Bodies that move as well as turn: what cameras see of them, and what that fixes."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import turns
 
 import rigidjax as rj
 from rigidjax import identify
@@ -23,7 +23,7 @@ def seen(law, start=START):
     readings = []
     for place in PLACES:
         arm = jnp.asarray(place) - TRUTH.com
-        clean = jax.vmap(lambda s, arm=arm: s.x + rj.quaternion.rotate(s.q, arm))(states)
+        clean = states.x + turns.to_world(states.q, arm)
         readings.append((identify.Marker(place, SIGMA), clean + SIGMA * rng.normal(size=(40, 3))))
     return readings
 

@@ -484,12 +484,12 @@ def test_entries_of_an_array_are_free_by_themselves(records):
     drag_z, drag, bias = model.slots
     x = x.at[drag_z.shared[0]].set(2.0).at[drag.shared[0, 0]].set(10.0)
     x = x.at[bias.own].set(jnp.arange(6.0).reshape(3, 2))
-    scenes = model.scenes(x)
+    scenes = eqx.filter_jit(model.scenes)(x)
     moved = [0.2 * np.exp(0.5), 0.3, 0.5]
     np.testing.assert_allclose(scenes.torque.parts[1].coefficient, [moved] * 3, rtol=1e-12)
     biases = [[0.1, 0.0, 0.0], [0.3, 0.0, 0.2], [0.5, 0.0, 0.4]]
     np.testing.assert_allclose(scenes.sensors[0].bias, biases, atol=1e-12)
-    values = model.values(x)
+    values = eqx.filter_jit(model.values)(x)
     np.testing.assert_allclose(values["drag z"], 0.5)
     np.testing.assert_allclose(values["drag"], [moved[0]])
     np.testing.assert_allclose(values["bias"], np.array(biases)[:, [2, 0]])

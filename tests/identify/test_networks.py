@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from once import once
 
 import rigidjax as rj
 from rigidjax import identify
@@ -48,7 +49,7 @@ def rates(start):
 def distance(law):
     """The error of a law at the rates of all motions over the size of the true one, rms."""
     omega = jnp.concatenate([rates(start).omega for start in STARTS])
-    of = lambda law: jax.vmap(lambda w: law(0.0, rj.Spin(w), BODY))(omega)
+    of = lambda law: once(jax.vmap(lambda w: law(0.0, rj.Spin(w), BODY)))(omega)
     true = of(Cubic())
     return float(jnp.sqrt(jnp.mean((of(law) - true) ** 2) / jnp.mean(true**2)))
 

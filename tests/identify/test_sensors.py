@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import once
 from scipy.interpolate import CubicSpline
 
 import rigidjax as rj
@@ -51,7 +52,7 @@ def test_accelerometer_is_the_second_derivative_of_where_it_sits(torque):
     law = None if torque is None else rj.torques.Damping([0.1, 0.2, 0.3])
     state = rj.Attitude(Q, OMEGA)
     here = moment(state, BODY.inertia, law)
-    second = jax.jacfwd(jax.jacfwd(along(state, BODY.inertia, PLACE, law)))(0.0)
+    second = once(jax.jacfwd(jax.jacfwd(along(state, BODY.inertia, PLACE, law))))(0.0)
     force = rj.quaternion.rotate(rj.quaternion.conjugate(Q), second)
     falling = rj.identify.Accelerometer(place=PLACE)
     np.testing.assert_allclose(falling.error(here, force), 0, atol=1e-12)
@@ -64,7 +65,7 @@ def test_accelerometer_on_a_body_that_moves():
     body = rj.MassProperties(1.3, [0.01, 0.02, -0.01], BODY.second_moment)
     state = rj.Rigid([1.0, 2, 3], [0.5, 0, 0], Q, OMEGA)
     wind = rj.torques.UniformGravity(GRAVITY)
-    second = jax.jacfwd(jax.jacfwd(along(state, body, PLACE - body.com, wind)))(0.0)
+    second = once(jax.jacfwd(jax.jacfwd(along(state, body, PLACE - body.com, wind))))(0.0)
     force = rj.quaternion.rotate(rj.quaternion.conjugate(Q), second - GRAVITY)
     sensor = rj.identify.Accelerometer(place=PLACE, gravity=GRAVITY)
     np.testing.assert_allclose(sensor.error(moment(state, body, wind), force), 0, atol=1e-12)
@@ -111,7 +112,7 @@ def test_readings_as_matrices_and_euler_angles_are_the_same():
     sensor = rj.identify.AttitudeSensor(0.01)
     one = rj.identify.Recording([0.0, 1.0], (sensor, matrices)).readings[0].values
     degrees = jnp.asarray(np.degrees(angles))
-    two = jax.vmap(lambda a: rj.euler.to_quaternion(jnp.deg2rad(a), "ZYX"))(degrees)
+    two = once(jax.vmap(lambda a: rj.euler.to_quaternion(jnp.deg2rad(a), "ZYX")))(degrees)
     np.testing.assert_allclose(np.abs(np.sum(one * two, axis=1)), 1, atol=1e-15)
     # A gap is masked as any other.
     matrices = np.concatenate([matrices, np.full((1, 3, 3), np.nan)])

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import turns
 
 import rigidjax as rj
 from rigidjax import identify
@@ -22,7 +23,7 @@ def tumble(body=BODY, omega=OMEGA, sigma=SIGMA, seed=0, ts=TS, law=None):
     rng = np.random.default_rng(seed)
     rates = np.asarray(ys.omega) + sigma * rng.normal(size=(ts.size, 3))
     steps = jnp.asarray(sigma * rng.normal(size=(ts.size, 3)))
-    turned = jax.vmap(lambda q, e: rj.quaternion.multiply(q, rj.quaternion.exp(e)))(ys.q, steps)
+    turned = turns.perturbed(ys.q, steps)
     return rates, np.asarray(turned)
 
 

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import turns
 
 import rigidjax as rj
 from rigidjax import identify
@@ -181,7 +182,7 @@ def test_the_place_of_a_marker_is_known_only_from_the_centre_of_mass():
     start = rj.Rigid([0.0, 0, 0], [0.1, 0, 0], [1.0, 0, 0, 0], [2.0, 3.0, -1.0])
     states = rj.simulate(body, start, ts).ys
     arm = jnp.asarray(place - np.asarray(body.com))
-    seen = states.x + jax.vmap(lambda q: rj.quaternion.rotate(q, arm))(states.q)
+    seen = states.x + turns.to_world(states.q, arm)
     sensors = (identify.Gyro(0.01), states.omega), (identify.Marker(place, 0.01), seen)
     model = identify.Model(
         identify.Recording(ts, *sensors),

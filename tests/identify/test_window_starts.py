@@ -2,10 +2,10 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import turns
 from scipy.optimize import least_squares
 
 import rigidjax as rj
@@ -83,11 +83,11 @@ def test_starts_of_every_kind_move():
     cut = identify.windows(ts, ys, length=8, stride=8, noise=noise, starts=free)
     rng = np.random.default_rng(0)
     n = cut.count
-    turns = jnp.asarray(rng.normal(size=(n, 3)) * 0.03)
+    turned = jnp.asarray(rng.normal(size=(n, 3)) * 0.03)
     moved = rj.Rigid(
         cut.starts.x + 0.05 * rng.normal(size=(n, 3)),
         cut.starts.v + 0.05 * rng.normal(size=(n, 3)),
-        jax.vmap(rj.quaternion.multiply)(cut.starts.q, jax.vmap(rj.quaternion.exp)(turns)),
+        turns.perturbed(cut.starts.q, turned),
         cut.starts.omega + 0.05 * rng.normal(size=(n, 3)),
     )
     wrong = dataclasses.replace(cut, starts=moved)

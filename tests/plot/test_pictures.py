@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 import pytest
+from once import once
 
 import rigidjax as rj
 
@@ -84,7 +85,7 @@ def parsed(text):
 def test_motion_shows_the_angles_of_the_notes(flip):
     above, _ = rj.plot.motion(flip.ts, flip.ys, attitude="angles")
     shown = np.stack([one.get_ydata() for one in above.lines], axis=-1)
-    wanted = np.degrees(jax.vmap(rj.euler.from_quaternion)(flip.ys.q))
+    wanted = np.degrees(once(jax.vmap(rj.euler.from_quaternion))(flip.ys.q))
     kept = np.isfinite(shown)
     assert kept.mean() > 0.9
     np.testing.assert_allclose(shown[2:][kept[2:]], wanted[2:][kept[2:]], atol=1e-8)
@@ -93,7 +94,7 @@ def test_motion_shows_the_angles_of_the_notes(flip):
 def test_the_polhode_lies_on_the_sphere_and_on_the_ellipsoid(flip):
     # Axes in another order and turned: the picture is along the ascending principal axes.
     turn = rj.quaternion.exp(jnp.array([0.3, -0.5, 0.2]))
-    turned = rj.Spin(jax.vmap(lambda w: rj.quaternion.rotate(turn, w))(flip.ys.omega))
+    turned = rj.Spin(once(jax.vmap(lambda w: rj.quaternion.rotate(turn, w)))(flip.ys.omega))
     ax = rj.plot.polhode(BODY.rotate(turn), turned)
     path = np.stack(line(ax, "this motion").get_data_3d(), axis=-1)
     hidden = np.isnan(path[:, 0])
@@ -312,7 +313,7 @@ def test_between_saved_times_a_film_stays_on_the_group():
     from rigidjax.plot.animation import resampled
 
     ts = jnp.linspace(0.0, 6.0, 40)
-    turning = jax.vmap(lambda t: rj.quaternion.exp(jnp.array([0.0, 0.0, 1.0]) * t))(ts)
+    turning = once(jax.vmap(lambda t: rj.quaternion.exp(jnp.array([0.0, 0.0, 1.0]) * t)))(ts)
     # The same attitudes with signs as they may come out of a logarithm.
     signs = jnp.where(jnp.arange(40) % 3 == 0, -1.0, 1.0)[:, None]
     states = rj.Attitude(turning * signs, jnp.zeros((40, 3)))
@@ -411,7 +412,7 @@ def test_a_film_shows_the_surface_that_it_gets():
 def test_a_film_says_when_its_pictures_show_another_motion():
     ts = jnp.linspace(0.0, 2.0, 81)
     spin = jnp.stack([jax.vmap(lambda t: 9.0 + 0 * t)(ts), 0 * ts, 0 * ts], axis=1)
-    q = jax.vmap(rj.quaternion.exp)(spin * ts[:, None])
+    q = once(jax.vmap(rj.quaternion.exp))(spin * ts[:, None])
     states, body = rj.Attitude(q, spin), rj.shapes.box(1.0, [1.0, 2.0, 3.0])
     # 18 rad in 2 s: 0.41 turns between 8 pictures, 0.57 between 6.
     rj.plot.tumble(body, ts, states, seconds=2, fps=4, size=64)

@@ -186,8 +186,8 @@ def test_jacobians(dtype):
         left, right = so3.left_jacobian(v), so3.right_jacobian(v)
         m = so3.exp(v)
         dm = jax.jacfwd(so3.exp)(v)
-        world = jax.vmap(so3.world_rate, in_axes=(None, 2), out_axes=1)(m, dm)
-        body = jax.vmap(so3.body_rate, in_axes=(None, 2), out_axes=1)(m, dm)
+        world = jax.jit(jax.vmap(so3.world_rate, in_axes=(None, 2), out_axes=1))(m, dm)
+        body = jax.jit(jax.vmap(so3.body_rate, in_axes=(None, 2), out_axes=1))(m, dm)
         eye = jnp.eye(3, dtype=v.dtype)
         return (
             left - world,

@@ -89,8 +89,8 @@ def test_inverse_kernel_near_a_full_turn(dtype):
         half = mp.sqrt(t) / 2
         return (1 - half * mp.cot(half)) / t
 
-    got = jax.vmap(stumpff.inverse_coefficient)(ts)
-    slope = jax.vmap(jax.grad(stumpff.inverse_coefficient))(ts)
+    got = jax.jit(jax.vmap(stumpff.inverse_coefficient))(ts)
+    slope = jax.jit(jax.vmap(jax.grad(stumpff.inverse_coefficient)))(ts)
     with mp.workdps(40):
         values = np.array([float(want(mp.mpf(float(t)))) for t in ts])
         slopes = np.array([float(mp.diff(want, mp.mpf(float(t)))) for t in ts])

@@ -65,7 +65,10 @@ def field(dtype=jnp.float64):
     return AttitudeEquations(rj.Inertia(jnp.diag(moments)), Driver(moments))
 
 
+attitude_at, attitudes = jax.jit(attitude), jax.jit(jax.vmap(attitude))
+
+
 def error(q, t):
     """Distance of attitudes, up to the sign that quaternions leave open."""
-    q, right = jnp.asarray(q), jax.vmap(attitude)(t) if jnp.ndim(t) else attitude(t)
+    q, right = jnp.asarray(q), attitudes(t) if jnp.ndim(t) else attitude_at(t)
     return jnp.minimum(jnp.linalg.norm(q - right, axis=-1), jnp.linalg.norm(q + right, axis=-1))

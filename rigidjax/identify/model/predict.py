@@ -412,7 +412,7 @@ def simulate_readings(
     start: Any = state0
     if isinstance(torque, Carried):
         ts = jnp.asarray(ts, jnp.result_type(float))
-        states = CarriedMotion(cast(MassProperties, body), torque)(ts)
+        states = eqx.filter_jit(CarriedMotion(cast(MassProperties, body), torque))(ts)
     else:
         sol = simulate(needed_body(body, type(state0)), start, ts, torque)
         states, ts = sol.ys if sol.own is None else Coupled(sol.ys, sol.own), sol.ts

@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import turns
 
 import rigidjax as rj
 from rigidjax import identify
@@ -24,7 +25,7 @@ def gyro(key, omega, noise):
 
 def direction(key, q, world, noise):
     """A unit vector near to where `world` is, each (T, 3)."""
-    seen = jax.vmap(lambda one: rj.quaternion.rotate_inverse(one, jnp.asarray(world, q.dtype)))(q)
+    seen = turns.to_body(q, jnp.asarray(world, q.dtype))
     seen = seen + noise * jax.random.normal(key, seen.shape, q.dtype)
     return seen / jnp.linalg.norm(seen, axis=-1, keepdims=True)
 

@@ -366,7 +366,7 @@ def test_forward_and_reverse_mode_agree_to_second_order():
 def test_without_noise_it_is_the_likelihood_of_the_fit(density):
     short = records.spinning()
     state0 = rj.Spin(records.START.omega + 0.01)
-    turned = jax.vmap(rj.exact.FreeBody(records.BODY, state0))(short.t - short.t[0])
+    turned = once(jax.vmap(rj.exact.FreeBody(records.BODY, state0)))(short.t - short.t[0])
     wanted = scipy.stats.norm.logpdf(short.readings[0].values - turned.omega, scale=0.02).sum()
     model = records.known(short, rj.torques.RandomTorque(density))
     first = identify.first_belief(model, state=state0, rate=0.0)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from identify.filtering import records
+from once import once
 
 import rigidjax as rj
 from rigidjax import identify
@@ -37,7 +38,7 @@ def test_a_torque_that_remembers_is_stationary_and_forgets():
     keys = jax.random.split(jax.random.key(2), MANY)
     ts = jnp.array([0.0, 0.4, 0.8])
     spin = rj.Spin([0.0, 0.0, 0.0])
-    drawn = jax.vmap(lambda key: records.truth(key, law, spin, ts, 4))(keys)
+    drawn = once(jax.vmap(lambda key: records.truth(key, law, spin, ts, 4)))(keys)
     torque = np.asarray(drawn.torques[0])
     variance = density / (2 * memory)
     np.testing.assert_allclose(torque.var(axis=0) / variance, 1, atol=FOUR)
