@@ -95,7 +95,8 @@ TOPICS = {
         "Sensors": "Gyro Accelerometer AttitudeSensor Direction Magnetometer Marker Position "
         "Velocity Range AbstractSensor SensorInput",
         "The fit and its result": "fit Fit Unpacked",
-        "How it searches": "SoftL1 Huber AbstractLoss FixedSteps Adaptive Descent descend Entropic",
+        "How it searches": "SoftL1 Huber AbstractLoss FixedSteps Adaptive Descent descend Entropic "
+        "Measured",
         "Uncertainty, comparison": "compare cross_validate",
         "Before the experiment": "simulate_readings expected_quantities fisher",
         "Short windows of driven bodies": "windows Windows predict_windows",

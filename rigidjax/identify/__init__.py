@@ -56,6 +56,7 @@ from rigidjax.identify.model.priors import (
     AbstractLoss as AbstractLoss,
     Entropic as Entropic,
     Huber as Huber,
+    Measured as Measured,
     SoftL1 as SoftL1,
 )
 from rigidjax.identify.model.scene import Scene as Scene
@@ -80,7 +81,8 @@ from rigidjax.identify.sensors import (
 __all__ = [
     "AbstractBodyChart", "AbstractLoss", "AbstractSensor", "Accelerometer", "Adaptive",
     "AttitudeSensor", "Descent", "Direction", "Entropic", "Fit", "FixedSteps", "ForceTorque",
-    "Free", "Gyro", "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass", "Model",
+    "Free", "Gyro", "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass", "Measured",
+    "Model",
     "Nuts", "Position", "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios", "Recording",
     "Refit", "Scene", "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity",
     "Walk", "Windows", "compare", "cross_validate", "descend", "expected_quantities", "filter",

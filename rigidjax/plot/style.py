@@ -62,10 +62,12 @@ def residuals_of(fit_result: Any, index: object) -> Residuals:
     if index >= count:
         raise ValueError(f"index: wanted one of {count} recordings, from 0, got {index}")
     record, which = fit_result.model.recordings[index], ... if count == 1 else index
-    errors = [np.asarray(e[which])[: record.t.shape[0]] for e in fit_result.residuals]
+    parts = fit_result.model.parts
+    mine = next((part.sensors for part in parts if index < part.rows.stop), slice(None))
+    errors = [np.asarray(e[which])[: record.t.shape[0]] for e in fit_result.residuals[mine]]
     noises = [
         np.hypot(noise[which], 0.0 if one.jitter_error is None else one.jitter_error)
-        for noise, one in zip(fit_result.noise, record.readings, strict=True)
+        for noise, one in zip(fit_result.noise[mine], record.readings, strict=True)
     ]
     return Residuals(record, errors, noises)
 

@@ -74,6 +74,12 @@ row("identify.Mass", lambda: dict(guess=s.body()))
 for name in ("Huber", "SoftL1"):
     row(f"identify.{name}", dict(scale=3.0), **HOST)
 row("identify.Entropic", lambda: dict(guess=s.inertia(), weight=2.0), **HOST)
+row(
+    "identify.Measured",
+    dict(of=lambda point: point.body.mass, value=0.5, sigma=0.1, name="weight"),
+    arguments=("of", "value", "sigma"),
+    **HOST,
+)
 row("identify.Adaptive", dict(rtol=1e-6, atol=1e-9), **HOST)
 row("identify.FixedSteps", dict(substeps=2), transforms=())
 row(

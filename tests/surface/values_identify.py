@@ -129,6 +129,13 @@ way(
     lambda m, c, s: 1.5 * (divergence(m, c, s, *map(v.number, GUESS)) + 4), norm=True,
 )  # fmt: skip
 
+way(
+    "identify.Measured identify.Measured.residual",
+    lambda m: identify.Measured(lambda point: point, -2.0, 0.25, "number").residual(m),
+    (scale(-1, 1),),
+    lambda m: -4 * (2 + m),
+)
+
 # Losses.
 
 

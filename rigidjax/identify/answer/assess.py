@@ -40,6 +40,7 @@ from rigidjax.identify.uncertainty import considered, covariance as uncertainty,
 from rigidjax.identify.uncertainty.covariance import (
     CorrelationTimes,
     Linearisation,
+    measured_residuals,
     white_noise_variance,
 )
 from rigidjax.identify.uncertainty.degrees_of_freedom import prepare_freedom
@@ -66,6 +67,8 @@ LAGS = 10
 # a TENTH of the variance; but it does not fail if the errors are as small as a given noise. Errors
 # whose mean square is at most a QUARTER of the variance are small.
 HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
+# A `Measured` contradicts the model if it is farther from it, in standard deviations.
+FAR_OFF = 5.0
 
 
 class _SensorGoodness(NamedTuple):
@@ -99,11 +102,21 @@ def goodness_of_fit(
         for index in range(len(model.records.readings))
     ]
     left = tuple(index for index, one in enumerate(each) if one.word != EXPLAINS)
-    found = [one.word for one in each]
+    rest = [_goodness_of_number(name, off) for name, off in measured_residuals(model, linear)]
+    words = [one.words for one in (*each, *rest) if one.word != EXPLAINS]
+    found = [one.word for one in (*each, *rest)]
     word = next((word for word in (FAILS, LEAVES) if word in found), EXPLAINS)
-    dof = max(sum(one.many for one in each) - linear.free_count, 1)
-    answer = Answer(word, tuple(each[index].words for index in left))
-    return Goodness(float(sum(one.chi2 for one in each)), dof, answer, left)
+    dof = max(sum(one.many for one in (*each, *rest)) - linear.free_count, 1)
+    chi2 = float(sum(one.chi2 for one in (*each, *rest)))
+    return Goodness(chi2, dof, Answer(word, tuple(words)), left)
+
+
+def _goodness_of_number(name: str, off: float) -> _SensorGoodness:
+    """Return whether the model explains a measured number that is `off`, in standard deviations."""
+    if abs(off) <= FAR_OFF:
+        return _SensorGoodness(EXPLAINS, "", off**2, 1)
+    words = f"the measured {name} is {abs(off):.3g} standard deviations off"
+    return _SensorGoodness(LEAVES, words, off**2, 1)
 
 
 def _goodness_of_sensor(

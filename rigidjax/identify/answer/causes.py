@@ -18,7 +18,7 @@ from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, readings_of
 from rigidjax.identify.data.reference_states import attitudes, mean_rates
 from rigidjax.identify.model.charts import body_list, tensor_of
-from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.model import Model, part_of_sensor
 from rigidjax.identify.model.terms import Noise, scaled_slopes
 from rigidjax.identify.search.starts import (
     integrated_euler,
@@ -202,11 +202,12 @@ def causes(
 
     If a file was most likely misread, this cause alone is returned.
     """
-    given = zip(stacking.on_host(model.records, model.counts), model.body_names, strict=True)
-    mine = [recording for recording, name in given if name == model.body_names[0]]
-    wrong = cause_by_misread_file(mine, model.torque)
-    if wrong is not None:
-        return (wrong,)
+    for one in stacking.kinds_of(model):
+        given = zip(stacking.on_host(one.records, one.counts), one.body_names, strict=True)
+        mine = [recording for recording, name in given if name == one.body_names[0]]
+        wrong = cause_by_misread_file(mine, one.torque)
+        if wrong is not None:
+            return (wrong,)
     if not np.isfinite(linear.weighted_jacobian).all():
         return ()
     free = np.linalg.qr(linear.weighted_jacobian)[0]
@@ -344,7 +345,7 @@ def _rate_response(
     """
     if not isinstance(model.records.readings[index].sensor, Gyro):
         return np.zeros_like
-    width, of = model.index.width, model.body_indices
+    width, of = part_of_sensor(model, index).model.index.width, model.body_indices
     flow = linear.raw_slopes[index][..., width - 3 : width]
     tensors = np.stack([np.asarray(tensor_of(b)) for b in body_list(model.bodies(x))])
     back = np.linalg.inv(tensors)[np.zeros(model.count, int) if of is None else np.asarray(of)]

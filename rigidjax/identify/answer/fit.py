@@ -154,7 +154,11 @@ def fit(
             )  # fmt: skip
         return dataclasses.replace(result, place=_ON_CPU)
     if model.index.bodies:
-        recordings = stacking.on_host(model.records, model.counts)
+        recordings = [
+            recording
+            for one in stacking.kinds_of(model)
+            for recording in stacking.on_host(one.records, one.counts)
+        ]
         for number, recording in enumerate(recordings, 1):
             require_turning(rates(recording)[1], f"fit: the rates of recording {number}")
     padded = stacking.pad_to_few(model)
@@ -163,13 +167,13 @@ def fit(
     if starts > len(points):
         points += starting_points(model, starts - len(points), key)
     points, interrupts, rough = points[:starts], [], []
-    if isinstance(padded.integrator, Adaptive):
+    if any(isinstance(one.integrator, Adaptive) for one in stacking.kinds_of(padded)):
         # Choose the tolerance of the integrator at the first starting point, before the search,
         # because integration errors would slow the search down. Another tolerance needs no new
         # compilation.
         first = Attempt(points[0], blocks=blocks_at(padded, points[0]))
-        finer = _converged_integrator(first, task, rough)
-        task = task if rough else task._replace(model=_with_integrator(padded, finer))
+        finer = _converged_integrators(first, task, rough)
+        task = task if rough else task._replace(model=_with_integrators(padded, finer))
     attempts = _search(points, task, checkpoint, progress, interrupts)
     best = min(attempts, key=lambda one: float(one.cost))
     lowest = float(best.cost)
@@ -177,8 +181,8 @@ def fit(
         best, task = estimated(best, task)
     best = _with_blocks(best, task.model)
     rough.clear()
-    while (finer := _converged_integrator(best, task, rough)) is not None:
-        task = task._replace(model=_with_integrator(task.model, finer))
+    while (finer := _converged_integrators(best, task, rough)) is not None:
+        task = task._replace(model=_with_integrators(task.model, finer))
         best, task = _noise_in_turn(search_whole(Attempt(best.x), task), task)
         best = _with_blocks(best, task.model)
     shown = model
@@ -192,7 +196,8 @@ def fit(
                 late = r.jitter_error[:, : one.mask.shape[1]]
                 one = dataclasses.replace(one, jitter_error=late)
                 records = eqx.tree_at(lambda a, i=index: a.readings[i], records, one)
-        shown = eqx.tree_at(lambda m: m.records, task.model, records)
+        kinds = [part.model.records for part in model.parts] or [records]
+        shown = stacking.with_records(task.model, kinds)
     return assess(task.model, best, task.noise, attempts, lowest, shown, interrupts, rough)
 
 
@@ -292,26 +297,37 @@ def _with_blocks(best: Attempt, model: Model) -> Attempt:
 _only_errors = eqx.filter_jit(all_errors)
 
 
-def _with_integrator(model: Model, integrator: AbstractIntegrator | None) -> Model:
-    """Return the `model` with another integrator, or unchanged for `None`."""
-    if integrator is None:
+# The integrator of each kind of recordings; `None` for a kind without a torque.
+Integrators = tuple[AbstractIntegrator | None, ...]
+
+
+def _with_integrators(model: Model, integrators: Integrators | None) -> Model:
+    """Return the `model` with other integrators, or unchanged for `None`."""
+    if integrators is None:
         return model
-    return eqx.tree_at(lambda m: m.integrator, model, integrator)
+    return stacking.with_field(model, "integrator", integrators)
 
 
-def _converged_integrator(
-    best: Attempt, task: Task, remarks: list[str]
-) -> AbstractIntegrator | None:
-    """Return an integrator with steps so short that shorter steps hardly change the predictions.
+def _refine(integrators: Integrators) -> Integrators | None:
+    """Return integrators of shorter steps, or `None` if none can be refined."""
+    finer = [None if one is None else one.refine() for one in integrators]
+    if all(one is None for one in finer):
+        return None
+    return tuple(one if new is None else new for one, new in zip(integrators, finer, strict=True))
 
-    They may change by a twentieth of the noise. The result is `None` if the present integrator is
+
+def _converged_integrators(best: Attempt, task: Task, remarks: list[str]) -> Integrators | None:
+    """Return integrators with steps so short that shorter steps hardly change the predictions.
+
+    They may change by a twentieth of the noise. The result is `None` if the present integrators are
     accurate enough; a line is added to `remarks` if even the shortest steps are not.
     """
     model, (errors, _) = task.model, best.blocks
-    steps, apart = model.integrator, 0.0
-    while steps is not None and (finer := steps.refine()) is not None:
-        closer = _with_integrator(model, finer)
-        if jax.tree.structure(finer) == jax.tree.structure(model.integrator):
+    first = steps = tuple(one.integrator for one in stacking.kinds_of(model))
+    apart = 0.0
+    while (finer := _refine(steps)) is not None:
+        closer = _with_integrators(model, finer)
+        if jax.tree.structure(finer) == jax.tree.structure(first):
             exact, _ = blocks_at(closer, best.x)
         else:
             exact = _only_errors(closer, best.x)
@@ -333,7 +349,7 @@ def _converged_integrator(
             remarks.append(
                 f"the shortest steps still change readings by {apart:.1g} of their noise"
             )
-    return None if steps is model.integrator else steps
+    return None if steps is first else steps
 
 
 def _spreads_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:

@@ -20,7 +20,7 @@ from rigidjax.identify.answer.table import Row, html_rows, interval_text, number
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
 from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jacobian
 from rigidjax.identify.model.terms import Noise
-from rigidjax.identify.uncertainty.covariance import Linearisation
+from rigidjax.identify.uncertainty.covariance import Linearisation, measured_residuals
 from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 from rigidjax.identify.uncertainty.quantities import Quantity, interval_about
 
@@ -213,7 +213,8 @@ class Fit(eqx.Module):
     def state0(self) -> Any:
         """Return the fitted state of the body at the first time of the recording.
 
-        For several recordings the state has a leading axis.
+        For several recordings the state has a leading axis; of several kinds of recordings it is a
+        dict by kind.
         """
         return self.model.unpack(self.x).state0
 
@@ -430,6 +431,8 @@ def verdict(fit: Fit) -> str:
         f"starts: {len(good)} of {len(fit.starts)} reached a motion that fits as well as the best"
         + (", all the same one" if fit.ok and len(good) > 1 else "")
     )
+    for name, off in measured_residuals(fit.model, fit.linear) if fit.linear is not None else ():
+        lines.append(f"measured {name}: {off:+.2g} standard deviations from the fit")
     lines += [f"- {line}" for line in fit.identifiability]
     lines += [fit.place] if fit.place else []
     if fit.x.dtype == np.float32:

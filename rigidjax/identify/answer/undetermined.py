@@ -15,7 +15,8 @@ from rigidjax.identify.data.full_scale import describe_full_scale
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.model.charts import BASIS, COMPONENTS, Tensor, body_list
 from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
-from rigidjax.identify.model.model import Model, shortened
+from rigidjax.identify.model.model import Model, parts_of, shortened
+from rigidjax.identify.model.several import Part
 from rigidjax.identify.search.stages import blocks_at
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
@@ -29,6 +30,7 @@ from rigidjax.identify.uncertainty.quantities import (
     quantity_vector,
     recording_suffixes,
     reports_starts,
+    starting_suffixes,
 )
 from rigidjax.motion.manifold import minus, parts_by_name
 from rigidjax.rotation import quaternion
@@ -127,7 +129,8 @@ def undetermined_combinations(
     best = basis = None
     values, slopes = _numbers_on_host(point)
     names, many = _labels(model), len(named_charts(model))
-    first, turns = len(labels(model)), 3 * model.count
+    first = len(labels(model))
+    turns = sum("attitude about the body" in one.name for one in names)
     for other in (1, 0):
         # Compute the combinations twice, with changes of attitude about the axes of the world and
         # about the axes of the body: first leave out the rows of the body's axes, then the rows of
@@ -244,9 +247,11 @@ def _labels(model: Model) -> list[Label]:
         ("x", "position", "m"),
         ("v", "velocity", "m/s"),
     ):
-        if hasattr(model.reference.state, part) and reports_starts(model):
-            for where in recording_suffixes(model):
-                out += [Label(f"the initial {name} {k}{where}", unit, False) for k in "xyz"]
+        every = zip(parts_of(model), recording_suffixes(model), strict=True)
+        for one, suffixes in every:
+            if hasattr(one.model.reference.state, part) and reports_starts(one.model):
+                for where in suffixes:
+                    out += [Label(f"the initial {name} {k}{where}", unit, False) for k in "xyz"]
     return out
 
 
@@ -262,25 +267,29 @@ def _numbers(model: Model, point: Float[Array, " n"]) -> FirstOrder:
     An initial attitude is a turn from that at `point`; an initial position or velocity is the
     difference from that of the reference state.
     """
-    reference = model.reference
-    start = jax.vmap(ReferenceStates.initial)(reference, point[model.index.start])
 
-    def initial_states(x: Array) -> list[Array]:
-        states = jax.vmap(ReferenceStates.initial)(reference, x[model.index.start])
-        one, numbers = jax.tree.map(lambda leaf: leaf[0], states), []
+    def initial_states(part: Part, x: Array) -> dict[str, Array]:
+        index, reference = part.model.index, part.model.reference
+        start, states = (
+            jax.vmap(ReferenceStates.initial)(reference, part.take(y)[index.start])
+            for y in (point, x)
+        )
+        one, numbers = jax.tree.map(lambda leaf: leaf[0], states), {}
         change = parts_by_name(one, jax.vmap(minus)(states, start))
         offset = parts_by_name(one, jax.vmap(minus)(states, reference.state))
         if "q" in change:
-            numbers += [jax.vmap(quaternion.rotate)(start.q, change["q"]), change["q"]]
-        return [*numbers, *(offset[name] for name in ("x", "v") if name in offset)]
+            numbers["world"] = jax.vmap(quaternion.rotate)(start.q, change["q"])
+            numbers["body"] = change["q"]
+        return numbers | {name: offset[name] for name in ("x", "v") if name in offset}
 
     def value(x: Array) -> Array:
         numbers = [quantity_vector(model, x)]
         for body in body_list(model.bodies(x)):
             tensor = tensor_of(body)
             numbers.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
-        if reports_starts(model):
-            numbers += initial_states(x)
+        kinds = [initial_states(p, x) for p in parts_of(model) if reports_starts(p.model)]
+        for name in ("world", "body", "x", "v"):
+            numbers += [kind[name] for kind in kinds if name in kind]
         return jnp.concatenate([part.reshape(-1) for part in numbers])
 
     return value_and_jacfwd(value, point)
@@ -371,12 +380,12 @@ def describe_identifiability(
             determined, float(student_quantile(0.95, uncertainty.degrees_of_freedom(limit.slope)))
         )
     ]
-    if reports_starts(point.model):
+    if count := len(starting_suffixes(point.model)):
         # Each recording has three components of its initial body rate.
-        rates = quantities[first : first + 3 * point.model.count]
+        rates = quantities[first : first + 3 * count]
         size = np.array([(q.value, _half_width(q)) for q in rates]).reshape(-1, 3, 2)
         if not (size[..., 1].max(axis=1) < np.linalg.norm(size[..., 0], axis=1)).all():
-            many = "rate is" if point.model.count == 1 else "rates are"
+            many = "rate is" if count == 1 else "rates are"
             out.append(f"The initial body {many} not determined by these data.")
     out += _describe_combinations(point, uncertainty)
     if point.model.torque is None:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from rigidjax import _checks
-from rigidjax.identify.data.recording import Reading, Recording
+from rigidjax.identify.data.recording import Reading, Recording, unchecked
 from rigidjax.motion.torques import Linear, Series
 
 
@@ -63,10 +63,59 @@ def pad_to_few(model: PyTree) -> PyTree:
     """
     if model.clusters is not None:
         return model
-    records = model.records
-    count, rows = _padded(records.t.shape[1]), _padded(_table_rows(records, 1))
-    longer = pad_recording(records, count, rows, 1)
-    return eqx.tree_at(lambda m: m.records, model, longer)
+
+    def longer(records: Recording) -> Recording:
+        count, rows = _padded(records.t.shape[1]), _padded(_table_rows(records, 1))
+        return pad_recording(records, count, rows, 1)
+
+    return with_records(model, [longer(one.records) for one in kinds_of(model)])
+
+
+def kinds_of(model: PyTree) -> list[Any]:
+    """Return a model for each kind of recordings of a `model`."""
+    return [part.model for part in model.parts] or [model]
+
+
+def with_records(model: PyTree, kinds: Sequence[Recording]) -> PyTree:
+    """Return a `model` with other recordings, given kind by kind."""
+    model = with_field(model, "records", kinds)
+    return eqx.tree_at(lambda m: m.records, model, unite(kinds)) if model.parts else model
+
+
+def with_field(model: PyTree, name: str, values: Sequence[Any]) -> PyTree:
+    """Return a `model` with other `values` of a field, given kind by kind."""
+    # `equinox.tree_at` takes an empty tuple as a leaf, which is no sequence.
+    several = bool(model.parts)
+    return eqx.tree_at(
+        lambda m: [getattr(one, name) for one in (kinds_of(m) if several else [m])],
+        model,
+        list(values),
+        is_leaf=lambda node: node is None,
+    )
+
+
+def unite(kinds: Sequence[Recording]) -> Recording:
+    """Return recordings of several kinds, each with a leading axis, as one with all sensors.
+
+    A sensor reads nothing in the recordings of another kind. Inputs are left out.
+    """
+    long, ends = max(r.t.shape[1] for r in kinds), np.cumsum([r.t.shape[0] for r in kinds])
+    kinds = [r if r.t.shape[1] == long else pad_recording(r, long, 0, 1) for r in kinds]
+    readings, every = [], np.arange(ends[-1])
+    for record, end in zip(kinds, ends.tolist(), strict=True):
+        count = record.t.shape[0]
+        mine = (every >= end - count) & (every < end)
+        for reading in pick(record.readings, np.clip(every - end + count, 0, count - 1)):
+            mask = _apply("logical_and", reading.mask, mine[:, None])
+            readings.append(eqx.tree_at(lambda r: r.mask, reading, mask))
+    return unchecked(_apply("concatenate", [r.t for r in kinds]), tuple(readings), {})
+
+
+def _apply(name: str, *arrays: Any) -> Array:
+    """Return the result of a function of NumPy, or of JAX if an array is traced."""
+    if _checks.is_known(arrays):
+        return _constant(getattr(np, name)(*arrays))
+    return getattr(jnp, name)(*arrays)
 
 
 def _table_rows(recording: Recording, axis: int) -> int:

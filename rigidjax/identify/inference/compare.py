@@ -17,7 +17,7 @@ from rigidjax.identify.data.recording import Recording, numbers_read
 from rigidjax.identify.model.charts import Known, body_places
 from rigidjax.identify.model.free import with_steps
 from rigidjax.identify.model.index import build_index
-from rigidjax.identify.model.model import Model, starting_scene
+from rigidjax.identify.model.model import Model, require_one_kind, starting_scene
 from rigidjax.identify.model.terms import (
     decorrelate,
     whiten,
@@ -153,6 +153,7 @@ def _with_shared_fixed(model: Model, fit_of_others: Fit) -> Model:
 
     Only its initial state is free, and each `Free` with a value for each recording.
     """
+    require_one_kind(model, "cross_validate")
     x = model.start()
     for slot, fitted in zip(model.slots, fit_of_others.model.slots, strict=True):
         if slot.shared is not None and fitted.shared is not None:
@@ -171,5 +172,6 @@ def _with_shared_fixed(model: Model, fit_of_others: Fit) -> Model:
     records = eqx.tree_at(
         lambda r: [reading.sensor for reading in r.readings], model.records, list(sensors)
     )
-    parts = dict(charts=charts, torque=scene.torque, records=records, slots=slots, index=index)
+    parts: Any = dict(measured=())  # they are in the fit of the others
+    parts |= dict(charts=charts, torque=scene.torque, records=records, slots=slots, index=index)
     return dataclasses.replace(model, **parts)

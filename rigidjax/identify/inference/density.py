@@ -24,6 +24,7 @@ from rigidjax.identify.model.model import (
     Model,
     Unpacked,
     map_rows,
+    require_one_kind,
     scenes_of,
     starting_scene,
     unpack_at,
@@ -108,6 +109,7 @@ class LogDensity(eqx.Module):
             fit, Fit, "LogDensity: fit", requirement="what identify.fit returns"
         )
         model = fit.model
+        require_one_kind(model, "LogDensity")
         process = model.process if process is None else process
         if process is not None:
             require_unknown_torque(process)

@@ -90,6 +90,7 @@ def fields_of_model(
     # interval between times is longer or shorter.
     filtered = process is not None or walks
     return parts | {
+        "parts": (),
         "records": data.records,
         "counts": data.counts,
         "charts": charts,

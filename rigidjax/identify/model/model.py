@@ -1,6 +1,5 @@
 """Map the parameters of a fit to the scene of each recording, by a model."""
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -38,8 +37,9 @@ from rigidjax.identify.model.predict import (
     sensor_inputs,
     states_at,
 )
-from rigidjax.identify.model.priors import AbstractLoss, Entropic
+from rigidjax.identify.model.priors import AbstractLoss, Entropic, Measured
 from rigidjax.identify.model.scene import Process, Scene
+from rigidjax.identify.model.several import Part, fields_of_several
 from rigidjax.identify.model.walks import Drift, Walk
 from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.torques.base import Torque
@@ -60,7 +60,8 @@ class Unpacked(eqx.Module):
 
     - `x`: (n,) the parameters.
     - `body`: the body; several bodies as a dict by name.
-    - `state0`: the initial state; the initial states of several recordings have a leading axis.
+    - `state0`: the initial state; the initial states of several recordings have a leading axis; of
+      several kinds of recordings a dict by kind.
     - `values`: the values of the `Free`s (other numbers that a fit may move) by name, in their
       units.
     - `noise`: if x belongs to a `LogDensity` (posterior density of a fitted model), for each sensor
@@ -92,6 +93,10 @@ class Model(eqx.Module):
       recording has its own initial state, and all recordings share the body. `Windows` of a record
       of measured states may be given instead: each window is then a short recording whose initial
       state is known, or free about the measured state.
+      For recordings of several kinds (other sensors, torques, integrators) give a model of each
+      kind by name, and nothing else but `measured`: `Model({"throw": Model(a, chart), "hand":
+      Model(b, chart, torque=Carried())})`. The kinds share the bodies, and each `Free` whose name
+      they have in common.
     - `chart`: the chart of the body: `Ratios()` (the full tensor up to scale), `PrincipalRatios()`
       (if the body axes are known to be principal), `Tensor()` or `Principal()` (the full or the
       principal tensor with its scale), `Mass(guess)` (all ten numbers), or `Known(body)`. For
@@ -108,6 +113,8 @@ class Model(eqx.Module):
       for each body, group or recording.
     - `loss`: a robust loss, `SoftL1()` or `Huber()`; `None` for plain least squares.
     - `prior`: `Entropic(guess, weight)`, a prior about a roughly known body, or `None`.
+    - `measured`: numbers measured beside the recordings, a sequence of `Measured(of, value, sigma,
+      name)`: a weight, a period, a length.
     - `integrator`: the integrator of a forced motion, `FixedSteps(n)` or `Adaptive(rtol, atol)`.
       With `None` it is chosen by the sampling. `Adaptive()` is quicker than fixed steps if the
       torque is smooth and the body turns by 0.1 rad or more between readings, but slow if the
@@ -136,12 +143,14 @@ class Model(eqx.Module):
     (8, Array(1., dtype=float64))
     """
 
+    # The models of several kinds of recordings; empty if all recordings are of one kind.
+    parts: tuple[Part, ...]
     records: Recording
     counts: Int[np.ndarray, " records"]
     charts: Charts
     body_names: tuple[str, ...] = eqx.field(static=True)
     body_indices: Int[Array, " records"] | None
-    torque: Torque | None
+    torque: Any  # of several kinds a dict by kind, or `None` if no kind has one
     process: Process | None
     walks: tuple[Drift, ...]
     slots: tuple[Slot, ...]
@@ -149,6 +158,7 @@ class Model(eqx.Module):
     noise_groups: Int[Array, " records"]
     loss: AbstractLoss | None
     prior: Entropic | None
+    measured: tuple[Measured, ...]
     start_weight: Float[Array, "records n"] | None
     clusters: Int[Array, " records"] | None
     integrator: AbstractIntegrator | None
@@ -158,11 +168,7 @@ class Model(eqx.Module):
 
     def __init__(
         self,
-        recording: Recording
-        | Sequence[Recording]
-        | Mapping[str, Recording | Sequence[Recording]]
-        | Windows
-        | None = None,
+        recording: Recording | Sequence[Recording] | Mapping[str, Any] | Windows | None = None,
         chart: AbstractBodyChart | Mapping[str, AbstractBodyChart] | None = None,
         *,
         torque: Torque | None = None,
@@ -171,6 +177,7 @@ class Model(eqx.Module):
         free: Sequence[Free] = (),
         loss: AbstractLoss | None = None,
         prior: Entropic | None = None,
+        measured: Sequence[Measured] = (),
         integrator: AbstractIntegrator | None = None,
         noise_each: bool | str | Sequence[Any] = False,
         stretches: int = 12,
@@ -178,13 +185,19 @@ class Model(eqx.Module):
     ):
         given: dict[str, Any] = dict(torque=torque, process=process, walks=walks)
         given |= dict(loss=loss, prior=prior, integrator=integrator)
-        if not fields:
+        for one in measured:
+            _checks.require_instance(one, Measured, "measured", requirement="Measured(of, …)")
+        named = recording if isinstance(recording, Mapping) else {}
+        if any(isinstance(one, Model) for one in named.values()) and not fields:
+            own: Any = dict(chart=chart, free=free, noise_each=noise_each or None)
+            given, fields = {}, fields_of_several(named, **given, **own)
+        elif not fields:
             rest: Any = dict(free=free, noise_each=noise_each, stretches=stretches)
             fields = fields_of_model(recording, chart, **given, **rest)
         elif recording is not None or chart is not None:
             # All fields together come from `dataclasses.replace`, without recording and chart.
             raise TypeError(f"Model: {next(iter(fields))!r} is no argument of a Model")
-        for name, value in (given | fields).items():
+        for name, value in (given | fields | {"measured": tuple(measured)}).items():
             setattr(self, name, value)
 
     @property
@@ -204,6 +217,8 @@ class Model(eqx.Module):
         The model stores them with equally many times, where masked readings fill up the shorter
         recordings. These readings are left out here.
         """
+        if self.parts:
+            return tuple(one for part in self.parts for one in part.model.recordings)
         return tuple(
             stacking.take_rows(stacking.pick(self.records, index), count)
             for index, count in enumerate(np.asarray(self.counts).tolist())
@@ -241,6 +256,14 @@ class Model(eqx.Module):
         **Raises:** `ValueError` for a body that the chart cannot represent, or a wrong shape.
         """
         require_single(self)
+        if self.parts:
+            x = jnp.zeros(self.size)
+            for part in self.parts:
+                mine, named = body, dict.fromkeys(part.model.body_names)
+                if isinstance(body, Mapping) and not set(body) - set(self.body_names):
+                    mine = {name: body[name] for name in named if name in body}
+                x = x.at[part.places].set(part.model.start(mine, omega))
+            return x
         if self.body_indices is None:
             vector = _chart_vector(self.charts[0], body)
         else:
@@ -297,9 +320,9 @@ class Model(eqx.Module):
             return next(bodies)
         return dict(zip(dict.fromkeys(self.body_names), bodies, strict=True))
 
-    def scenes(self, x: Float[Array, " n"]) -> Scene:
+    def scenes(self, x: Float[Array, " n"]) -> Any:
         """Return the scene (body, torques, sensors, initial state) of each recording at the
-        parameters x (n,), with a leading axis of recordings.
+        parameters x (n,), with a leading axis of recordings; of several kinds a dict by kind.
         """
         return scenes_of(self, checked_x(self, x))
 
@@ -317,9 +340,12 @@ class Model(eqx.Module):
         """Return the states at the times of the recording for the parameters x (n,), with a
         leading time axis.
 
-        For several recordings an axis of recordings comes before the time axis.
+        For several recordings an axis of recordings comes before the time axis; of several kinds
+        the result is a dict by kind.
         """
         x = checked_x(self, x)
+        if self.parts:
+            return {part.name: part.model.motion(part.take(x)) for part in self.parts}
 
         def motion_of_recording(row: Array, record: Recording, *others: PyTree) -> Any:
             scene = scene_at(self, row, record, *others)
@@ -341,6 +367,9 @@ class Model(eqx.Module):
 
 def unpack_at(model: Model, x: Float[Array, " n"]) -> Unpacked:
     """Return what `Model.unpack` returns, without a check of x."""
+    if model.parts:
+        starts = {part.name: unpack_at(part.model, part.take(x)).state0 for part in model.parts}
+        return Unpacked(x, model.bodies(x), starts, values_of(model, x))
     starts = jax.vmap(ReferenceStates.initial)(model.reference, x[model.index.start])
     state0 = stacking.pick(starts, 0) if model.count == 1 else starts
     return Unpacked(x, model.bodies(x), state0, values_of(model, x))
@@ -357,12 +386,46 @@ def shortened(model: Model) -> Model:
 
     What depends on no reading is then compiled once, not again for recordings of another length.
     """
-    records = jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, model.records)
-    return dataclasses.replace(model, records=stacking.take_rows(records, 1, axis=1))
+
+    def first_time(records: Recording) -> Recording:
+        records = jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, records)
+        return stacking.take_rows(records, 1, axis=1)
+
+    kinds = stacking.kinds_of(model)
+    return stacking.with_records(model, [first_time(one.records) for one in kinds])
 
 
-def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
+def parts_of(model: Model) -> tuple[Part, ...]:
+    """Return the parts of a `model`: one for each kind of recordings."""
+    return model.parts or (Part("", model, None, 0, 0),)
+
+
+def part_of_sensor(model: Model, index: int) -> Part:
+    """Return the part of a `model` with the sensor of this `index` among all."""
+    return next(part for part in parts_of(model) if index < part.sensors.stop)
+
+
+def padded(model: Model, arrays: Sequence[Array | np.ndarray]) -> tuple[Any, ...]:
+    """Return the arrays (R, T, k, …) of each sensor with zeros at the recordings, times and columns
+    of other kinds.
+    """
+    if not model.parts:
+        return tuple(arrays)
+    (count, times), columns = model.records.t.shape, model.index.places.shape[1]
+    out, xp = [], np if _checks.is_known(arrays) else jnp
+    for part in model.parts:
+        for one in arrays[part.sensors]:
+            ends = (count, times, one.shape[2], columns)[: one.ndim]
+            before = (part.first, 0, 0, 0)[: one.ndim]
+            widths = [(b, e - b - n) for b, e, n in zip(before, ends, one.shape, strict=True)]
+            out.append(jnp.asarray(xp.pad(one, widths)))
+    return tuple(out)
+
+
+def scenes_of(model: Model, x: Float[Array, " n"]) -> Any:
     """Return what `Model.scenes` returns, without a check of x."""
+    if model.parts:
+        return {part.name: scenes_of(part.model, part.take(x)) for part in model.parts}
     return eqx.filter_vmap(lambda row, *rest: scene_at(model, row, *rest))(
         model.index.rows(x), model.records, model.reference, model.body_indices
     )
@@ -370,6 +433,9 @@ def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
 
 def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
     """Return what `Model.values` returns, without a check of x."""
+    if model.parts:
+        each = (values_of(part.model, part.take(x)) for part in model.parts)
+        return {name: value for values in each for name, value in values.items()}
     rows, out = model.index.rows(x), {}
     leaves = dict(jax.tree.leaves_with_path(starting_scene(model, model.records)))
     for slot in model.slots:
@@ -390,6 +456,15 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
         if slot.spread is not None:
             out[f"{slot.name}, own"] = own
     return out
+
+
+def require_one_kind(model: Model, name: str) -> None:
+    """Raise `ValueError` for a `model` of several kinds of recordings, called `name`."""
+    if model.parts:
+        kinds = ", ".join(repr(part.name) for part in model.parts)
+        raise ValueError(
+            f"{name}: wanted a model of one kind of recordings, got several: {kinds}; give one"
+        )
 
 
 def require_single(model: PyTree) -> Model:
@@ -566,6 +641,9 @@ def all_errors(model: Model, x: Float[Array, " n"]) -> tuple[Array, ...]:
 
     Derivatives are computed as by `map_rows`.
     """
+    if model.parts:
+        each = [all_errors(part.model, part.take(x)) for part in model.parts]
+        return padded(model, [error for errors in each for error in errors])
     return map_rows(model.index.rows(x), model, sensor_errors)
 
 
@@ -607,6 +685,12 @@ def error_jacobians(
 
     The last axis (m) of the Jacobian is that of `model.index.places`.
     """
+    if model.parts:
+        each = [error_jacobians(part.model, part.take(x), function) for part in model.parts]
+        values, slopes = (
+            [one for some in part for one in some] for part in zip(*each, strict=True)
+        )
+        return FirstOrder(padded(model, values), padded(model, slopes))
     out, slopes = _row_jacobians(model, model.index.rows(x), function)
     columns = jnp.asarray(model.index.columns, jnp.int32)
     if columns.size > model.index.width:

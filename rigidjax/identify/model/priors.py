@@ -1,14 +1,18 @@
-"""Compute robust losses, which give outliers less weight, and a prior of the body."""
+"""Compute robust losses, which give outliers less weight, a prior of the body, and measurements
+that belong to no recording.
+"""
 
 import abc
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import Scalar
+from rigidjax._types import NumbersLike, Scalar
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
 
@@ -158,6 +162,49 @@ class Entropic(eqx.Module):
         signed = jnp.where(near, x * jnp.sqrt(2.0 * series), exact)
         parts = jnp.concatenate([factor[rows, columns], signed])
         return jnp.sqrt(2.0 * self.weight) * parts
+
+
+class Measured(eqx.Module):
+    """Define a measured number of the body or of the `Free`s, such as a weight, a period or a
+    length in a drawing: a reading that belongs to no recording.
+
+    A fit adds the residual `(value − of(point)) / sigma`. The sign is that of other readings.
+
+    **Arguments:**
+
+    - `of`: a differentiable function of an `Unpacked` (body, initial states, values of the `Free`s)
+      that returns the number, such as `lambda point: point.body.mass`. Another function is compiled
+      anew.
+    - `value`: the measured number, in its unit.
+    - `sigma`: its standard deviation, in the same unit.
+    - `name`: its name in reports.
+
+    **Raises:** `TypeError` for anything but a function and a name; `ValueError` for a value that is
+    not finite, or a standard deviation that is not positive.
+
+    >>> Measured(lambda point: point.body.mass, 0.482, 0.001, "weight").name
+    'weight'
+    """
+
+    of: Callable[[Any], Any] = eqx.field(static=True)
+    value: Scalar
+    sigma: Scalar
+    name: str = eqx.field(static=True)
+
+    def __init__(self, of: Callable[[Any], Any], value: NumbersLike, sigma: NumbersLike, name: str):
+        self.of = _checks.require_function(of, "of", "of an `Unpacked` to a number")
+        self.name = _checks.require_instance(name, str, "name")
+        here, kind = f"Measured {name!r}", jnp.result_type(float)
+        number = _checks.array_of_shape(value, (), f"{here}: value").astype(kind)
+        self.value = _checks.require_finite(number, f"{here}: value")
+        self.sigma = jnp.asarray(_checks.positive_float(sigma, f"{here}: sigma"), kind)
+
+    def residual(self, point: Any) -> Scalar:
+        """Return the measured minus the computed number, in standard deviations."""
+        number = _checks.differentiable_array(self.of(point), f"Measured {self.name!r}")
+        if number.shape != ():
+            raise ValueError(f"Measured {self.name!r}: wanted one number, got {number.shape}")
+        return (self.value - number) / self.sigma
 
 
 def _pseudo_inertia(body: MassProperties) -> Float[Array, "4 4"]:

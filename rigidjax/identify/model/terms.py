@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from rigidjax.identify.model.first_order import FirstOrder
-from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.model import Model, unpack_at
 from rigidjax.identify.sensors.base import extras
 
 # `SensorErrors` holds one array for each sensor, such as its errors (R, T, k), for R recordings, T
@@ -166,12 +166,16 @@ def prior_weights(model: Model) -> Float[Array, " n"]:
 
 
 def joint_residuals(model: Model, x: Float[Array, " n"]) -> Float[Array, " j"]:
-    """Return the residuals of the prior of the body, if the model has one."""
-    if model.prior is None:
-        return jnp.zeros(0, x.dtype)
-    (chart,) = model.charts
-    body = chart.body(x[: model.index.bodies])
-    return model.prior.residuals(body, to_scale=chart.unit != "").reshape(-1)
+    """Return the residuals of the prior of the body, if there is one, and of each `Measured`."""
+    out = [jnp.zeros(0, x.dtype)]
+    if model.prior is not None:
+        (chart,) = model.charts
+        body = chart.body(x[: model.index.bodies])
+        out.append(model.prior.residuals(body, to_scale=chart.unit != "").reshape(-1))
+    if model.measured:
+        point = unpack_at(model, x)
+        out += [one.residual(point).astype(x.dtype)[None] for one in model.measured]
+    return jnp.concatenate(out)
 
 
 def prior_residuals(model: Model, x: Float[Array, " n"]) -> Float[Array, " m"]:

@@ -115,7 +115,7 @@ def _shares(
     """
     groups, readings = np.asarray(model.noise_groups), model.records.readings
     sizes = [np.bincount(groups, one.usable.sum(axis=(1, 2))) for one in readings]
-    held = model.prior, *((slot.prior, slot.spread) for slot in model.slots)
+    held = model.prior, model.measured, *((slot.prior, slot.spread) for slot in model.slots)
     if len(readings) * sizes[0].size == 1 and not jax.tree.leaves(held):
         # Without priors, and if all readings share one noise, the leverages of the readings are not
         # needed one by one: their sum is the number of fitted numbers.

@@ -8,19 +8,21 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rigidjax.identify.data.recording import Reading, numbers_read
 from rigidjax.identify.model import terms
 from rigidjax.identify.model.charts import split_numbers
 from rigidjax.identify.model.first_order import value_and_jacfwd
-from rigidjax.identify.model.model import Model, error_jacobians
+from rigidjax.identify.model.model import Model, error_jacobians, padded, parts_of
 from rigidjax.identify.model.normal import NormalMatrix, normal_matrix
 from rigidjax.identify.model.predict import FixedSteps, HeldSteps
+from rigidjax.identify.model.several import Part
 from rigidjax.identify.model.terms import Blocks, Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
 from rigidjax.identify.sensors.base import extras
@@ -60,8 +62,8 @@ class Evaluation(NamedTuple):
     """Hold what a search keeps from its last evaluation of the cost."""
 
     blocks: Blocks
-    # For each recording the gradient of the cost of its readings with respect to its row.
-    pulls: Float[Array, "records m"]
+    # For each kind and recording the gradient of the cost of its readings in its row.
+    pulls: tuple[Float[Array, "records m"], ...]
 
 
 class Attempt(eqx.Module):
@@ -96,36 +98,38 @@ def marquardt(
 
     The `weights` are zero for readings that are not fitted.
     """
-    number, kind, places = model.size, x.dtype, model.index.places
-    (count, times), columns = model.records.t.shape, places.shape[1]
-    if isinstance(model.integrator, FixedSteps | HeldSteps):
-        # No states are computed long after the last reading with a weight.
-        counts = jnp.any(weights > 0, axis=0)
-        place = jnp.arange(counts.size, dtype=jnp.int32)
-        last = jnp.max(jnp.where(counts, place, 0))
-        shorter = eqx.tree_at(
-            lambda s: s.last, model.integrator, last, is_leaf=lambda node: node is None
-        )
-        model = eqx.tree_at(lambda m: m.integrator, model, shorter)
+    number, kind = model.size, x.dtype
+    kinds = [_kind(model, part, noise, weights) for part in parts_of(model)]
+    # Own parameters may be in a `Measured`, too.
+    many = model.count >= MANY and not model.parts and not model.measured
+    alone = np.asarray(model.index.alone, int) if many else None
     prior = terms.prior_weights(model)
-    alone = np.asarray(model.index.alone, int) if count >= MANY else None
 
     def evaluate(x: Array) -> tuple[Evaluation, Array, NormalMatrix, Array]:
-        # Without a barrier XLA on CPU computes the derivatives again inside each residual, and the
-        # program takes a fifth longer to compile.
-        errors, slopes = barrier(error_jacobians(model, x))
-        residuals, rows = terms.residual_jacobians(
-            lambda e: terms.reading_residuals(model, e, noise, weights), errors, slopes
-        )
-        total, pulls = jnp.zeros((), kind), jnp.zeros(places.shape, kind)
-        for e, row in zip(residuals, rows, strict=True):
-            total = total + jnp.sum(e**2)
-            # On a CPU a product of matrices is several times as fast as an `einsum`, as in
-            # `normal_matrix`.
-            flat = row.reshape(count, -1, columns)
-            pulls = pulls + (e.reshape(count, 1, -1) @ flat)[:, 0]
-        slope = jnp.zeros(number + 1, kind).at[places].add(pulls)
-        normal = normal_matrix(rows, places, number, alone).add_diagonal(prior**2)
+        total, slope = jnp.zeros((), kind), jnp.zeros(number + 1, kind)
+        blocks, every, normals = [], [], []
+        for part, one, places, sigma, factors in kinds:
+            # Without a barrier XLA on CPU computes the derivatives again inside each residual, and
+            # the program takes a fifth longer to compile.
+            errors, slopes = barrier(error_jacobians(one, part.take(x)))
+            residuals, rows = terms.residual_jacobians(
+                lambda e, m=one, s=sigma, w=factors: terms.reading_residuals(m, e, s, w),
+                errors,
+                slopes,
+            )
+            pulls = jnp.zeros(places.shape, kind)
+            for e, row in zip(residuals, rows, strict=True):
+                total = total + jnp.sum(e**2)
+                # On a CPU a product of matrices is several times as fast as an `einsum`, as in
+                # `normal_matrix`.
+                flat = row.reshape(len(places), -1, places.shape[1])
+                pulls = pulls + (e.reshape(len(places), 1, -1) @ flat)[:, 0]
+            slope = slope.at[places].add(pulls)
+            normals.append(normal_matrix(rows, places, number, alone))
+            blocks.append((errors, slopes))
+            every.append(pulls)
+        normal = jax.tree.map(lambda *all_: sum(all_[1:], all_[0]), *normals)
+        normal = normal.add_diagonal(prior**2)
         total, slope = total + jnp.sum((prior * x) ** 2), slope[:-1] + prior**2 * x
         e, row = value_and_jacfwd(lambda x: terms.joint_residuals(model, x), x)
         if e.size:
@@ -137,18 +141,25 @@ def marquardt(
         bent = [chart.curvature_rows(*mine) for chart, *mine in zip(charts, *parts, strict=True)]
         curvature = block_diag(*bent)
         normal = normal.add_rows(jnp.pad(curvature, ((0, 0), (0, number - curvature.shape[1]))))
-        return Evaluation(Blocks(errors, slopes), pulls), 0.5 * total, normal, slope
+        kept = (tuple(x for block in some for x in block) for some in zip(*blocks, strict=True))
+        return Evaluation(Blocks(*kept), tuple(every)), 0.5 * total, normal, slope
 
     # The shapes of the first state are computed here, since tracing `evaluate` would take seconds.
-    shapes = [(count, times, sensor.components) for sensor in model.records.sensors]
+    shapes = [
+        ((*one.records.t.shape, sensor.components), places.shape[1])
+        for _, one, places, *_ in kinds
+        for sensor in one.records.sensors
+    ]
     zeros = Evaluation(
         Blocks(
-            tuple(jnp.zeros(shape, kind) for shape in shapes),
-            tuple(jnp.zeros((*shape, columns), kind) for shape in shapes),
+            tuple(jnp.zeros(shape, kind) for shape, _ in shapes),
+            tuple(jnp.zeros((*shape, columns), kind) for shape, columns in shapes),
         ),
-        jnp.zeros(places.shape, kind),
+        tuple(jnp.zeros(places.shape, kind) for _, _, places, *_ in kinds),
     )
-    zero_normal = normal_matrix((jnp.zeros((count, 0, 0, columns), kind),), places, number, alone)
+    places = kinds[0].places
+    none = jnp.zeros((len(places), 0, 0, places.shape[1]), kind)
+    zero_normal = normal_matrix((none,), places, number, alone)
     by_noise = None if model.clusters is None else partial(_takeuchi, model)
     order_one = of_order_one(model, kind)
     end = minimise(evaluate, x, order_one, settings, zeros, zero_normal, by_noise)
@@ -161,6 +172,33 @@ def marquardt(
         cost=jnp.where(lost, jnp.inf, end.cost),
         converged=end.converged & ~lost,
     )
+
+
+class _Kind(NamedTuple):
+    """Hold what a search reads of one kind of recordings."""
+
+    part: Part
+    # Its integrator computes no states long after the last reading with a weight.
+    model: Model
+    places: Int[Array, "records m"]  # of the columns of its rows among all parameters
+    noise: Noise
+    weights: Float[Array, "records times"]
+
+
+def _kind(model: Model, part: Part, noise: Noise, weights: Float[Array, "records times"]) -> _Kind:
+    """Return what a search reads of one `part` of a `model`."""
+    one, places = dataclasses.replace(part.model, loss=model.loss), model.index.places[part.rows]
+    weights = weights[part.rows, : one.records.t.shape[1]]
+    if isinstance(one.integrator, FixedSteps | HeldSteps):
+        counts = jnp.any(weights > 0, axis=0)
+        place = jnp.arange(counts.size, dtype=jnp.int32)
+        last = jnp.max(jnp.where(counts, place, 0))
+        shorter = eqx.tree_at(
+            lambda s: s.last, one.integrator, last, is_leaf=lambda node: node is None
+        )
+        one = eqx.tree_at(lambda m: m.integrator, one, shorter)
+    sigma = tuple(each[part.rows] for each in noise[part.sensors])
+    return _Kind(part, one, places[:, : one.index.places.shape[1]], sigma, weights)
 
 
 def _takeuchi(model: Model, evaluation: Evaluation, normal: NormalMatrix) -> Float[Array, ""]:
@@ -178,7 +216,7 @@ def _takeuchi(model: Model, evaluation: Evaluation, normal: NormalMatrix) -> Flo
     # compiled. The other rows stay zero.
     slopes = jnp.zeros((model.count, model.size), normal.core.dtype)
     slopes = slopes.at[model.clusters[:, None], model.index.places].add(
-        evaluation.pulls, mode="drop"
+        evaluation.pulls[0], mode="drop"
     )
     starts = jnp.asarray(model.index.start).reshape(-1)
     slopes = slopes.at[:, starts].set(0.0)
@@ -212,9 +250,9 @@ def first_weights(model: Model, part: float) -> Float[Array, "records times"]:
     return jnp.asarray((since <= part * length).astype(t.dtype))
 
 
-def _best(state: LMState) -> Attempt:
+def _best(state: LMState, model: Model) -> Attempt:
     """Return the best point of a search, with its `blocks` if it was the last evaluated one."""
-    blocks = state.evaluation.blocks if bool(state.evaluated_at_best) else None
+    blocks = _blocks(state, model) if bool(state.evaluated_at_best) else None
     return Attempt(state.point, state.cost, state.converged, blocks)
 
 
@@ -249,11 +287,16 @@ def _evaluate(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
     return marquardt(model, x, noise, whole_weights(model), Settings(0.0, 1.0, 0))
 
 
+def _blocks(state: LMState, model: Model) -> Blocks:
+    """Return the blocks of the last evaluation of a search."""
+    return Blocks(*(padded(model, some) for some in state.evaluation.blocks))
+
+
 def blocks_at(model: Model, x: Float[Array, " n"]) -> Blocks:
     """Return what `terms.error_jacobians` returns, by the compiled program of the search."""
     kind, sensors = model.records.t.dtype, model.records.sensors
     ones = (np.ones((model.count, sensor.components), kind) for sensor in sensors)
-    return _evaluate(model, x, tuple(map(jnp.asarray, ones))).evaluation.blocks
+    return _blocks(_evaluate(model, x, tuple(map(jnp.asarray, ones))), model)
 
 
 def cost_of(model: Model, x: Float[Array, " n"], noise: Noise) -> float:
@@ -286,7 +329,7 @@ def search_whole(
             attempt = Attempt(attempt.x, cost_of(task.model, attempt.x, task.noise))
             watch(attempt)
             break
-        attempt = _best(end)
+        attempt = _best(end, task.model)
         # At the minimum every step may be refused because of round-off. The search therefore also
         # ends if the cost does not fall any more. This test needs a whole run: with a small
         # `max_steps`, one or two steps may all be refused only because they are too long.
@@ -332,7 +375,7 @@ def fit_in_stages(
             attempt = search_whole(Attempt(x), task, aim=aim, watch=watch)
         return attempt
     end = _take_steps(x, task, whole_weights(model), CAREFUL, aim)
-    at_once = _best(end)
+    at_once = _best(end, model)
     if bool(end.converged) and float(end.cost) <= accepted_cost(model):
         watch(at_once)
         return at_once

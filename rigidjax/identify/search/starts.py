@@ -19,7 +19,13 @@ from rigidjax.identify.data.recording import Recording, input_functions
 from rigidjax.identify.data.reference_states import rates
 from rigidjax.identify.model.charts import BASIS
 from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
-from rigidjax.identify.model.model import Model, map_recordings, scene_at, scene_errors
+from rigidjax.identify.model.model import (
+    Model,
+    map_recordings,
+    parts_of,
+    scene_at,
+    scene_errors,
+)
 from rigidjax.identify.search.noise import initial_noise
 from rigidjax.motion import Spin
 from rigidjax.motion.torques import Carried
@@ -37,24 +43,32 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
     There is only one point if neither a body nor initial rates are free. Without a `key` the points
     are the same at each call.
     """
-    carried = isinstance(model.torque, Carried)
-    recordings = stacking.on_host(model.records, model.counts) if model.index.bodies else ()
-    members: dict[str, list[Recording]] = {}
-    for name, record in zip(model.body_names, recordings, strict=False):
-        members.setdefault(name, []).append(record)
-    if carried:
-        found = carried_bodies(model, list(members))
-    else:
-        found = {name: regress_inertia(tuple(rows), model.torque) for name, rows in members.items()}
-    found = {name: body for name, body in found.items() if body is not None}
+    kinds = stacking.kinds_of(model)
+    found: dict[str, Any] = {}
+    # Carried bodies come first. A kind without a torque, which shows the inertia only up to scale,
+    # comes last.
+    in_order = sorted(kinds, key=lambda one: (one.torque is None) - _is_carried(one))
+    for one in in_order if model.index.bodies else ():
+        members: dict[str, list[Recording]] = {}
+        recordings = stacking.on_host(one.records, one.counts)
+        for name, record in zip(one.body_names, recordings, strict=True):
+            members.setdefault(name, []).append(record)
+        if _is_carried(one):
+            mine = carried_bodies(one, list(members))
+        else:
+            mine = {name: regress_inertia(tuple(r), one.torque) for name, r in members.items()}
+        found = {name: body for name, body in mine.items() if body is not None} | found
     regressed = (found.get("") if model.body_indices is None else found) or None
     start = model.start(regressed)
-    bodies, spins = slice(model.index.bodies), np.asarray(model.index.start)[:, -3:]
+    bodies, places = slice(model.index.bodies), np.arange(model.size)
+    starts = ((part, np.asarray(part.model.index.start)[:, -3:]) for part in parts_of(model))
+    spins = np.concatenate([np.ravel(np.asarray(p.take(places))[rows]) for p, rows in starts])
     # NumPy's random generator is used, since the generator of JAX takes seconds to compile.
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)
     out = []
     # If neither a body nor initial rates are free, there is nothing to scatter. The readings of a
     # carried body are linear in its numbers: there is one best point.
+    carried = all(map(_is_carried, kinds))
     for index in range(count if (model.index.bodies or spins.size) and not carried else 1):
         wide = 0.0 if index == 0 else (0.5 if regressed is not None and index % 2 else 1.5)
         x = np.array(start)
@@ -63,6 +77,10 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
         x[spins] += (0.0 if index == 0 else 0.1) * rng.normal(size=spins.shape)
         out.append(jnp.asarray(x, start.dtype))
     return out
+
+
+def _is_carried(model: Model) -> bool:
+    return isinstance(model.torque, Carried)
 
 
 def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) -> Inertia | None:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from rigidjax import _checks
 from rigidjax.identify.data import stacking
-from rigidjax.identify.model.model import Model, all_errors, checked_x
+from rigidjax.identify.model.model import Model, all_errors, checked_x, require_one_kind
 from rigidjax.identify.model.terms import (
     Noise,
     half_squares,
@@ -107,6 +107,7 @@ def descend(
     True
     """
     _checks.require_instance(model, Model, "descend", requirement="a Model")
+    require_one_kind(model, "descend")
     _checks.require_instance(
         descent, Descent, "descend", requirement="a Descent(optimiser, steps=…, batch=…)"
     )

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rigidjax.identify.model.free import TOLERANCES, Slot, split_path
-from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.model import Model, part_of_sensor
 from rigidjax.identify.model.terms import Noise, scaled_slopes
 from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.identify.sensors.base import extras
@@ -100,7 +100,9 @@ def sensor_slots(model: Model, sensor_index: int, member: str) -> list[Slot]:
         path, _ = split_path(slot.path)
         return tuple(getattr(key, "name", getattr(key, "idx", None)) for key in path)
 
-    return [slot for slot in model.slots if names(slot) == ("sensors", sensor_index, member)]
+    part = part_of_sensor(model, sensor_index)
+    place = ("sensors", sensor_index - part.first_sensor, member)
+    return [slot for slot in part.model.slots if names(slot) == place]
 
 
 def unit_shifts(

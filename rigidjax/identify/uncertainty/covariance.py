@@ -183,6 +183,12 @@ def linearise(
     return Linearisation(raw=raw, raw_slopes=raw_slopes, mask=mask, **parts)
 
 
+def measured_residuals(model: Model, linear: Linearisation) -> list[tuple[str, float]]:
+    """Return the name and the residual, in standard deviations, of each `Measured` of a `model`."""
+    names = [one.name for one in model.measured]
+    return list(zip(names, linear.extra[len(linear.extra) - len(names) :].tolist(), strict=True))
+
+
 class _Own(NamedTuple):
     """Hold the part of a `Root` for the own parameters of one recording."""
 
@@ -206,7 +212,7 @@ class Root(eqx.Module):
     shared: Int[np.ndarray, " s"]  # the places of the shared parameters among all
     # For each recording the derivatives with respect to the shared parameters that are left after
     # the elimination of its own parameters; the last column holds the residuals.
-    left: tuple[Float[np.ndarray, "p s+1"], ...]
+    left: tuple[Float[np.ndarray, "_ s+1"], ...]
     own: tuple[_Own, ...]
     # Of the residuals of priors of shared parameters, as in `left`.
     ties: Float[np.ndarray, "q s+1"]

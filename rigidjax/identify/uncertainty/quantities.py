@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from rigidjax.identify.model.charts import BASIS, AbstractBodyChart, Ratios, Tensor, body_list
 from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
-from rigidjax.identify.model.model import Model, shortened, values_of
+from rigidjax.identify.model.model import Model, parts_of, shortened, values_of
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 
@@ -115,10 +115,12 @@ def labels(model: Model) -> list[Label]:
     for name, chart in named_charts(model):
         for names, positive in ((chart.log_names, True), (chart.plain_names, False)):
             out += [Label(f"{n}{name}", _UNITS.get(n, chart.unit), positive) for n in names]
-    names = recording_suffixes(model)
-    for where in names if reports_starts(model) else ():
+    for where in starting_suffixes(model):
         out += [Label(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]
+    every = zip(parts_of(model), recording_suffixes(model), strict=True)
+    suffixes = {slot.name: names for part, names in every for slot in part.model.slots}
     for slot in model.slots:
+        names = suffixes[slot.name]
         parts = [""]
         if slot.shape:
             channels = ("fx", "fy", "fz", "tx", "ty", "tz") if slot.shape == (6,) else "xyz"
@@ -147,19 +149,27 @@ def named_charts(model: Model) -> list[NamedChart]:
     return [NamedChart(f" [{name}]" if name else "", chart) for name, chart in named]
 
 
-def recording_suffixes(model: Model) -> list[str]:
-    """Return for each recording the suffix of the names of its quantities.
+def recording_suffixes(model: Model) -> list[list[str]]:
+    """Return for each recording of each kind the suffix of the names of its quantities.
 
-    It has, in brackets, the name of the body, if it has one, and the number of the recording among
-    those of this body; it is empty for a single recording.
+    It has, in brackets, the names of the kind and of the body, if they have one, and the number of
+    the recording among those of both; it is empty for a single recording.
     """
-    if model.count == 1:
-        return [""]
-    out: list[str] = []
-    for index, name in enumerate(model.body_names):
-        number = model.body_names[:index].count(name)
-        out.append(f" [{name} {number}]" if name else f" [{number}]")
+    out = []
+    for part in parts_of(model):
+        bodies, kind = part.model.body_names, []
+        for index, name in enumerate(bodies):
+            number = [] if len(bodies) == 1 else [str(bodies[:index].count(name))]
+            words = " ".join([*filter(None, (part.name, name)), *number])
+            kind.append(f" [{words}]" if words and model.count > 1 else "")
+        out.append(kind)
     return out
+
+
+def starting_suffixes(model: Model) -> list[str]:
+    """Return the suffix of each recording whose initial state a fit reports."""
+    every = zip(parts_of(model), recording_suffixes(model), strict=True)
+    return [one for part, names in every if reports_starts(part.model) for one in names]
 
 
 def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
@@ -169,9 +179,10 @@ def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
     parts, bodies = [jnp.zeros(0, x.dtype)], body_list(model.bodies(x))
     for (_, chart), body in zip(named_charts(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
-    if reports_starts(model):
-        rates = x[model.index.start[:, -3:]] * model.reference.rate[:, None]
-        parts.append(rates.reshape(-1))
+    for part in parts_of(model):
+        if reports_starts(one := part.model):
+            rates = part.take(x)[one.index.start[:, -3:]] * one.reference.rate[:, None]
+            parts.append(rates.reshape(-1))
     values = values_of(model, x)
     for slot in model.slots:
         for name in (slot.name, f"{slot.name}, own")[: 1 + (slot.spread is not None)]:
