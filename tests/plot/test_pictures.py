@@ -178,6 +178,7 @@ def stand_in():
         model=SimpleNamespace(
             recordings=(SimpleNamespace(t=TS, readings=(reading,)),),
             count=1,
+            parts=(),
             unpack=lambda x: SimpleNamespace(body=shaped(x), state0=None),
             bodies=shaped,
         ),
