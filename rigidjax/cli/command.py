@@ -249,7 +249,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "the body, at the origin of its frame and in its axes; finds mass, centre and inertia"),
     "--pose": dict(
         nargs=7, metavar=("X", "Y", "Z", "QW", "QX", "QY", "QZ"),
-        default=["x", "y", "z", "qw", "qx", "qy", "qz"],
         help="with --wrench: columns of the frame's place, m, and attitude, frame to world "
         "(default: x y z qw qx qy qz)"),
     "--motion": dict(
@@ -258,7 +257,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "(without gravity) and of the derivative of the rate, in its own axes (default: from "
         "smoothed poses)"),
     "--gravity": dict(
-        nargs=3, type=float, default=[0.0, 0.0, -9.81], metavar=("GX", "GY", "GZ"),
+        nargs=3, type=float, metavar=("GX", "GY", "GZ"),
         help="with --wrench: gravity in the frame of the poses, m/s² (default: 0 0 -9.81)"),
     "--starts": dict(type=int, help="how many starting points of the fit to try"),
     "--checkpoint": dict(
@@ -349,10 +348,23 @@ def _read_logs(
     """
     if options.columns and options.time:
         raise LogError("--time: not together with --columns, whose first name is the time column")
+    alone = [name for name in ("pose", "motion", "gravity") if getattr(options, name)]
+    if alone and not options.wrench:
+        raise LogError(f"--{alone[0]}: wanted a --wrench beside it, the columns of the readings")
     if options.wrench:
-        how = dict(gravity=options.gravity, time=options.time or "t", window=options.window)
+        others = ("columns", "sensor", "wheel", "unit", "limit", "flight")
+        others = [name for name in others if getattr(options, name)]
+        if others or set(options.free) - {"bias"}:
+            what = f"--{others[0]}" if others else "--free drag, --free delay"
+            raise LogError(f"{what}: not together with --wrench, whose motion is the logged one")
+        how = dict(
+            gravity=options.gravity or [0.0, 0.0, -9.81],
+            time=options.time or "t",
+            window=options.window,
+        )
         how |= dict(time_unit=options.time_unit, noise=options.noise, free=options.free)
-        columns = options.wrench, options.pose, options.motion
+        pose = options.pose or ["x", "y", "z", "qw", "qx", "qy", "qz"]
+        columns = options.wrench, pose, options.motion
         held = [spec.read_held(path, *columns, **how) for path in options.logs]
         return [], held, spec.model_of_held(held, options.free, options.loss)
     wheels = [spec.parse_wheel(text) for text in options.wheel]

@@ -191,10 +191,7 @@ def read_log(
     turning = dict.fromkeys(w.column for w in wheels)
     names = [time, *(c for one in channels for c in one.columns), *turning]
     table = read_table(path, names, flight=flight)
-    # The times are counted from the first time stamp: times since 1970, in seconds or nanoseconds,
-    # are so large that float64 has few digits left for the steps between them.
-    finite = np.flatnonzero(np.isfinite(table[time]))
-    t = (table[time] - (table[time][finite[0]] if finite.size else 0.0)) * UNITS[unit]
+    t = _since_first(table[time]) * UNITS[unit]
     kept = increasing_rows(path, t, time, window)
     # A slice is used if all rows are kept, since indexing with a slice makes no copy of a large
     # log.
@@ -217,6 +214,14 @@ def read_log(
         return Recording(t[kept], *readings, inputs=inputs)
     except ValueError as error:
         raise LogError(f"{path}: {error}") from None
+
+
+def _since_first(t: np.ndarray) -> np.ndarray:
+    """Return the times counted from the first time stamp."""
+    # Times since 1970, in seconds or nanoseconds, are so large that float64 has few digits left for
+    # the steps between them.
+    finite = np.flatnonzero(np.isfinite(t))
+    return t - (t[finite[0]] if finite.size else 0.0)
 
 
 def unit_of_channel(path: str | Path, channel: Channel) -> str:
@@ -301,18 +306,21 @@ def read_held(
 
     The columns of `motion`, if there are any, are rate, acceleration of the origin and dΩ/dt (nine,
     rad and m, in its own axes); without them the poses are smoothed. The `gravity` (3,) is in m/s²,
-    world frame; `noise` is that of force, N, and of torque, N m. **Raises** `LogError` as
-    `read_table`, and for poses or a wrench with gaps.
+    world frame; `noise` is that of force, N, and of torque, N m. The sensor has no reading in a row
+    in which one of its cells is empty; a row without a pose is left out with a warning. **Raises**
+    `LogError` as `read_table`, and for a motion through which no spline goes.
     """
     names = [*pose, *wrench, *motion]
     table = read_table(path, [time, *dict.fromkeys(names)])
-    scale = UNITS[unit_of_time(path, time, time_unit)]
-    finite = np.flatnonzero(np.isfinite(table[time]))
-    t = (table[time] - (table[time][finite[0]] if finite.size else 0.0)) * scale
+    unit = unit_of_time(path, time, time_unit)
+    t = _since_first(table[time]) * UNITS[unit]
     kept = increasing_rows(path, t, time, window)
     t, rows = t[kept], np.stack([table[name] for name in names], axis=1)[kept]
-    whole = np.isfinite(rows).all(axis=1)
-    t, rows = t[whole], rows[whole]
+    posed = np.isfinite(np.delete(rows, np.s_[7:13], axis=1)).all(axis=1)
+    if not posed.all():
+        warn(f"{path}: {(~posed).sum()} rows without a pose or a motion are left out")
+    t, rows = t[posed], rows[posed]
+    warn_of_steps(path, t, unit, 0.0)
     if noise is not None and len(noise) != 2:
         raise LogError("--noise: wanted two numbers with --wrench: of force, N, and torque, N m")
     bias = np.zeros(6) if "bias" in free else None
@@ -324,7 +332,9 @@ def read_held(
             given = LoggedMotion(t, place, turn, *np.split(logged, 3, axis=1))
         else:
             given = LoggedMotion.from_poses(t, place, turn)
-        return Recording(t, (sensor, rows[:, 7:13]), inputs={"motion": given})
+        readings = rows[:, 7:13]
+        mask = np.isfinite(readings).all(axis=1)
+        return Recording(t, (sensor, readings, mask), inputs={"motion": given})
     except ValueError as error:
         raise LogError(f"{path}: {error}") from None
 

@@ -61,6 +61,11 @@ def run_subcommand(options: argparse.Namespace, parser: argparse.ArgumentParser)
     for name in (*_NEEDED[kind], "period"):
         if given[name] is None:
             parser.error(f"swing: --suspension {kind} needs --{name}")
+    strings = ("radius_above",) if kind in ("bifilar", "trifilar") else ()
+    weight = ("gravity",) if kind != "torsion" else ()
+    read = {*_NEEDED[kind], "period", "amplitude", *strings, *weight}
+    if spare := [name for name, value in given.items() if value is not None and name not in read]:
+        parser.error(f"swing: --suspension {kind} does not read --{spare[0].replace('_', '-')}")
     usual = dict(amplitude=0.0, gravity=9.80665, radius_above=given["radius"])
     numbers = {k: usual.get(k) if v is None else v for k, v in given.items()}
     numbers = {k: jnp.asarray(v) for k, v in numbers.items() if v is not None}

@@ -68,14 +68,16 @@ class AbstractSuspension(eqx.Module):
       which gets the state that the method `state` returns; or `None`. It has no states of its own.
 
     and these methods: `moment`, `potential`, `place`, `period`; `swing(body, start)` returns the
-    motion in closed form (see `closed_form`). A suspension that may end a run has two more, as a
-    scene of a `Point` has: `ends(t, turn, body)` and `end_words(t, turn)`.
+    motion in closed form, or `None` if the class has `solvable = False`. A suspension that may end
+    a run has two more, as a scene of a `Point` has: `ends(t, turn, body)` and `end_words(t, turn)`.
 
     >>> isinstance(rj.suspensions.TorsionBar([0.0, 0.0, 1.0], 0.4), AbstractSuspension)
     True
     """
 
     bodies: ClassVar[tuple[type, ...]] = (MassProperties,)
+    # Whether the free motion is known in closed form; if not, `swing` returns `None`.
+    solvable: ClassVar[bool] = True
     axis: eqx.AbstractVar[Float[Array, "3"]]
 
     __repr__ = _show.fields_as_text
@@ -116,7 +118,7 @@ class AbstractSuspension(eqx.Module):
     def closed_form(self) -> bool:
         """Return whether the motion is known in closed form."""
         law: Any = self
-        return law.friction is None and law.torque is None
+        return self.solvable and law.friction is None and law.torque is None
 
     @property
     def unit(self) -> Vec3:

@@ -1,7 +1,7 @@
 """Hang a body on two or more strings: a bifilar or trifilar pendulum."""
 
 import math
-from typing import Any, NoReturn
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -54,6 +54,7 @@ class Strings(AbstractSuspension):
     1.0075
     """
 
+    solvable: ClassVar[bool] = False
     number: int = eqx.field(static=True, converter=lambda n: _checks.integer(n, "number", 2))
     radius_above: Float[Array, ""] = eqx.field(converter=base.positive_converter("radius_above"))
     radius_below: Float[Array, ""] = eqx.field(converter=base.positive_converter("radius_below"))
@@ -75,12 +76,8 @@ class Strings(AbstractSuspension):
                 f"{float(self.length):.6g}"
             )
 
-    @property
-    def closed_form(self) -> bool:
-        return False
-
-    def swing(self, body: Body, start: Turn) -> NoReturn:
-        raise NotImplementedError("Strings: no closed form is known")
+    def swing(self, body: Body, start: Turn) -> None:
+        """Return nothing: no closed form is known."""
 
     def height(self, angle: ScalarLike) -> Scalar:
         """Return the height h(γ), m, of the upper ends above the lower ones; NaN where no strings

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.cli import command
+from rigidjax.cli import command, spec
+from rigidjax.cli.logs.errors import LogWarning
 from rigidjax.identify.data.stacking import pad_to_few
 from rigidjax.motion.torques import Carried, LoggedMotion
 
@@ -226,9 +227,35 @@ def test_the_command_line_reads_poses_and_a_wrench(tmp_path, monkeypatch, capsys
     assert (tmp_path / "tool.png").stat().st_size > 10_000
 
 
+def test_rows_with_empty_cells_are_gaps(tmp_path):
+    rows = np.column_stack([T, X, Q, wrench_of(TOOL)])
+    rows[40, 9] = np.nan  # of the wrench
+    rows[70, 2] = np.nan  # of the pose
+    names = "t,x,y,z,qw,qx,qy,qz,fx,fy,fz,tx,ty,tz"
+    np.savetxt(tmp_path / "tool.csv", rows, delimiter=",", header=names, comments="", fmt="%.10g")
+    text = (tmp_path / "tool.csv").read_text()
+    (tmp_path / "tool.csv").write_text(text.replace("nan", ""))
+    columns = ["fx", "fy", "fz", "tx", "ty", "tz"], ["x", "y", "z", "qw", "qx", "qy", "qz"]
+    with pytest.warns(LogWarning, match="1 rows without a pose"):
+        record = spec.read_held(tmp_path / "tool.csv", *columns, gravity=G)
+    assert record.t.shape == (T.size - 2,)  # a time at which nothing was read is dropped
+    assert record.readings[0].mask.all()
+    np.testing.assert_allclose(record.t[69], T[71], rtol=0, atol=1e-12)
+
+
+def test_poses_without_a_wrench_are_refused(capsys):
+    assert command.main(["identify", "tool.csv", "--gravity", "0", "0", "9.81", "--no-cache"]) == 2
+    assert "--gravity: wanted a --wrench" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("more", "words"),
-    [(["--noise", "0.1"], "two numbers"), (["--pose", *"abcdefg"], "no column")],
+    [
+        (["--noise", "0.1"], "two numbers"),
+        (["--pose", *"abcdefg"], "no column"),
+        (["--unit", "deg/s"], "--unit: not together with --wrench"),
+        (["--free", "drag"], "--free drag"),
+    ],
 )
 def test_mistakes_on_the_command_line_are_answered(more, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -69,7 +69,7 @@ def test_at_the_samples_a_log_is_what_it_says(logged):
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_the_ends_have_velocities_and_accelerations(logged, dtype):
-    # (6.0 - 0.0) / (6.0 / 600) is 600.0000000000001: no sample beyond the end.
+    # At the last sample round-off must not decide on which side of the end the time is.
     for motion in logged:
         ends = jnp.asarray([0.0, 4.0, 4.1], dtype)
         now = jax.jit(jax.vmap(motion))(ends)

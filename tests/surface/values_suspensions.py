@@ -121,7 +121,6 @@ leave_out(
 leave_out(
     "a truth value, words, or an error: tests/suspensions",
     "motion.AbstractSuspension.closed_form", "motion.AbstractSuspension.require_body",
-    "suspensions.Strings.closed_form",
     "suspensions.Strings.swing", "suspensions.Strings.ends", "suspensions.Strings.end_words",
 )  # fmt: skip
 leave_out("abstract", "motion.AbstractSuspension")

@@ -7,7 +7,7 @@ from jaxtyping import Array
 from rigidjax.body.inertia import MassProperties
 from rigidjax.motion import Rigid
 from rigidjax.motion.torques import Carried
-from rigidjax.motion.torques.carried import Kinematics, centripetal
+from rigidjax.motion.torques.carried import Kinematics, relative_acceleration
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross
 
@@ -29,5 +29,6 @@ class CarriedMotion(eqx.Module):
     def field(self, t: Array, state: Rigid, args: object = None) -> Rigid:
         """Return the logged time derivative of the state, for which I⁻¹ is not needed."""
         now: Kinematics = self.torque.motion(t)
-        a = now.a + quaternion.rotate(now.q, centripetal(now, self.body.com))
+        moved = relative_acceleration(now.omega, now.alpha, self.body.com)
+        a = now.a + quaternion.rotate(now.q, moved)
         return Rigid(state.v, a, quaternion.rate(state.q, state.omega), now.alpha)

@@ -11,8 +11,9 @@ from rigidjax._types import HasAttitude, HasPose, HasSpin, Vec3
 from rigidjax.identify.sensors import base
 from rigidjax.identify.sensors.base import ClockedSensor, SensorInput
 from rigidjax.identify.sensors.tolerance import Tolerance, tolerance_of
+from rigidjax.motion.torques.carried import relative_acceleration
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.linalg3 import apply, cross
+from rigidjax.rotation.linalg3 import apply
 
 
 class VectorSensor(ClockedSensor):
@@ -121,7 +122,7 @@ def specific_force(motion: SensorInput, place: Vec3, gravity: Vec3 | None) -> Ve
     """
     state, rate = motion.state, motion.rate
     r = motion.lever(place)
-    force = cross(rate.omega, r) + cross(state.omega, cross(state.omega, r))
+    force = relative_acceleration(state.omega, rate.omega, r)
     if gravity is None:
         return force
     acceleration = rate.v if isinstance(state, HasPose) else 0.0
