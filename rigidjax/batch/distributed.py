@@ -139,7 +139,7 @@ def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyT
 
 
 def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
-    """Write the arrays of `tree`, which this process has computed, to a file in `folder`.
+    """Write the share of this process alone, the arrays of `tree`, to a file in `folder`.
 
     The file is `folder/share-<process>.npz`, where `<process>` is the index of this process, from
     0. The file appears only when it is complete. **Returns** the path of the file.

@@ -268,7 +268,7 @@ def checked_steps(step_size: ScalarLike, num_steps: int, dtype: np.dtype) -> tup
     h = _checks.array_of_shape(step_size, (), "step_size").astype(dtype)
     if _checks.is_known(h) and not 0 < float(h) < np.inf:
         raise ValueError(
-            f"step_size: wanted a positive step, s, got {step_size}; to go back in time negate Ω "
-            "and the time of the torque"
+            f"step_size: wanted a positive step, s, got {step_size}; to run backwards, start "
+            "with −Ω and give a torque that is evaluated at −t"
         )
     return h, _checks.integer(num_steps, "num_steps", 1)

@@ -127,8 +127,8 @@ def _eigensystem_jvp(
 
 
 def _jacobi_sweep(_: Array | int, state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-    """Apply three Jacobi rotations, of which each makes one entry off the diagonal zero, to the
-    diagonal, the entries (2, 3), (1, 3) and (1, 2), and the axes.
+    """Turn a matrix and its axes by three Jacobi rotations, each of which makes one off-diagonal
+    entry zero; `state` is the diagonal, the entries (2, 3), (1, 3), (1, 2), and the axes.
     """
     values, opposite, axes = map(list, state)
     for k in range(3):

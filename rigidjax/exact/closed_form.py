@@ -78,10 +78,10 @@ class ReducedTime(NamedTuple):
 
 
 def reduce_time(u: Scalar, half_period: Scalar, modulus: Modulus) -> ReducedTime:
-    """Return the time u less a whole number of half periods.
+    """Return the `ReducedTime` of a time u.
 
     On the separatrix the half period is infinite, and the body ends in a steady spin about its
-    middle axis: a time within this spin is replaced by the time at which the spin begins.
+    middle axis: in `near`, a time within this spin is replaced by the time at which it begins.
     """
     count = jnp.round(u / half_period)
     rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half_period)

@@ -143,7 +143,9 @@ class Inputs(NamedTuple):
 def _inputs(
     primals: tuple[SymmetricEntries, Triple, Scalar], tangents: tuple[PyTree, ...]
 ) -> Inputs:
-    """Return the variables of the derivatives and their tangents from the inertia, Π(0) and t."""
+    """Return the inverse inertia, the ten variables, and the tangents of both, from the inertia,
+    Π(0) and t and their tangents.
+    """
     inverse, change = jax.jvp(inverted, primals[:2], tangents[:2])
     variables = ten_variables(inverse, *primals[1:])
     return Inputs(inverse, change, variables, ten_variables(change, *tangents[1:]))

@@ -117,13 +117,13 @@ class Instant(eqx.Module):
 
         - `x`, `v`: the position (3,), m, and the velocity (3,), m/s, of a particle in S'
         """
-        turning = turning_acceleration(self, x, v)
+        turning = fictitious_of_rotation(self, x, v)
         return turning + self.translational_acceleration().astype(turning.dtype)
 
 
-def turning_acceleration(instant: Instant, x: Vector, v: Vector) -> Vec3:
-    """Return the sum of the centrifugal, Coriolis and Euler accelerations, m/s², in the axes of a
-    moving frame S'; it does not depend on the rotation matrix of S'.
+def fictitious_of_rotation(instant: Instant, x: Vector, v: Vector) -> Vec3:
+    """Return the acceleration −Ω × (Ω × x) − 2 Ω × v − dΩ/dt × x, m/s², in the axes of a moving
+    frame S'; it does not depend on the rotation matrix of S'.
     """
     x, v = _checks.array_of_shape(x, (3,), "x"), _checks.array_of_shape(v, (3,), "v")
     return instant.centrifugal(x) + instant.coriolis(v) + instant.euler_acceleration(x)

@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 from rigidjax import _checks, _show
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.frames import rotation_models
-from rigidjax.frames.frame_kinematics import Instant, turning_acceleration
+from rigidjax.frames.frame_kinematics import Instant, fictitious_of_rotation
 from rigidjax.frames.point import require_point
 from rigidjax.rotation import linalg3
 
@@ -269,7 +269,7 @@ def fictitious_acceleration(frame: MovingFrame, instant: Instant, x: Vector, v: 
     has an `origin`.
     """
     if frame.origin is None:
-        return turning_acceleration(instant, x, v)
+        return fictitious_of_rotation(instant, x, v)
     return instant.fictitious(x, v)
 
 

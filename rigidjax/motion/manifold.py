@@ -132,8 +132,8 @@ def _moved(
     of_quaternion: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> PyTree:
-    """Return a pytree like `state`: one function of the leaf and its change for quaternions (and
-    rotation vectors), another for all other leaves.
+    """Return the pytree `state` with each quaternion replaced by `of_quaternion(leaf, part)`, each
+    other leaf by `of_others(leaf, part)`; `part` is the leaf's part of the vector `change`.
     """
     (leaves, tree), out = jax.tree.flatten(state), []
     for leaf, place, turned in zip(leaves, _slices(state), _are_rotations(state), strict=True):
@@ -148,8 +148,8 @@ def _vector(
     of_quaternions: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> Array:
-    """Return one vector from pairs of leaves: one function for pairs with a quaternion in `second`,
-    which gives three numbers, another for all other pairs.
+    """Return one vector of `of_quaternions(a, b)`, three numbers, for each pair of leaves with a
+    quaternion b in `second`, and of `of_others(a, b)` for each other pair.
     """
     pairs = zip(
         jax.tree.leaves(first), jax.tree.leaves(second), _are_rotations(second), strict=True

@@ -303,7 +303,7 @@ class _Solid(NamedTuple):
 
     polygons: np.ndarray  # (m, k, 3)
     sides: np.ndarray  # (m,) which of the colours `SHADES` is nearest
-    colours: np.ndarray  # (m, 3)
+    colours: np.ndarray  # (m, 3) one RGB colour for each polygon
     tip: np.ndarray  # (3,) the end of the longest axis
     reach: float  # the largest distance of a corner from the origin
 
@@ -372,7 +372,7 @@ def equal_box(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
     size = np.sqrt(np.maximum(np.asarray(second, dtype=float), 0.0))
     if not size.max() > 0:
         raise ValueError(
-            "body: wanted a body with an extension, got one whose second moment of mass is zero "
+            "body: wanted a body of non-zero size, got one whose second moment of mass is zero "
             "(a point), which has no box"
         )
     if isinstance(body, MassProperties):

@@ -43,7 +43,7 @@ def inertia_ellipsoid(
     size = 1.0 if solid else float(np.trace(np.asarray(best.second_moment)))
     if not size > 0:
         raise ValueError(
-            "body: wanted a body with an extension, got one whose second moment of mass is zero "
+            "body: wanted a body of non-zero size, got one whose second moment of mass is zero "
             "(a point), which has no ellipsoid"
         )
     shapes = {"body": np.asarray(_matrix(best))[None] / size}

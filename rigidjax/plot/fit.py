@@ -56,7 +56,11 @@ def fit(
     size, how = (max(6.2 * count, 7.5), 6), dict(squeeze=False, layout="constrained")
     figure, axes = plt.subplots(2, count, figsize=size, sharex=True, height_ratios=(2, 1), **how)
     dense, model, body, state0 = None, fit_result.model, fit_result.body, fit_result.state0
-    for part in (part for part in model.parts if part.rows.start <= index < part.rows.stop):
+    for part in (
+        part
+        for part in model.parts
+        if part.recordings_slice.start <= index < part.recordings_slice.stop
+    ):
         model, state0, index = part.model, state0[part.name], index - part.first
     # For a free body and few readings the line between the readings is made smooth.
     if model.torque is None and record.t.shape[0] <= 300:

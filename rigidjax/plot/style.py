@@ -63,7 +63,9 @@ def residuals_of(fit_result: Any, index: object) -> Residuals:
         raise ValueError(f"index: wanted one of {count} recordings, from 0, got {index}")
     record, which = fit_result.model.recordings[index], ... if count == 1 else index
     parts = fit_result.model.parts
-    mine = next((part.sensors for part in parts if index < part.rows.stop), slice(None))
+    mine = next(
+        (part.sensors_slice for part in parts if index < part.recordings_slice.stop), slice(None)
+    )
     errors = [np.asarray(e[which])[: record.t.shape[0]] for e in fit_result.residuals[mine]]
     noises = [
         np.hypot(noise[which], 0.0 if one.jitter_error is None else one.jitter_error)
@@ -99,7 +101,7 @@ def axes_2d_or_new(ax: Any, **options: Any) -> Any:
 
 
 def axes_3d_or_new(ax: Any) -> Any:
-    """Return `ax`, or new 3-D axes; raise `TypeError` for flat ones."""
+    """Return `ax`, or new 3-D axes if it is `None`; raise `TypeError` for flat ones."""
     if ax is None:
         figure = pyplot().figure(layout="constrained", figsize=(6.0, 5.6))
         return figure.add_subplot(projection="3d")
@@ -109,8 +111,8 @@ def axes_3d_or_new(ax: Any) -> Any:
 
 
 def axes_of_shape(ax: Any, shape: tuple[int, ...], **options: Any) -> Any:
-    """Return `ax` as an array of axes of this shape, or new axes; raise `ValueError` for another
-    shape.
+    """Return `ax` as an array of axes of this shape, or new axes if it is `None`; raise
+    `ValueError` for another shape.
     """
     if ax is None:
         ax = np.reshape(pyplot().subplots(layout="constrained", **options)[1], shape)

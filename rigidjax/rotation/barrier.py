@@ -52,8 +52,8 @@ def set_xla_flags() -> None:
 
 @functools.cache
 def warn_of_slow_loops() -> None:
-    """Warn once a process if XLA on CPU makes many small kernels of a loop, by its default before
-    JAX 0.11.
+    """Warn, once in a process, if XLA on CPU will split a loop into many small kernels, as it does
+    by default before JAX 0.11.
     """
     flagged = _LOOPS in os.environ.get("XLA_FLAGS", "")
     if jax.__version_info__ < (0, 11) and not flagged and platform() == "cpu":

@@ -130,12 +130,14 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
 
 
 def _between(a: Mat3, b: Mat3) -> Mat3:
-    """Return aᵀb, or raise a `ValueError` if it is known and not finite or far from a rotation."""
+    """Return aᵀb; raise a `ValueError` if JAX does not trace it and it is not finite or far from a
+    rotation.
+    """
     between = product(a.T, b)
     if _checks.is_known(between):
         _checks.require_finite(between, "aᵀb")
         large = jnp.abs(between).max() > 2
-        _checks.error_if(between, large, "aᵀb: wanted rotations a and b, got entries above 1")
+        _checks.error_if(between, large, "aᵀb: wanted rotations a and b, got entries above 2")
     return between
 
 

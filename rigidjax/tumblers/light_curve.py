@@ -236,7 +236,7 @@ def _require_one_brightness(model: Model) -> Reading:
 
 
 class Nature(NamedTuple):
-    """Hold what tells one free motion from another."""
+    """Hold numbers that differ between free motions: periods, moment ratios and energy."""
 
     logarithms: Float[Array, "4"]  # of both periods, s, and of the ratios of `Alias`
     energy: Scalar  # h²/2T over the middle moment, below 1 in the long-axis mode
@@ -244,7 +244,7 @@ class Nature(NamedTuple):
 
 @eqx.filter_jit
 def _nature(x: Float[Array, " n"], model: Model) -> Nature:
-    """Return what tells the motion with the parameters x from another."""
+    """Return the `Nature` of the motion with the parameters x."""
     body: Any = model.bodies(x)
     inertia = Inertia(tensor_of(body))
     omega = x[model.index.start[0, -3:]] * model.reference.rate[0]

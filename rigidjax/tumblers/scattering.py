@@ -166,7 +166,9 @@ class Facing(NamedTuple):
 
 
 def _facing(shape: Mat3, sun: Vec3, observer: Vec3) -> Facing:
-    """Return these scalars without a loss of digits, whatever the angle of the unit vectors."""
+    """Return the `Facing` of an ellipsoid, without a loss of digits at any angle between the unit
+    vectors `sun` and `observer`.
+    """
     minors = cofactors(shape)
     of_sun, turned = apply(minors, sun), cross(sun, observer)
     pq = dot(observer, of_sun)

@@ -86,7 +86,7 @@ def starts_of_pairs(
     best_of, others = [], []
     for pair in pairs:
         for mode in starts.MODES:
-            candidates = starts.candidates(pair, mode, light, middle, areas, 3)
+            candidates = starts.best_candidates(pair, mode, light, middle, areas, 3)
             # `best_of` gets the starts of the best body for this pair and this mode, and `others`
             # the starts of the other bodies. All starts of `best_of` are used, those of `others`
             # only to fill the last chunk, since χ² on a grid cannot decide between pairs and

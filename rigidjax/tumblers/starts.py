@@ -58,13 +58,13 @@ class GridMotions(NamedTuple):
     omega: Float[Array, "bodies phases 3"]  # the initial rate, rad/s, principal axes
 
 
-def candidates(
+def best_candidates(
     pair: Float[np.ndarray, "2"],
     mode: str,
     light: Light,
     bisector: Float[np.ndarray, "3"],
     areas: Float[np.ndarray, "3"] | None,
-    count: int,
+    body_count: int,
 ) -> list[Candidate]:
     """Return the best motions on a grid of bodies and phases that have a given pair of frequencies,
     the smallest χ² first, for `count` bodies of the grid.
@@ -91,7 +91,7 @@ def candidates(
     # Each body is used with the phase of its smallest χ².
     phase, least = chi2.argmin(axis=1), chi2.min(axis=1)
     out = []
-    for k in np.argsort(least)[:count]:
+    for k in np.argsort(least)[:body_count]:
         if not np.isfinite(least[k]):
             continue
         at = k, phase[k]

@@ -1,6 +1,7 @@
 """Find pairs of frequencies whose Fourier series fit a light curve best."""
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -171,7 +172,7 @@ def two_frequencies(
     pairs = np.concatenate(rows)
     pairs = pairs[(pairs[:, 1] > 0.5) & (pairs[:, 1] < highest)]
     misfits = chi2_of_pairs(table, pairs, order)
-    pairs, misfits = refined(table, pairs[distinct(pairs, misfits, count * TRIED)], order)
+    pairs, misfits = lower_chi2(table, pairs[distinct(pairs, misfits, count * TRIED)], order)
     pairs, misfits = with_aliases(table, pairs, misfits, highest, order)
     keep = distinct(pairs, misfits, count)
     dof = t.size - unknowns
@@ -244,11 +245,18 @@ def aliases_of(
     return np.abs(np.concatenate(rows).reshape(-1, 2))
 
 
+class Pairs(NamedTuple):
+    """Hold pairs of frequencies, 1/span, and χ² of each."""
+
+    frequencies: np.ndarray  # (n, 2)
+    chi2: np.ndarray  # (n,)
+
+
 def with_aliases(
     table: Sums, pairs: np.ndarray, misfits: np.ndarray, highest: float, order: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pairs of frequencies together with aliases of the best pairs up to `highest`,
-    1/span, and χ² of all, after rounds that end when no alias is better than the best pair.
+) -> Pairs:
+    """Add the aliases of the best `pairs` up to the frequency `highest`, 1/span, in rounds that end
+    when no alias is better than the best pair.
     """
     peaks = highest_side_peaks(table, highest)
     for _ in range(ROUNDS):
@@ -258,12 +266,12 @@ def with_aliases(
         if not len(more):
             break
         best = distinct(more, chi2_of_pairs(table, more, order), 2 * SEEDS)
-        more, new = refined(table, more[best], order)
+        more, new = lower_chi2(table, more[best], order)
         before = misfits.min()
         pairs, misfits = np.concatenate([pairs, more]), np.concatenate([misfits, new])
         if not new.min() < before * (1 - 1e-3):
             break
-    return pairs, misfits
+    return Pairs(pairs, misfits)
 
 
 def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
@@ -279,11 +287,11 @@ def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
     return chosen
 
 
-def refined(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pairs of frequencies, each moved towards a minimum of χ², and χ² there.
+def lower_chi2(table: Sums, pairs: np.ndarray, order: int) -> Pairs:
+    """Return the pairs of frequencies, each moved nine times to the best of its neighbours on a
+    square grid.
 
-    Each pair moves nine times, to the best of its neighbours on a square grid. Where no neighbour
-    has a lower χ², the pair stays and its grid becomes finer.
+    Where no neighbour has a lower χ², the pair stays and its grid becomes finer.
     """
     size = np.full(len(pairs), 0.08)
     least = np.full(len(pairs), np.inf)
@@ -294,4 +302,4 @@ def refined(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.
         best, least = misfits.argmin(axis=1), misfits.min(axis=1)
         pairs = pairs + size[:, None] * AROUND[best]
         size = np.where(best == 4, 0.4 * size, size)
-    return pairs, least
+    return Pairs(pairs, least)

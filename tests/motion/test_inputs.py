@@ -59,7 +59,7 @@ def test_by_attitude_by_magnus_and_by_sensitivity():
         ({"inputs": None}, ValueError, "inputs: the torque reads 'u', got none"),
         ({"inputs": {"v": RAMP}}, ValueError, "the torque reads 'u', got 'v'"),
         ({"inputs": {"u": RAMP, "v": RAMP}}, ValueError, "the torque reads 'u', got 'u', 'v'"),
-        ({"inputs": [RAMP]}, TypeError, "wanted arrays by name, got list"),
+        ({"inputs": [RAMP]}, TypeError, "wanted a mapping from names to arrays, .* got list"),
         (
             {"inputs": {"u": RAMP[:, :-1]}},
             ValueError,

@@ -220,9 +220,9 @@ def _first_motion(recording: Recording) -> _Motion:
         mask = np.all([r.host_mask for r in ranges], axis=0)
         stations = np.stack([np.asarray(r.sensor.station) for r in ranges])
         lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[mask]
-        # For each station s the distance d obeys |x|² − 2 s·x + |s|² = d². Less the mean over the
-        # stations the equation is linear in x. A component of x that the stations do not determine,
-        # as in one plane, is taken from their mean position.
+        # For each station s the distance d obeys |x|² − 2 s·x + |s|² = d². If the mean over the
+        # stations is subtracted, |x|² cancels, and the equation is linear in x. A component of x
+        # that the stations do not determine, as in one plane, is taken from their mean position.
         centre = stations.mean(axis=0)
         s = stations - centre
         sides = (s * s).sum(axis=1)[None] - lengths**2

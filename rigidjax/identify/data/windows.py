@@ -251,7 +251,10 @@ def windows(
             f"t: wanted at least length + 1 = {length + 1} times (T,), got shape {times.shape}"
         )
     if not isinstance(inputs, Mapping | None):
-        raise TypeError(f"inputs: wanted arrays by name, got {type(inputs).__name__}")
+        raise TypeError(
+            "inputs: wanted a mapping from names to arrays, such as {'u': array}, got "
+            f"{type(inputs).__name__}"
+        )
     inputs = {k: _checks.without_mask(v, f"inputs[{k!r}]") for k, v in (inputs or {}).items()}
     step, broken = _sampling(times, states, inputs)
     begin = np.arange(before, times.size - length, stride)

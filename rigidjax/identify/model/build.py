@@ -274,7 +274,9 @@ def _windowed(
 
 
 def _held(integrator: AbstractIntegrator | None) -> HeldSteps:
-    """Return the integrator for samples as inputs, the only one that an argument may give."""
+    """Return `HeldSteps`, the only integrator for inputs given as samples; raise `ValueError` if
+    `integrator` is neither `None` nor a `HeldSteps`.
+    """
     if integrator is not None and not isinstance(integrator, HeldSteps):
         raise ValueError(
             "integrator: samples as inputs are held through one step from each time to the "

@@ -380,9 +380,9 @@ def _pad_with_zeros(
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(leading, trailing)])
 
 
-def marked_body(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
-    """Return the body that `vector` represents, marked `scale="arbitrary"` if the chart finds no
-    scale.
+def body_with_scale_mark(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
+    """Return the body that `vector` represents; an `Inertia` gets the `scale` of the chart, such as
+    "arbitrary".
 
     Inside a fit bodies have no such mark, with which a torque is refused.
     """
@@ -398,9 +398,8 @@ Charts = tuple[AbstractBodyChart, ...]
 def body_places(
     charts: Charts, body_indices: Int[Array, " records"] | None, recording_count: int
 ) -> Int[np.ndarray, "records numbers"]:
-    """Return the places of the parameters of each recording's body among those of all bodies.
-
-    The row of a body with fewer parameters than another is filled up with −1.
+    """Return the places of the parameters of each recording's body among those of all bodies (−1:
+    the body has fewer parameters than another).
     """
     widest, size = max(one.size for one in charts), sum(one.size for one in charts)
     parts = split_numbers(charts, np.arange(size))

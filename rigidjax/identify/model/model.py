@@ -23,7 +23,7 @@ from rigidjax.identify.model.charts import (
     AbstractBodyChart,
     Charts,
     body_at,
-    marked_body,
+    body_with_scale_mark,
     split_numbers,
 )
 from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
@@ -315,7 +315,7 @@ class Model(eqx.Module):
         name → body.
         """
         parts = split_numbers(self.charts, x[: self.index.bodies])
-        bodies = map(marked_body, self.charts, parts)
+        bodies = map(body_with_scale_mark, self.charts, parts)
         if self.body_indices is None:
             return next(bodies)
         return dict(zip(dict.fromkeys(self.body_names), bodies, strict=True))
@@ -402,7 +402,7 @@ def parts_of(model: Model) -> tuple[Part, ...]:
 
 def part_of_sensor(model: Model, index: int) -> Part:
     """Return the part of a `model` with the sensor of this `index` among all."""
-    return next(part for part in parts_of(model) if index < part.sensors.stop)
+    return next(part for part in parts_of(model) if index < part.sensors_slice.stop)
 
 
 def padded(model: Model, arrays: Sequence[Array | np.ndarray]) -> tuple[Any, ...]:
@@ -414,7 +414,7 @@ def padded(model: Model, arrays: Sequence[Array | np.ndarray]) -> tuple[Any, ...
     (count, times), columns = model.records.t.shape, model.index.places.shape[1]
     out, xp = [], np if _checks.is_known(arrays) else jnp
     for part in model.parts:
-        for one in arrays[part.sensors]:
+        for one in arrays[part.sensors_slice]:
             ends = (count, times, one.shape[2], columns)[: one.ndim]
             before = (part.first, 0, 0, 0)[: one.ndim]
             widths = [(b, e - b - n) for b, e, n in zip(before, ends, one.shape, strict=True)]

@@ -267,7 +267,9 @@ def needed_body(body: Body, state_type: type) -> Body:
 
 
 class Along(NamedTuple):
-    """Hold the times at which a sensor reads, and its inputs along a motion."""
+    """Hold the times at which a sensor reads, the states at these times, and the function (time,
+    state) → `SensorInput`.
+    """
 
     # In s, after the clock offset.
     times: Float[Array, " times"]

@@ -28,13 +28,13 @@ class Part(eqx.Module):
     first_sensor: int = eqx.field(static=True)
 
     @property
-    def rows(self) -> slice:
-        """Return the recordings of this part among all."""
+    def recordings_slice(self) -> slice:
+        """Return where the recordings of this part stand among all."""
         return slice(self.first, self.first + self.model.records.t.shape[0])
 
     @property
-    def sensors(self) -> slice:
-        """Return the sensors of this part among all."""
+    def sensors_slice(self) -> slice:
+        """Return where the sensors of this part stand among all."""
         return slice(self.first_sensor, self.first_sensor + len(self.model.records.readings))
 
     def take(self, x: Any) -> Any:
@@ -84,7 +84,7 @@ def fields_of_several(models: Mapping[str, Any], **arguments: Any) -> dict[str, 
             moved = dataclasses.replace(slot, shared=shared, own=own)
             slots.setdefault(slot.name, (moved, model))
         parts.append(Part(kind, model, jnp.asarray(mine, jnp.int32), first, first_sensor))
-        first, first_sensor = parts[-1].rows.stop, parts[-1].sensors.stop
+        first, first_sensor = parts[-1].recordings_slice.stop, parts[-1].sensors_slice.stop
     indices = [names.index(name) for name in body_names]
     priors = [model.prior for model in kinds if model.prior is not None]
     if len(priors) > 1 or not all(eqx.tree_equal(one.loss, kinds[0].loss) for one in kinds):

@@ -187,8 +187,11 @@ class _Kind(NamedTuple):
 
 def _kind(model: Model, part: Part, noise: Noise, weights: Float[Array, "records times"]) -> _Kind:
     """Return what a search reads of one `part` of a `model`."""
-    one, places = dataclasses.replace(part.model, loss=model.loss), model.index.places[part.rows]
-    weights = weights[part.rows, : one.records.t.shape[1]]
+    one, places = (
+        dataclasses.replace(part.model, loss=model.loss),
+        model.index.places[part.recordings_slice],
+    )
+    weights = weights[part.recordings_slice, : one.records.t.shape[1]]
     if isinstance(one.integrator, FixedSteps | HeldSteps):
         counts = jnp.any(weights > 0, axis=0)
         place = jnp.arange(counts.size, dtype=jnp.int32)
@@ -197,7 +200,7 @@ def _kind(model: Model, part: Part, noise: Noise, weights: Float[Array, "records
             lambda s: s.last, one.integrator, last, is_leaf=lambda node: node is None
         )
         one = eqx.tree_at(lambda m: m.integrator, one, shorter)
-    sigma = tuple(each[part.rows] for each in noise[part.sensors])
+    sigma = tuple(each[part.recordings_slice] for each in noise[part.sensors_slice])
     return _Kind(part, one, places[:, : one.index.places.shape[1]], sigma, weights)
 
 
@@ -279,7 +282,7 @@ def _take_steps(
     return marquardt(task.model, x, task.noise, weights, settings)
 
 
-def _evaluate(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
+def _evaluate_all_readings(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
     """Return the state of a search that evaluates the cost of all readings and takes no step.
 
     It uses the compiled program of the search.
@@ -296,12 +299,12 @@ def blocks_at(model: Model, x: Float[Array, " n"]) -> Blocks:
     """Return what `terms.error_jacobians` returns, by the compiled program of the search."""
     kind, sensors = model.records.t.dtype, model.records.sensors
     ones = (np.ones((model.count, sensor.components), kind) for sensor in sensors)
-    return _blocks(_evaluate(model, x, tuple(map(jnp.asarray, ones))), model)
+    return _blocks(_evaluate_all_readings(model, x, tuple(map(jnp.asarray, ones))), model)
 
 
 def cost_of(model: Model, x: Float[Array, " n"], noise: Noise) -> float:
     """Return the cost of a `model` over the whole of its records."""
-    return float(_evaluate(model, x, noise).cost)
+    return float(_evaluate_all_readings(model, x, noise).cost)
 
 
 def search_whole(

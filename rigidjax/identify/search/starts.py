@@ -257,6 +257,8 @@ def integrated_euler(
 def _torques(
     torque: Torque, t: Float[ArrayLike, " n"], w: Float[ArrayLike, "n 3"]
 ) -> Float[Array, "n 3"]:
-    """Return the values of a `torque` that reads no body: one of unit inertia takes its place."""
+    """Return the values, N m, at the times t, s, and the rates w, rad/s, of a `torque` that does
+    not read the body: one of unit inertia takes its place.
+    """
     body = Inertia(jnp.eye(3))
     return jax.vmap(lambda time, omega: evaluate_torque(torque, time, Spin(omega), body))(t, w)

@@ -294,7 +294,10 @@ def require_inputs(torque: PyTree, inputs: object) -> Mapping[str, Any]:
     """
     read, mapping = input_names_of(torque), {} if inputs is None else inputs
     if not isinstance(mapping, Mapping):
-        raise TypeError(f"inputs: wanted arrays by name, got {type(mapping).__name__}")
+        raise TypeError(
+            "inputs: wanted a mapping from names to arrays, such as {'u': array}, got "
+            f"{type(mapping).__name__}"
+        )
     if set(read) != set(mapping):
         raise ValueError(
             f"inputs: the torque reads {', '.join(map(repr, read)) or 'none'}, got "

@@ -19,9 +19,9 @@ from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
 
-# The longest step from x to one of the two points, relative to each number of x, for numbers of 8
-# and of 4 bytes. It is half of the error of |q| up to which a quaternion q is accepted as a unit
-# quaternion, so that a quaternion in x stays acceptable.
+# The step from x to each of the two points of the difference is at most this fraction of each
+# number of x, for float64 and for float32. It is half of the error of |q| up to which a quaternion
+# q is accepted as a unit quaternion, so that a quaternion in x stays acceptable.
 _STEP = {8: 5e-7, 4: 5e-4}
 # The value of the function may happen to be zero at x, and then does not show its usual size. The
 # size is therefore taken to be at least this fraction of the change of the value when each number
@@ -128,23 +128,15 @@ def values_at_two_points(
 
 
 @jax.jit
-def slopes_of_both(
+def derivative_and_difference(
     x: PyTree, value_at_x: Array, step: Array, points: PyTree, values: Array, error: Any
 ) -> Slopes:
-    """Return the slope of a function by its derivative, and by its values on both sides of `x`.
+    """Return the slope of a function along one line through `x`, by its derivative and by a
+    difference of its values at two `points` on both sides of `x`.
 
-    Both are slopes along one line through `x`, on which the two points lie.
-
-    **Arguments:**
-
-    - `x`: the numbers at which the derivative is taken.
-    - `value_at_x`: the value of the function at `x`, computed with the same tolerances as `values`.
-    - `step`: the length of the step from `x` to each of the two points, relative to the sizes of
-      the numbers of `x`.
-    - `points`: a tree like `x` with the two points, one on either side of `x`, in a new first axis
-      of each array.
-    - `values`: the values at the two points, NaN at a point that the function refuses.
-    - `error`: a `FunctionError` with the derivative, and with the errors of value and derivative.
+    The points stand in a new first axis of each array, at the distance `step`, relative to the
+    sizes of the numbers of `x`. All values are computed with the same tolerances, and are NaN at a
+    point that the function refuses; `error` is the `FunctionError` at `x`.
     """
     # The numbers of the two points have been rounded, so that the way from `x` to them is not
     # exactly along the wanted direction. The derivative is therefore taken along the true way.

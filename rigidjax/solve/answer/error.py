@@ -673,7 +673,7 @@ def error_of(
         x, error.value, error.value_error, error.derivative
     )
     values = difference.values_at_two_points(eqx.filter_jit(value), sides, second)
-    slopes = difference.slopes_of_both(x, closer, step, sides, values, error)
+    slopes = difference.derivative_and_difference(x, closer, step, sides, values, error)
     difference.warn_if_slopes_differ(slopes)
     missed = difference.derivative_error_from_slopes(slopes)
     derivative_error = jax.tree.map(jnp.hypot, error.derivative_error, missed)

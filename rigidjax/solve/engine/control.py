@@ -152,12 +152,16 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         # The first step is at least the shortest that the time can resolve, because steps of length
         # 0 would be accepted without end. If the start is not finite, the step has the length NaN,
         # which ends the run.
-        first = jnp.where(sound, jnp.maximum(first, begin + self._shortest(begin, least)), jnp.nan)
+        first = jnp.where(
+            sound, jnp.maximum(first, begin + self._shortest_step(begin, least)), jnp.nan
+        )
         return first.astype(begin.dtype), (inner, least)
 
-    def _shortest(self, t: ArrayLike, smallest_time: ArrayLike) -> Array:
-        """Return 8 units of round-off, s, of the time `t` or, if greater, of `smallest_time`."""
-        return 8 * jnp.finfo(jnp.result_type(t)).eps * jnp.maximum(jnp.abs(t), smallest_time)
+    def _shortest_step(self, t: ArrayLike, time_scale: ArrayLike) -> Array:
+        """Return the length of the shortest step, s: 8 units of round-off of |t| or, if greater, of
+        `time_scale`.
+        """
+        return 8 * jnp.finfo(jnp.result_type(t)).eps * jnp.maximum(jnp.abs(t), time_scale)
 
     # As in diffrax, the arguments come by position; they are those of `StandardController`.
     def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -166,7 +170,7 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         *rest, (inner, least) = given
         adapted = self.controller.adapt_step_size(t0, t1, *rest, inner)
         keep, left, right, jumped, inner, result = adapted
-        unit = self._shortest(left, least)
+        unit = self._shortest_step(left, least)
         stuck = ~keep & ~(right - left > unit)
         y_error = rest[3]
         # A run that is stuck after a step to NaN or infinity ends with `NONFINITE`. If this step

@@ -59,7 +59,9 @@ class ByMomentum(eqx.Module):
     def replace_rate(
         self, t: Any, y: PyTree, new_rate: Callable[[Array, Array, Array], Array]
     ) -> PyTree:
-        """Return the state with the rate `new_rate(I, I₀, rate)`, rad/s."""
+        """Return the state with the rate `new_rate(I(t), I₀, rate)`, rad/s, in the place of its
+        rate Ω or Ω̃; I and I₀ are inertia tensors.
+        """
         motion, own = motion_of(y), y.own if isinstance(y, Coupled) else ()
         dtype = motion.omega.dtype
         inner: Any = self.field.field if isinstance(self.field, CoupledEquations) else self.field

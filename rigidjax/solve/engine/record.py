@@ -113,10 +113,11 @@ def _for_bodies(
     constants: Arrays,
     arrays_of_bodies: Arrays,
 ) -> tuple[Method, Run, Layout, Arrays]:
-    """Convert a method for one body to one for arrays whose last axis runs over the bodies.
+    """Convert a method for one body to one for arrays whose last axis runs over the bodies; return
+    it with the run, the layout and the constants that remain.
 
-    The last of `constants` are the states of the controller, which go into the run. The new `halt`
-    and `control` hold the constants, without derivatives.
+    The last `constants`, the states of the controller, become `run.state`. The others are bound,
+    without derivatives, to `halt` and `control`.
     """
     run_tree, state_tree = trees
     run, count = run_tree.unflatten(arrays_of_bodies), len(constants) - state_tree.num_leaves

@@ -51,6 +51,13 @@ class _Division(NamedTuple):
     left: int  # the number of steps after the last piece, too few for another one
 
 
+class _PieceStarts(NamedTuple):
+    """Hold the states from which reverse mode computes all others once more."""
+
+    of_pieces: Arrays  # at the start of each piece, in a new first axis
+    of_left: Arrays  # at the start of the steps after the last piece
+
+
 @dataclasses.dataclass(frozen=True)
 class _Pieces:
     """Take many equal steps, and run them in reverse mode, in pieces of about √count steps.
@@ -67,19 +74,20 @@ class _Pieces:
     def take_steps(
         self, constants: Arrays, y: Arrays, first: Array, number: int, keep_starts: bool = False
     ) -> tuple[Arrays, Arrays | None]:
-        """Take `number` steps from `y`; return the end and, if wanted, the starts of all."""
+        """Take `number` steps from `y`, the first with the number `first`; return the state at
+        their end and, if wanted, the starts of all.
+        """
 
         def one(y: Arrays, i: Array) -> tuple[Arrays, Any]:
             return self.call(constants, y, i), y if keep_starts else None
 
         return lax.scan(one, y, first + jnp.arange(number, dtype=jnp.int32), unroll=self.turn)
 
-    def run(
+    def run_saving_starts(
         self, constants: Arrays, first: Array, y: Arrays
-    ) -> tuple[Arrays, tuple[Arrays, Arrays]]:
-        """Take all steps; return the end, and the states that `pull_back` needs.
-
-        These are the starts of the pieces, and the state after the last piece.
+    ) -> tuple[Arrays, _PieceStarts]:
+        """Take all steps, of which the first has the number `first`; return the state at their end,
+        and the starts of the pieces.
         """
         firsts, length, left = self.divide(first)
 
@@ -90,14 +98,14 @@ class _Pieces:
         last = end
         if left:
             end, _ = self.take_steps(constants, end, first + self.count - left, left)
-        return end, (starts, last)
+        return end, _PieceStarts(starts, last)
 
     def pull_back(
         self,
         constants: Arrays,
         has_derivative: Sequence[bool],
         first: Array,
-        starts: tuple[Arrays, Arrays],
+        starts: _PieceStarts,
         cotangent_of_end: Arrays,
     ) -> tuple[Arrays, Arrays]:
         """Return the cotangents of the constants with a derivative, and of the start."""
@@ -119,18 +127,17 @@ class _Pieces:
             return lax.scan(one, sums, (states, steps), reverse=True)[0]
 
         sums = [jnp.zeros_like(c) for c in chosen], cotangent_of_end
-        rows, last = starts
         if left:
-            sums = piece(sums, last, first + self.count - left, left)
+            sums = piece(sums, starts.of_left, first + self.count - left, left)
 
         def whole(sums: tuple[Arrays, Arrays], at: tuple[Arrays, Array]) -> tuple[Any, None]:
-            starts, begin = at
-            return piece(sums, starts, begin, length), None
+            y, begin = at
+            return piece(sums, y, begin, length), None
 
-        return lax.scan(whole, sums, (rows, firsts), reverse=True)[0]
+        return lax.scan(whole, sums, (starts.of_pieces, firsts), reverse=True)[0]
 
     def divide(self, first: Array) -> _Division:
-        """Return how all steps are divided into pieces, if the first has the number `first`."""
+        """Return how all steps are divided into pieces; the first step has the number `first`."""
         length = steps_per_piece(self.count)
         many, left = divmod(self.count, length)
         return _Division(first + length * jnp.arange(many, dtype=jnp.int32), length, left)
@@ -153,7 +160,7 @@ def march_on_gpu(step: Callable[[Any, Array], Any], first: Array, count: int, y:
     smooth = [*[eqx.is_inexact_array(c) for c in constants], False, *[True for _ in start]]
 
     def end(args: Arrays) -> Arrays:
-        return program.run(args[:number], args[number], args[number + 1 :])[0]
+        return program.run_saving_starts(args[:number], args[number], args[number + 1 :])[0]
 
     @jax.custom_jvp
     def run(*args: Array) -> Arrays:
@@ -163,7 +170,7 @@ def march_on_gpu(step: Callable[[Any, Array], Any], first: Array, count: int, y:
         both = zip(smooth, tangents, strict=True)
         moving = [s and not isinstance(t, SymbolicZero) for s, t in both]
         size = len(primals)
-        out, starts = program.run(
+        out, starts = program.run_saving_starts(
             list(primals[:number]), primals[number], list(primals[number + 1 :])
         )
         rows, shape = jax.tree.flatten(starts)

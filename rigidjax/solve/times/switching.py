@@ -151,7 +151,9 @@ def _asks_for_nan(eqn: Any) -> bool:
 
 
 def _height_and_value(eqn: Any, inputs: Any, result: Array) -> tuple[Array, Array]:
-    """Return of each element what passes zero or whole numbers, and what jumps there."""
+    """Return, for each element of a switch `eqn`, its height, at whose zeros or whole values the
+    equation switches, and the value that then jumps.
+    """
     name, x = _name(eqn), inputs[0]
     if _asks_for_nan(eqn):
         height, value = x, result
@@ -266,7 +268,10 @@ class Interpreter(NamedTuple):
         return list(zip(out, kinds, strict=True))
 
     def cond(self, eqn: Any, args: list[Any]) -> list[tuple[Any, int]]:
-        """Evaluate the branches: one by `lax.switch` if `whole`, else all, to choose from them."""
+        """Return the results of the chosen branch, each with how it depends on the time.
+
+        If `whole`, only this branch is evaluated, by `lax.switch`; else all are.
+        """
         (index, by), *args = args
         kinds: list[list[int]] = []
 
@@ -327,7 +332,7 @@ class Switches(NamedTuple):
         return np.array([fact(s) for s in self.switches for _ in range(s.size)], int)
 
     def heights_and_values(self, consts: Arrays, t: Array) -> tuple[Array, Array]:
-        """Return of each element what passes zero or whole numbers (m,), and what jumps (m,)."""
+        """Return the heights (m,) and the values (m,) of all elements (see `_height_and_value`)."""
         rows = {}
 
         def meet(path: Any, inputs: Any, result: Array, kind: int) -> Array:

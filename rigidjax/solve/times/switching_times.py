@@ -143,19 +143,26 @@ class _Cells(NamedTuple):
 
 
 def _cells_with_one_change(
-    found: Switches, consts: Arrays, begin: Array, end: Array, bent: np.ndarray, others: Array
+    found: Switches,
+    consts: Arrays,
+    begin: Array,
+    end: Array,
+    bent_elements: np.ndarray,
+    other_times: Array,
 ) -> _Cells:
-    """Return `MOST` intervals in which the elements `bent` change.
+    """Return `MOST` intervals of time (cells): at the ends of each, one of the `bent_elements` has
+    two different values.
 
-    `others` are the times at which elements of other heights change: times of the grid, too.
+    Cells without a change come last. The grid of times contains `other_times`, at which elements of
+    other heights change.
     """
-    m, both = bent.size, lambda t: found.heights_and_values(consts, t)
+    bent, m, both = bent_elements, bent_elements.size, lambda t: found.heights_and_values(consts, t)
     count = _GRID if m <= 8 else max(256, 8 * _GRID // m)
     grid = begin + (end - begin) * jnp.linspace(0.0, 1.0, count, dtype=begin.dtype)
-    if others.size:
-        before = jnp.nextafter(others, jnp.full_like(others, -jnp.inf))
+    if other_times.size:
+        before = jnp.nextafter(other_times, jnp.full_like(other_times, -jnp.inf))
         grid = jnp.sort(
-            jnp.concatenate([grid, jnp.clip(jnp.concatenate([others, before]), begin, end)])
+            jnp.concatenate([grid, jnp.clip(jnp.concatenate([other_times, before]), begin, end)])
         )
     height, value = (a[:, bent] for a in jax.vmap(both)(grid))
     # Between two times an element may change twice, near its closest approach to zero.

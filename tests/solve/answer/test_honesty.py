@@ -217,7 +217,7 @@ def test_a_flat_body_has_a_difference_on_one_side(moments):
 
 def test_smooth_functions_agree_with_their_differences():
     from rigidjax.solve.answer.difference import (
-        slopes_of_both,
+        derivative_and_difference,
         step_and_two_points,
         values_at_two_points,
     )
@@ -237,8 +237,10 @@ def test_smooth_functions_agree_with_their_differences():
             error = FunctionError(value, 1e-10 * jnp.abs(value), slope, 1e-9 * jnp.abs(slope))
             step, sides = step_and_two_points(x, value, error.value_error, slope)
             values = values_at_two_points(lambda x, _: f(x), sides, jnp.zeros(2))
-            assert not np.any(slopes_of_both(x, value, step, sides, values, error).differ)
+            assert not np.any(
+                derivative_and_difference(x, value, step, sides, values, error).differ
+            )
             wrong = eqx.tree_at(lambda e: e.derivative, error, 0.9 * slope)
-            slopes = slopes_of_both(x, value, step, sides, values, wrong)
+            slopes = derivative_and_difference(x, value, step, sides, values, wrong)
             missed = np.abs(slopes.difference - slopes.derivative)
             assert np.any(slopes.differ) or missed.max() < 0.02 * np.abs(slopes.difference).max()
