@@ -40,7 +40,9 @@ _MOST = 70
 
 
 class Path(NamedTuple):
-    """Hold the arrays of a run that is searched; in a batch each has a last axis of bodies."""
+    """Hold the arrays of a run that is searched for crossings; in a batch with a last axis of
+    bodies.
+    """
 
     t0: Array
     stops: Array  # (J,) the times at which the field jumps, then the end of the run
@@ -52,7 +54,7 @@ class Path(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """Hold a condition g at a time and a state, and what tells whether it is a zero."""
+    """Hold a condition g at a time and a state, its rate, and the size of its round-off."""
 
     g: Array
     rate: Array  # dg/dt along the motion
@@ -103,7 +105,9 @@ class _IntervalEnd(NamedTuple):
 
 
 class _SearchState(NamedTuple):
-    """Hold the state of the search; a pass is a step, or a part that ends at a guess for a zero."""
+    """Hold the state of the search; a pass is a step, or a part of a step that ends at a guess for
+    a zero.
+    """
 
     t: Array  # the time that is reached
     y: Array  # (n, *bodies) the state at t
@@ -367,7 +371,7 @@ def step_with_error(
 
 
 def result_of_search(h: Array, t: Array, end: Array, is_full: Array) -> dfx.RESULTS:
-    """Return how a search ended, by its last length `h` and time `t`, s (see `_searching`)."""
+    """Return the result of a search that ended at `t`, s, before a step `h` (see `_searching`)."""
     result = dfx.RESULTS.dt_min_reached
     for there, word in (
         (jnp.isnan(h), NONFINITE),

@@ -356,14 +356,15 @@ def _crossings(
 def _differentiable(times: Array, states: Array, jumps: Array, *inputs: Any) -> tuple[Array, Array]:
     """Return the crossings (K,), (K, n) as they are; their derivatives come from a second run.
 
-    It is made only if derivatives are taken. `inputs` are set-up, event, start and times.
+    The second run is made only if derivatives are taken. `inputs` are set-up, event, start and
+    times.
     """
     return times, states
 
 
 @_differentiable.def_jvp
 def _jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-    """Return known crossings, and their tangents: those of a step from the fixed times found."""
+    """Return the crossings, and the tangents of a `chebyshev_step` from their fixed times."""
     found, jumps = primals[:2], primals[2]
     there = jnp.isfinite(found[0])
 
@@ -451,7 +452,7 @@ class Numbers(NamedTuple):
 
 
 def section_of_run(setup: AnyRun, event: Event, state0: Any, ts: Array) -> tuple[Section, Numbers]:
-    """Return the condition of an event and the motion of a run, as what can be searched."""
+    """Return the `Section` of an event along a run, and the arrays with which it is searched."""
     form = integrated(setup.body, state0, setup.torque)
 
     def condition(t: Array, y: Any) -> Array:
@@ -551,7 +552,7 @@ def _locate(
 
 
 def _norms(sizes: list[int], vector: Array) -> Array:
-    """Return for each number of a vector (n,) the norm of the array, of `sizes`, that it is in."""
+    """Return for each number of a vector (n,), made of arrays of `sizes`, the norm of its array."""
     which = np.repeat(np.arange(len(sizes)), sizes)
     same = jnp.asarray(which[:, None] == which[None], vector.dtype)
     return jnp.sqrt(jnp.sum(same * (vector * vector)[None], 1))

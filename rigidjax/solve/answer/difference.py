@@ -39,29 +39,16 @@ class Slopes(NamedTuple):
     """Hold two slopes of a function f at a point x along one direction.
 
     The slope is the change of f(x) divided by the length of the step in this direction.
-
-    **Fields:**
-
-    - `derivative`: the slope computed from the derivative, in the shape of f(x).
-    - `difference`: the slope computed from a difference of values of f, in the shape of f(x).
-    - `differ`: for each number of f(x) whether its two slopes differ by more than their
-      uncertainty.
-    - `direction`: a tree like x: the absolute value of the change of each number of x, divided by
-      the length of the step.
     """
 
-    derivative: Array
-    difference: Array
-    differ: Array
-    direction: Any
+    derivative: Array  # the slope by the derivative, in the shape of f(x)
+    difference: Array  # the slope by a difference of values, in the shape of f(x)
+    differ: Array  # for each number of f(x), whether its slopes differ clearly
+    direction: Any  # like x: |change of each number| over the length of the step
 
 
 def absolute_or_one_if_all_zero(array: Array) -> Array:
-    """Return the absolute value of each number of an array, or ones if all numbers are zero.
-
-    The result serves as the natural size of each number. If all numbers are zero, their natural
-    size is not known, and is taken to be 1.
-    """
+    """Return the natural size of each number of an array: its absolute value; 1 if all are zero."""
     return jnp.where(jnp.all(array == 0), jnp.ones_like(array), jnp.abs(array))
 
 
@@ -69,12 +56,10 @@ def absolute_or_one_if_all_zero(array: Array) -> Array:
 def step_and_two_points(
     x: PyTree, value: Array, value_error: Array, derivative: PyTree
 ) -> tuple[Array, PyTree]:
-    """Return the length of a step, and the two points one step from `x` along a random line.
+    """Return the length h of a step, and the two points x − h d and x + h d, where d is random.
 
-    The values of a function f at the two points give its slope, to be compared with its derivative.
-
-    The length h is relative to the sizes of the numbers of `x`; the points x − h d and x + h d,
-    where d is the direction of the line, stand in a new first axis of each array.
+    The length is relative to the sizes of the numbers of `x`; the points stand in a new first axis
+    of each array. The values of a function there give its slope along d.
     """
     rng = np.random.default_rng(2)
 
@@ -105,14 +90,10 @@ def step_and_two_points(
 def values_at_two_points(
     function: Callable[[Any, Array], Array], points: PyTree, tolerances: Array
 ) -> Array:
-    """Return the values of a function at two points.
+    """Return the values `function(x, tolerances)` at two `points`, in the first axis of each array.
 
     The value is NaN at a point for which the function raises a `RuntimeError`, because the point is
     no valid argument. Under `jit` the numbers of the points are not known, and no error is raised.
-
-    - `function`: the function, called as `function(x, tolerances)`.
-    - `points`: a tree of arrays with the two points in the first axis.
-    - `tolerances`: the relative and the absolute tolerance, which are passed to the function.
     """
     if not _checks.is_known((points, tolerances)):
         return lax.map(lambda x: function(x, tolerances), points)
@@ -163,17 +144,11 @@ def derivative_and_difference(
 
 @jax.jit
 def derivative_error_from_slopes(slopes: Slopes) -> PyTree:
-    """Return the error of a function's derivative with respect to each number of its argument x.
+    """Return the error of a function's derivative by each number of its argument, from two slopes.
 
-    The slope of the function by its derivative is compared with its slope by a difference of
-    values, both along one direction. The whole difference between the two slopes may come from the
-    derivative with respect to any one number of x. The error of each of these derivatives is
-    therefore so large that it alone explains the difference. It is 0 where the slopes agree.
-
-    - `slopes`: the two slopes and the direction.
-
-    **Returns** a tree of the structure of x; the axes of each array are those of the value, then
-    those of the array in x.
+    The whole difference of the slopes may come from any one of these derivatives: the error of each
+    is so large that it alone explains the difference, and 0 where the slopes agree. The axes of an
+    array are those of the value, then those of the array in x.
     """
     slope = jnp.where(slopes.differ, jnp.abs(slopes.difference - slopes.derivative), 0)
 
@@ -185,11 +160,9 @@ def derivative_error_from_slopes(slopes: Slopes) -> PyTree:
 
 
 def warn_if_slopes_differ(slopes: Slopes) -> None:
-    """Warn the user that a derivative leaves something out, if two slopes of a function differ.
+    """Warn that a derivative misses something if the two slopes of a function differ.
 
     Nothing is compared under `jit`, where the slopes are not known.
-
-    - `slopes`: the slope of the function by its derivative, and by a difference of its values.
     """
     if not _checks.is_known(slopes) or not np.any(slopes.differ):
         return
@@ -206,13 +179,9 @@ def warn_if_slopes_differ(slopes: Slopes) -> None:
 
 
 def _directional_change(derivative: PyTree, direction: PyTree) -> Array:
-    """Return df/dx · direction, the change of a function's value if x changes by `direction`.
+    """Return df/dx · direction, the change of f(x) if x changes by `direction`.
 
-    - `derivative`: df/dx of the function f, a tree with one array for each array of x. The axes of
-      an array are those of the value f(x), then those of this array of x.
-    - `direction`: a tree of the structure of x.
-
-    **Returns** an array of the shape of the value.
+    The axes of an array of df/dx are those of f(x), then those of the array in x.
     """
 
     def of_leaf(derivative: Array, direction: Array) -> Array:

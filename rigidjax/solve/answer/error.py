@@ -176,22 +176,14 @@ class Error(eqx.Module):
 
     @property
     def _largest_relative_error(self) -> Array:
-        """Return the largest relative error of the state at each time (T,).
-
-        The relative error of each array of the state (`q`, `omega`, …) is its error divided by its
-        scale in `sizes`. In contrast to `relative`, errors above one half are returned as they are,
-        and not as infinity.
-        """
+        """Return the largest relative error of the state at each time (T,), above one half, too."""
         return _largest_relative_distance(
             jax.tree.map(jnp.hypot, self.steps, self.round_off), self.sizes
         )
 
 
 class TriedRun(NamedTuple):
-    """Hold one run of a search for a tolerance: the tolerance, and the results of the run.
-
-    The search tries smaller and smaller tolerances until a run is as accurate as wanted.
-    """
+    """Hold one run of a search for a tolerance, which tries smaller and smaller ones."""
 
     rtol: Array  # (), the relative tolerance of the run
     ys: Any  # the states at the T saved times, with a leading time axis
@@ -200,8 +192,15 @@ class TriedRun(NamedTuple):
 
     @property
     def accepted_steps(self) -> Array:
-        """Return the number of accepted steps of this run, a whole number."""
+        """Return the number of accepted steps."""
         return self.stats["num_accepted_steps"]
+
+
+class ToleranceSearch(NamedTuple):
+    """Hold two of the runs that `simulate(…, accuracy=…)` tried."""
+
+    first: TriedRun
+    before_last: TriedRun
 
 
 @eqx.filter_jit
@@ -210,18 +209,17 @@ def estimate_error_of_run(
     ts: Array,
     ys: PyTree,
     num_steps: Array,
-    search: tuple[TriedRun, TriedRun] | None = None,
+    search: ToleranceSearch | None = None,
 ) -> Error:
     """Return an estimate of the error of a known run, at each of its saved times.
 
-    `search` holds two of the runs that `simulate(…, accuracy=…)` tried: the first one, and the one
-    before the given run. The error of the steps is then measured by the latter, not by a more
-    accurate run, and is too large by a factor of about six.
+    If the run ended a `search`, the error of its steps is measured by the run before it, not by a
+    more accurate run, and is too large by a factor of about six.
     """
     setup, ts, ys, num_steps, search = _without_derivatives((setup, ts, ys, num_steps, search))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
     if search is not None:
-        before = search[1]
+        before = search.before_last
         rtol, others = setup.rtol, before.ys
         far = _relative_distance(others, ys) > _FORESEEN
         factor = jnp.where(far, jnp.inf, _ALLOWED * rtol / before.rtol)
@@ -230,16 +228,15 @@ def estimate_error_of_run(
         # reach it stays NaN.
         factor = 0.0
     else:
-        second, rtol, factor = _more_accurate_setup(
-            setup, ts, times_of_peaks(setup, ts, ys, num_steps)
-        )
-        others, *_ = solve(second, jax.tree.map(lambda leaf: leaf[0], ys), ts)
+        closer = _more_accurate(setup, ts, times_of_peaks(setup, ts, ys, num_steps))
+        rtol, factor = closer.rtol, closer.factor
+        others, *_ = solve(closer.setup, jax.tree.map(lambda leaf: leaf[0], ys), ts)
     steps = jax.tree.map(lambda part: factor * part, _distances_of_states(others, ys))
     return _error_with_round_off(setup, ts, ys, num_steps, steps, rtol, search)
 
 
 def _without_derivatives(tree: PyTree) -> PyTree:
-    """Return the same tree, whose arrays are constants for derivatives."""
+    """Return `tree`, whose arrays are constants for derivatives."""
     return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_array(a) else a, tree)
 
 
@@ -250,13 +247,13 @@ def _error_with_round_off(
     num_steps: Array,
     step_errors: dict[str, Array],
     rtol: Array,
-    search: tuple[TriedRun, TriedRun] | None,
+    search: ToleranceSearch | None,
 ) -> Error:
-    """Return the known error of the steps together with the round-off, measured by neighbours.
+    """Return the error of the steps together with that of round-off, measured by neighbours.
 
-    A neighbour is a run whose body, torque and start differ by about a unit in the last digit.
-    With a `search` (see `estimate_error_of_run`) neighbours of one of its two runs are taken, so
-    that no run at a larger tolerance has to be made.
+    A neighbour is a run whose body, torque and start differ by about a unit in the last digit. With
+    a `search` neighbours of one of its two runs are taken, so that no run at a larger tolerance has
+    to be made.
     """
     sizes, start = _error_scales_by_name(ys), jax.tree.map(lambda leaf: leaf[0], ys)
     reached = jnp.isfinite(_relative_distance(ys, ys))
@@ -268,7 +265,7 @@ def _error_with_round_off(
     coarse = rtol > _COARSE * eps
     known = _largest_relative_distance(step_errors, sizes)
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
-    setup, ys, more = _run_at_larger_tolerance(setup, start, ts, ys, num_steps, search)
+    setup, ys, more = _at_larger_tolerance(setup, start, ts, ys, num_steps, search)
     free = setup.solver is None
 
     def changes_of_neighbour(numbers: Any, times: Array) -> Array:
@@ -312,26 +309,33 @@ def _error_with_round_off(
     return Error(ts, step_errors, off, sizes)
 
 
-def _run_at_larger_tolerance(
+class _RunForRoundOff(NamedTuple):
+    """Hold a run by which the round-off of a given run is measured."""
+
+    setup: Any
+    ys: PyTree
+    factor: float | Array  # the round-off of the given run over that of this run
+
+
+def _at_larger_tolerance(
     setup: Any,
     start: PyTree,
     ts: Array,
     ys: PyTree,
     num_steps: Array,
-    search: tuple[TriedRun, TriedRun] | None,
-) -> tuple[Any, PyTree, float | Array]:
-    """Return a run by which the round-off of a given run is measured, its states, and a factor.
+    search: ToleranceSearch | None,
+) -> _RunForRoundOff:
+    """Return a run with a larger tolerance and fewer steps, whose states are still near `ys`.
 
-    The run has a larger tolerance, and takes fewer steps. The round-off of the given run is about
-    that of the new run times the factor: with k times as many steps it would be √k if all round-off
-    came from the steps, 1 if all came from the last digits of the inputs; the fourth root of k is
-    between the two. Both grow along the motion in the same way while the states stay near `ys`.
+    If the given run takes k times as many steps, its round-off would be √k times as large if all
+    came from the steps, and the same if all came from the last digits of the inputs; the fourth
+    root of k is between the two. While the states stay near `ys`, both grow in the same way.
 
     The given run itself is returned in float32, where it takes few steps anyway, in closed form,
     and if it does not record its steps.
     """
     if not setup.replays or ts.dtype == jnp.float32:
-        return setup, ys, 1.0
+        return _RunForRoundOff(setup, ys, 1.0)
 
     def is_near(run: TriedRun) -> Array:
         unreached = jnp.isnan(_relative_distance(ys, ys))
@@ -348,13 +352,14 @@ def _run_at_larger_tolerance(
             _placeholder_run(setup, start, ts, loosest),
         )
     else:
-        near = is_near(search[0])
+        near = is_near(search.first)
         run = jax.tree.map(lambda first, last: jnp.where(near, first, last), *search)
         if setup.cuts is not None:  # the first run was made before the peaks were known
             setup = dataclasses.replace(setup, cuts=jnp.where(near, ts[0], setup.cuts))
     fewer = jnp.maximum(run.accepted_steps, 1)
     setup = _with_tolerance(setup, run.rtol)
-    return setup, run.ys, (jnp.maximum(num_steps / fewer, 1.0) ** 0.25).astype(ts.dtype)
+    factor = (jnp.maximum(num_steps / fewer, 1.0) ** 0.25).astype(ts.dtype)
+    return _RunForRoundOff(setup, run.ys, factor)
 
 
 def _run_at_tolerance(setup: DiffraxRun, state0: PyTree, ts: Array, rtol: Array) -> TriedRun:
@@ -412,7 +417,7 @@ def _error_scales_by_name(ys: PyTree) -> dict[str, Array]:
 
 
 def _largest_relative_distance(distances: dict[str, Array], sizes: dict[str, Array]) -> Array:
-    """Return the largest quotient of the distances (T,) and their scales over all names, (T,)."""
+    """Return (T,) the largest of the `distances` (T,) of all arrays, each divided by its scale."""
     return jnp.max(jnp.stack([distances[name] / sizes[name] for name in distances]), 0)
 
 
@@ -421,18 +426,21 @@ def _relative_distance(others: PyTree, ys: PyTree) -> Array:
     return _largest_relative_distance(_distances_of_states(others, ys), _error_scales_by_name(ys))
 
 
+class AccurateRun(NamedTuple):
+    """Hold the run in which a search for a tolerance ended."""
+
+    setup: DiffraxRun
+    solved: Any  # what `solve` returns for it
+    search: ToleranceSearch
+
+
 @eqx.filter_jit
-def solve_to_accuracy(
-    setup: DiffraxRun, state0: PyTree, ts: Array, accuracy: Array
-) -> tuple[DiffraxRun, PyTree, tuple[TriedRun, TriedRun]]:
+def solve_to_accuracy(setup: DiffraxRun, state0: PyTree, ts: Array, accuracy: Array) -> AccurateRun:
     """Solve a run at a tolerance at which its global error is below `accuracy`, if there is one.
 
     The distance of each run from the run before, at a larger tolerance, is about the error of the
     run before; the error of the new run is estimated from it, in proportion to the two tolerances.
     If even the smallest tolerance is not enough, its run is returned.
-
-    **Returns** the set-up at the tolerance found; what `solve` returns for it; and the first of the
-    runs and the one before the last.
     """
     still = _without_derivatives((setup, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
@@ -479,7 +487,7 @@ def solve_to_accuracy(
     _, first, before, new, _, cuts, _ = lax.while_loop(lambda carry: ~carry[-1], closer, carry)
     setup = dataclasses.replace(_with_tolerance(setup, lax.stop_gradient(new.rtol)), cuts=cuts)
     run = _with_derivatives_of_solve(setup, state0, ts, new.ys), new.stats, new.result
-    return setup, run, (first, before)
+    return AccurateRun(setup, run, ToleranceSearch(first, before))
 
 
 @eqx.filter_custom_jvp
@@ -499,15 +507,21 @@ def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
 
 
 def _with_tolerance(setup: DiffraxRun, rtol: Array) -> DiffraxRun:
-    """Return the set-up of a run with another tolerance, which raises no error."""
+    """Return `setup` with the relative tolerance `rtol`, and without errors raised."""
     return dataclasses.replace(setup, rtol=rtol, atol=_SMALL * rtol, throw=False)
 
 
-def _more_accurate_setup(setup: Any, ts: Array, peaks: Array) -> tuple[DiffraxRun, Array, float]:
-    """Return a more accurate run, the relative tolerance of the given run, and a factor.
+class _MoreAccurate(NamedTuple):
+    """Hold the set-up of a run that is more accurate than a given run."""
 
-    The error of the given run is its distance to the more accurate run times the factor. Under
-    fixed steps the tolerance is 0, and steps do not end at the `peaks` (m,), s, of the torque.
+    setup: DiffraxRun
+    rtol: Array  # the relative tolerance of the given run; 0 under fixed steps
+    factor: float  # the error of the given run over its distance to this one
+
+
+def _more_accurate(setup: Any, ts: Array, peaks: Array) -> _MoreAccurate:
+    """Return the set-up of a more accurate run, in which steps end at the `peaks` (m,) of the
+    torque, s, unless they are fixed.
     """
     eps = float(jnp.finfo(ts.dtype).eps)
     most = None if setup.max_steps is None else 4 * setup.max_steps
@@ -519,7 +533,7 @@ def _more_accurate_setup(setup: Any, ts: Array, peaks: Array) -> tuple[DiffraxRu
         longest = jnp.abs(ts[-1] - ts[0]) / _PARTS
         longest = longest if setup.max_step is None else jnp.minimum(longest, setup.max_step)
         new = dict(rtol=less, atol=setup.atol * (less / rtol), max_step=longest)
-        return dataclasses.replace(setup, cuts=cuts, **new), rtol, 1.0
+        return _MoreAccurate(dataclasses.replace(setup, cuts=cuts, **new), rtol, 1.0)
     pid = lambda node: isinstance(node, dfx.PIDController)  # noqa: E731
     inside: Any = lambda c: [n for n in jax.tree.leaves(c, is_leaf=pid) if pid(n)]  # noqa: E731
     if found := inside(setup.controller):
@@ -527,7 +541,8 @@ def _more_accurate_setup(setup: Any, ts: Array, peaks: Array) -> tuple[DiffraxRu
         both = less, found[0].atol * (less / found[0].rtol)
         where = lambda s: (inside(s.controller)[0].rtol, inside(s.controller)[0].atol)  # noqa: E731
         setup = eqx.tree_at(where, setup, both)
-        return dataclasses.replace(setup, cuts=cuts), jnp.asarray(found[0].rtol, ts.dtype), 1.0
+        setup, rtol = dataclasses.replace(setup, cuts=cuts), jnp.asarray(found[0].rtol, ts.dtype)
+        return _MoreAccurate(setup, rtol, 1.0)
     if not isinstance(setup.controller, dfx.ConstantStepSize):
         raise TypeError(
             "error: a second run needs a diffrax.PIDController or ConstantStepSize, got "
@@ -536,7 +551,7 @@ def _more_accurate_setup(setup: Any, ts: Array, peaks: Array) -> tuple[DiffraxRu
     # In a method of order 2 the run with half of the step has a quarter of the error of the given
     # run. The distance between the two runs is then 3/4 of the error of the given run. For a method
     # of higher order the factor 4/3 makes the error too large, by at most a third.
-    return dataclasses.replace(setup, dt0=0.5 * setup.dt0), jnp.zeros(()), 4 / 3
+    return _MoreAccurate(dataclasses.replace(setup, dt0=0.5 * setup.dt0), jnp.zeros(()), 4 / 3)
 
 
 class FunctionError(eqx.Module):

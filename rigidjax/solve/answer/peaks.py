@@ -38,9 +38,10 @@ _STEEP = {"tanh", "logistic", "erf", "erfc", "atan", "asinh", "sinh", "cosh", "e
 
 
 def _height(eqn: Any, inputs: list[Any], kinds: list[int], out: Any) -> tuple[Array, bool] | None:
-    """Return what has its maximum at a peak of an equation, and whether it is the result itself.
+    """Return a number that is largest at a peak of an equation, and whether it is the result
+    itself.
 
-    It is the logarithm of the result, as far as it matters. `None`: the equation makes no peak.
+    Else it is the logarithm of the result, as far as it matters. `None`: there is no peak.
     """
     name, log = eqn.primitive.name, lambda a: jnp.log(jnp.abs(a))
     at = kinds[1] if len(kinds) > 1 else FIXED

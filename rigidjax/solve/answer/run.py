@@ -60,7 +60,9 @@ class ClosedFormRun(eqx.Module):
     replays: ClassVar[bool] = False
 
     def moving(self, state0: Any) -> Any:
-        """Return the motion from `state0`, a Module that is called with times since the start."""
+        """Return the motion from `state0`, a Module that maps the time since the start, s, to a
+        state.
+        """
         if self.torque is None:
             return FreeMotion(self.body, state0)
         body, law = in_precision((self.body, self.torque), state0.angle.dtype)
@@ -78,7 +80,7 @@ class ClosedFormRun(eqx.Module):
         return eqx.error_if(ys, result != dfx.RESULTS.successful, _CLOSED_FORM)
 
     def forward(self) -> "ClosedFormRun":
-        """Return the run without errors, for derivatives in forward mode."""
+        """Return the same run, which raises no error, for derivatives in forward mode."""
         return dataclasses.replace(self, throw=False)
 
 
@@ -190,7 +192,7 @@ class DiffraxRun(eqx.Module):
         return result.error_if(ys, ill)
 
     def forward(self) -> "DiffraxRun":
-        """Return the run without errors, for derivatives in forward mode."""
+        """Return the same run, which raises no error, with derivatives in forward mode."""
         # A run that does not record its steps needs `ForwardMode` for this.
         adjoint = self.adjoint if self.replays else dfx.ForwardMode()
         return dataclasses.replace(self, throw=False, adjoint=adjoint)
@@ -211,8 +213,8 @@ class ForwardRun(NamedTuple):
 
 
 class Ends(eqx.Module):
-    """Evaluate whether the scene of a particle ends its run, for example by a collision, or the
-    suspension of a body that of the body.
+    """Evaluate whether a run ends early: a particle's by its scene, such as a collision, and that
+    of a hanging body by its suspension.
     """
 
     scene: Any  # has ends(t, state) → bool, of a suspension (t, state, body), and end_words
@@ -303,7 +305,7 @@ class End(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """Hold a motion and the end of its run, which the closed form has not."""
+    """Hold the motion and the end of a run; a closed form has no `end`."""
 
     solved: Solved
     end: End | None

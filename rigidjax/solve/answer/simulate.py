@@ -214,7 +214,7 @@ def _chosen(
     solver: dfx.AbstractSolver | None, adjoint: dfx.AbstractAdjoint | None,
     max_steps: int | None, rtol: Any, has_event: bool,
 ) -> _Chosen:  # fmt: skip
-    """Return the given solver and adjoint or, for `None`, the fastest that work with the rest."""
+    """Return the given solver and adjoint or, for `None`, the fastest for the other arguments."""
     if solver is None:
         # If the user asks for forward mode alone, diffrax computes the tangents together with the
         # run.
@@ -237,8 +237,8 @@ def _message_of_conflict(
     solver: dfx.AbstractSolver | None,
     meter: dfx.AbstractProgressMeter | None,
 ) -> str:
-    """Return why the argument `name` (an accuracy or an event) cannot be had: which of the other
-    arguments needs diffrax' own loop.
+    """Return the message that the argument `name`, an accuracy or an event, does not go with those
+    arguments that need diffrax' own loop.
     """
     ours = solver is None or isinstance(solver, AbstractExplicit)
     needs_diffrax = {
@@ -267,18 +267,10 @@ def _solve_to_accuracy(
     times: Array,
     accuracy: ScalarLike,
 ) -> Solution:
-    """Solve to a wanted accuracy: find a tolerance, and return the solution with its error.
+    """Find a tolerance that gives the wanted accuracy, and return the solution with its error.
 
-    **Arguments:**
-
-    - `setup`: the body, the torque and the solver of the run.
-    - `event`: a condition `(t, state, body) → scalar` at whose first zero the run ends, an `Event`
-      with such a condition, or `None`.
-    - `state0`: the state at the time `times[0]`.
-    - `times`: (T,) s, the times at which states are saved.
-    - `accuracy`: the largest error that is allowed at the saved times. For a rotation it is an
-      angle, rad; for any other array of the state it is a fraction of the largest length of this
-      array in the run.
+    The `accuracy` is the largest error that is allowed at the saved times: for a rotation an angle,
+    rad; for any other array of the state a fraction of its largest length in the run.
     """
     # The derivative of the search is a rule of our own, which does not see traced numbers that a
     # function holds. They become arrays of the set-up, which the rule does see.
@@ -302,14 +294,7 @@ def _solve_run(
 ) -> Solution:
     """Solve a run, and return it as a `Solution`.
 
-    **Arguments:**
-
-    - `setup`: the body, the torque and how the motion is solved, a `ClosedFormRun` or `DiffraxRun`.
-    - `event`: a condition `(t, state, body) → scalar` at whose first zero the run ends, an `Event`
-      with such a condition, or `None`.
-    - `state0`: the state at the time `times[0]`.
-    - `times`: (T,) s, the times at which states are saved.
-    - `solved_run`: what `solve` returned for this run, if it is already known; else `None`.
+    `solved_run` is what `solve` returned for this run, if it is already known.
     """
     event_time = event_state = None
     try:

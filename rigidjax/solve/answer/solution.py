@@ -223,7 +223,7 @@ def _warn_of_error(error: Error, limit: Any, message_start: str) -> None:
 
 @eqx.filter_jit
 def _transition_matrix(setup: AnyRun, ts: Array, ys: Any) -> Float[Array, "times n n"]:
-    """Return the derivatives (T, n, n) of the states by the first, all as small changes."""
+    """Return the derivatives (T, n, n) of the states by the first, as changes by `plus`."""
     setup = setup.forward()
     start = jax.tree.map(lambda leaf: leaf[0], ys)
 

@@ -103,7 +103,7 @@ def require_compatible(body: Any, state0: Any, torque: Any) -> None:
 
 
 def _laws_within(law: Any) -> list[Any]:
-    """Return the parts of a law, and those of the torques inside them."""
+    """Return the parts of a law, and the parts of the torques inside them."""
     inner = [p.torque for p in parts_of(law) if isinstance(p, BodyInFrame | ChangingInertia)]
     return [*parts_of(law), *(part for one in inner for part in _laws_within(one))]
 
@@ -134,7 +134,7 @@ def _advice(numbers: Any, moves: bool = False) -> str:
 
 
 def real_or_nan(body: Any, throw: bool = False, allow_zero_moment: bool = False) -> Any:
-    """Return a body, with NaN for numbers that no real body can have, or raise an error."""
+    """Return `body`, with NaN for numbers that no real body can have, or raise an error."""
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
     mass = body.mass if matter else None

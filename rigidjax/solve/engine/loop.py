@@ -63,7 +63,7 @@ class Decision(NamedTuple):
 
 
 class Method(NamedTuple):
-    """Hold what a run with adaptive steps needs besides arrays; states are arrays (n, *bodies).
+    """Hold all of a run with adaptive steps but its arrays; states are arrays (n, *bodies).
 
     `*bodies` is one last axis for the bodies of a batch, or no axis for one body.
     """
@@ -141,7 +141,7 @@ def unpack_loop(arrays: Arrays, like: LoopState) -> LoopState:
 
 
 def _groups(leaves: Arrays) -> dict[np.dtype, list[int]]:
-    """Return which arrays are packed together, by dtype: booleans go with the int32 numbers."""
+    """Return the indices of the arrays packed together, by dtype: booleans go with int32."""
     groups: dict[np.dtype, list[int]] = {}
     for i, a in enumerate(leaves):
         kind = jnp.dtype(jnp.int32) if a.dtype == bool else a.dtype

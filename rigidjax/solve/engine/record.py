@@ -153,7 +153,7 @@ HasTangent = tuple[list[bool], list[bool]]
 
 
 class _Seen(NamedTuple):
-    """Hold the recorded run of all bodies, with what is needed to differentiate it."""
+    """Hold the recorded run of all bodies, and the tangents or cotangents along it."""
 
     method: Method  # its field takes only the constants below
     constants: Arrays  # those that have a tangent, with one copy for each body
@@ -166,7 +166,9 @@ def _recorded(
     has_tangent: HasTangent, method: Method, trees: tuple[Any, Any], layout: Layout,
     constants: Arrays, arrays_of_bodies: Arrays,
 ) -> _Seen:  # fmt: skip
-    """Return a recorded run from the arrays of the run, of its record, and along it."""
+    """Return the recorded run whose own arrays, those of its record, and the tangents or cotangents
+    are joined in `arrays_of_bodies`.
+    """
     whole, one = trees[0].num_leaves, method.field
     method, run, layout, constants = _for_bodies(
         method, trees, layout, constants, arrays_of_bodies[:whole]

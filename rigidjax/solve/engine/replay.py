@@ -164,7 +164,9 @@ class _Control(NamedTuple):
     order: Any  # the order of the error of a step
 
     def __call__(self, again: bool, constants: Arrays, given: Any, numbers: Any) -> Decision:
-        """Return the decision on a step; repeated for a derivative (`again`) it moves no meter."""
+        """Return the decision on a step; a step repeated for a derivative (`again`) moves no
+        progress meter.
+        """
         controller, meter = eqx.combine(self.arrays(constants), self.static)
         (control, progress), (t0, last, begin, end) = given
         *states, error = (self.tree(y) for y in numbers)

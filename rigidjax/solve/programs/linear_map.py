@@ -132,7 +132,7 @@ def _jvp_rule(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...], **param
 
 
 def no_transpose(*_: Any) -> Arrays:
-    """Raise `TypeError`: it is the transpose of a map without one, in reverse over a derivative."""
+    """Raise the `TypeError` of a map without a transpose: reverse mode over a derivative."""
     raise TypeError(
         "second derivatives through a solver are forward over reverse: wanted "
         "jax.jacfwd(jax.grad(f)) or jax.hessian(f), got reverse mode over a derivative, such as "

@@ -115,9 +115,7 @@ def stages(
 def _stage(
     w: Weights, field: Field, constants: Arrays, step: Step, i: Array, slopes: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the time, the state and the slope of stage `i`, from the slopes (n, s, *bodies)
-    before.
-    """
+    """Return time, state and slope of stage `i`, from the slopes (n, s, *bodies) before it."""
     # The dtype of the time may differ from that of the state.
     y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _weighted_sum(w.a[i], slopes)
     t = jnp.where(w.last[i], step.end, step.t + w.c[i].astype(step.t.dtype) * step.h)
@@ -176,10 +174,19 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     return found[0] * jnp.sum(which * ratio[:, None], 0)
 
 
+class StepCotangents(NamedTuple):
+    """Hold the cotangents of the inputs of a step."""
+
+    constants: Arrays
+    t: Array
+    h: Array
+    y: Array
+
+
 def pull_back(
     tableau: Tableau, field: Field, constants: Arrays, step: Step, step_stages: Stages,
     cotangent: Array, cotangents_of_slopes: Array | None = None,
-) -> tuple[Arrays, Array, Array, Array]:  # fmt: skip
+) -> StepCotangents:  # fmt: skip
     """Return the cotangents of a step's inputs from those of its end and of its slopes."""
     w, count = weights_of(tableau, step.y.dtype), step_stages.slopes.shape[1]
     h, put = step.h.astype(step.y.dtype), lax.dynamic_update_index_in_dim
@@ -210,4 +217,5 @@ def pull_back(
     by_length = jnp.sum(seeds * step_stages.slopes, (0, 1)).astype(by_times.dtype)
     c = w.c[:count].astype(by_times.dtype).reshape(-1, *[1] * (by_times.ndim - 1))
     by_length = by_length + jnp.sum(c * by_times, 0)
-    return by_constants, jnp.sum(by_times, 0), by_length, cotangent + jnp.sum(below, 1)
+    by_start = cotangent + jnp.sum(below, 1)
+    return StepCotangents(by_constants, jnp.sum(by_times, 0), by_length, by_start)

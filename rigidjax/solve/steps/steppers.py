@@ -273,7 +273,7 @@ def _of_slope(
     state: Callable[[Atoms], Any],
     example_state: Any,
 ) -> Stepper:
-    """Return steps of an explicit method for a slope `slope_for_inputs(inputs)(t, y)`.
+    """Return the `Stepper` of an explicit method for a slope `slope_for_inputs(inputs)(t, y)`.
 
     `example_state` has as many numbers as y, in the same order, and shows which are a quaternion.
     """

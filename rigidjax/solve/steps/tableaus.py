@@ -17,30 +17,23 @@ _MOST_CHOSEN = 12
 class Tableau(NamedTuple):
     """Hold the numbers of an explicit Runge–Kutta method.
 
-    **Fields:**
-
-    - `order`: the order of the solution.
-    - `c`, `a`: the nodes and the weights of the stages after the first.
-    - `b`: the weights of the solution.
-    - `errors`: the weights of one or two error estimates, the one of higher order first. In these
-      weights the stage number `len(a) + 1` is the derivative at the end of the step.
-    - `extra_c`, `extra_a`: the nodes and the weights of the stages that only dense output needs.
-      The first of them has the number `len(a) + 2`.
-    - `dense`: the weights of dense output, which is the state at any time within the step. Dense
-      output is a cubic polynomial in θ plus corrections. Here θ is the fraction of the step that
-      has passed, from 0 to 1. The cubic has the right state and slope at both ends of the step. The
-      corrections are multiples of θ²(1−θ)², θ³(1−θ)², θ³(1−θ)³, …. Each row has the weights of the
-      slopes of all stages in one of these multiples (Hairer, Nørsett and Wanner 1993, II.6).
+    Dense output, the state within a step, is a cubic polynomial in the fraction θ of the step that
+    has passed, with the right state and slope at both ends, plus multiples of θ²(1−θ)², θ³(1−θ)²,
+    θ³(1−θ)³, … (Hairer, Nørsett and Wanner 1993, II.6).
     """
 
-    order: int
-    c: tuple[float, ...]
-    a: tuple[Row, ...]
-    b: Row
+    order: int  # of the solution
+    c: tuple[float, ...]  # the nodes of the stages after the first
+    a: tuple[Row, ...]  # the weights of these stages
+    b: Row  # the weights of the solution
+    # The weights of one or two error estimates, the one of higher order first. In these weights the
+    # stage number `len(a) + 1` is the derivative at the end of the step.
     errors: tuple[Row, ...]
+    # The nodes and the weights of the stages that only dense output needs. The first of them has
+    # the number `len(a) + 2`.
     extra_c: tuple[float, ...] = ()
     extra_a: tuple[Row, ...] = ()
-    dense: tuple[Row, ...] = ()
+    dense: tuple[Row, ...] = ()  # the weights of all slopes in each of the multiples
 
 
 def _parse_rows(text: str) -> tuple[Row, ...]:

@@ -30,21 +30,15 @@ class Sided(eqx.Module):
 
     A step that ends at a jump needs the value of the law before the jump. A step that begins at a
     jump needs the value after the jump.
-
-    - `law`: the law, which is called with the time and, if it is a torque, with the state and the
-      body.
-    - `jumps`: (n,) s, the times at which the law jumps.
-    - `stops`: (n,) s, the times at which steps end because of these jumps. They differ from the
-      jumps by at most some units of round-off; `None` says that they are equal to the jumps.
-    - `sign`: the direction of time: 1, −1 in a run backwards, or `None` for 1.
-    - `end`: s, the time at which the run ends.
     """
 
-    law: Any
-    jumps: Any
+    law: Any  # a torque (t, state, body), or a function of the time
+    jumps: Any  # (n,) s, the times at which the law jumps
+    # (n,) s, the times at which steps end because of the jumps, from which they differ by at most
+    # some units of round-off; `None`: they are equal.
     stops: Any
-    sign: Any
-    end: Any
+    sign: Any  # the direction of time: 1, −1 in a run backwards, or `None` for 1
+    end: Any  # s, the time at which the run ends
 
     def __getattr__(self, name: str) -> Any:
         # Attributes that a `Sided` does not have, such as `feels` or `rate_free`, are those of the
@@ -55,7 +49,7 @@ class Sided(eqx.Module):
 
     @property
     def law_name(self) -> str:
-        """Return the name of the class of the law that this `Sided` wraps."""
+        """Return the name of the class of the `law`."""
         return type(self.law).__name__
 
     def __call__(self, t: Any, *args: Any) -> Any:
@@ -64,10 +58,8 @@ class Sided(eqx.Module):
             return self.law(self.time_on_correct_side(t), *args)
 
     def time_on_correct_side(self, t: Any) -> Any:
-        """Return the time, s, with which the law is called at the time `t` of the run, s.
-
-        It is `t` itself, unless `t` is on the wrong side of a jump. In this case it is the nearest
-        time on the correct side of the jump.
+        """Return the time t, s, or the nearest on the correct side of a jump if t is on its wrong
+        side.
         """
         still = lax.stop_gradient(jnp.asarray(t))
         # The oldest supported JAX has no derivative of `nextafter`, not even inside
@@ -95,12 +87,11 @@ class Sided(eqx.Module):
 
 
 def _declares_jumps(node: Any) -> bool:
-    """Return whether a part of a vector field is a law that declares that it jumps in time.
+    """Return whether a node of a vector field is a law that declares jumps in time.
 
-    `node` is any part of the tree of the field. A law is a torque, or a function of time, in the
-    field. A law of this package declares jumps if its class has jumps of its own (not only those of
-    a law inside it) and the law has at least one jump time. A law that a user has written declares
-    jumps if it has the member `jump_times`, even if this array is empty.
+    A law of this package does if its class has jumps of its own (not only those of a law inside it)
+    and the law has at least one jump time; a law of a user if it has the member `jump_times`, even
+    if this array is empty.
     """
     if isinstance(node, type) or not hasattr(node, "jump_times"):
         return False
@@ -110,11 +101,7 @@ def _declares_jumps(node: Any) -> bool:
 
 
 def declared_jumps(field: Any) -> list[Array]:
-    """Return a list with the jump times, s, of each part of a vector field that jumps in time.
-
-    `field` is the vector field, a tree whose parts may be torque laws or functions of time. A part
-    without jump times has no entry in the list.
-    """
+    """Return the jump times, s, of each part of a vector field that has some."""
     parts = filter(_declares_jumps, jax.tree.leaves(field, is_leaf=_declares_jumps))
     return [jumps for part in parts if (jumps := jnp.asarray(jump_times_of(part))).shape[0]]
 
@@ -122,17 +109,10 @@ def declared_jumps(field: Any) -> list[Array]:
 def evaluate_on_correct_sides(
     field: Any, sign: Array | None, stop_times: list[Array] | None, end: Array
 ) -> Any:
-    """Return a vector field in which each part is evaluated on the correct side of its jumps.
+    """Wrap each part of a vector field that declares jumps in a `Sided`.
 
-    Each part that declares jumps in time is wrapped in a `Sided` law, unless it has states of its
-    own.
-
-    - `field`: the vector field, a tree of parts.
-    - `sign`: the direction of time: 1, −1 in a run backwards, or `None` for 1.
-    - `stop_times`: a list with one array for each part that has jumps, in the order of
-      `declared_jumps`: the times, s, at which steps end because this part jumps. `None` says that
-      steps end exactly at the jump times.
-    - `end`: s, the time at which the run ends.
+    `stop_times` has the `stops` of each such part, in the order of `declared_jumps`; `sign`, `end`
+    and `None` are as in `Sided`.
     """
     stops = iter(stop_times or ())
 

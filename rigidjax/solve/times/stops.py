@@ -38,17 +38,11 @@ class ProgramWithStops(NamedTuple):
 def program_with_stops(
     function: Callable[..., Array], declared_jumps: list[Array], t0: Array, t1: Array, y: Array
 ) -> ProgramWithStops:
-    """Return a vector field, with all times at which steps end because the field jumps there.
+    """Return a vector field `function(t, y, *sides)`, and the times at which it jumps between t0
+    and t1.
 
-    **Arguments:**
-
-    - `function`: the field `(t, y, *sides)`. If several parts of the field declare jumps, `sides`
-      has one array for each of these parts: the times, s, at which steps end because this part
-      jumps. Otherwise `sides` is empty.
-    - `declared_jumps`: a list with the jump times, s, of each part of the field that declares
-      jumps.
-    - `t0`, `t1`: the start and the end of the run, s.
-    - `y`: an example of the state.
+    If several parts declare jumps, `sides` has for each of them the times, s, at which steps end
+    because of its jumps, else it is empty. `y` is an example of the state.
     """
     declared = [times.astype(t0.dtype) for times in declared_jumps if times.size]
     likes = declared if len(declared) > 1 else []
@@ -93,9 +87,5 @@ def program_with_stops(
 
 
 def _split_like(whole: Array, like: list[Array]) -> list[Array]:
-    """Return an array cut along its first axis into parts that are as long as other arrays.
-
-    `whole` is the array that is cut. `like` are the other arrays: part number i has as many rows as
-    `like[i]`, and together the parts are the whole array.
-    """
+    """Return `whole` cut along its first axis into parts as long as the arrays in `like`."""
     return list(jnp.split(whole, np.cumsum([a.shape[0] for a in like])[:-1]))

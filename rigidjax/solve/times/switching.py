@@ -206,10 +206,10 @@ Meet = Callable[[tuple[Any, ...], Any, Array, int], Array]
 
 
 class Interpreter(NamedTuple):
-    """Evaluate a traced function, and call `meet` at what switches by the time.
+    """Evaluate a traced function, and call `meet` at each equation that switches by the time.
 
-    Each value goes with how it depends on the time. Unless `whole`, nothing that depends on the
-    state is evaluated, and its value is `None`.
+    Each value comes with its kind of dependence on the time (`FIXED`, `STRAIGHT`, …). Unless
+    `whole`, nothing that depends on the state is evaluated, and its value is `None`.
     """
 
     meet: Meet
@@ -328,7 +328,7 @@ class Switches(NamedTuple):
     unfound: list[str]  # the primitives, and their lines, that may switch at times not found
 
     def of_elements(self, fact: Callable[[Switch], Any]) -> np.ndarray:
-        """Return (m,) a fact of the switch of each element."""
+        """Return (m,) the number `fact(switch)` of the switch of each element."""
         return np.array([fact(s) for s in self.switches for _ in range(s.size)], int)
 
     def heights_and_values(self, consts: Arrays, t: Array) -> tuple[Array, Array]:
@@ -346,7 +346,9 @@ class Switches(NamedTuple):
         return jnp.concatenate(height), jnp.concatenate(value)
 
     def field(self, values: Array, over: Array, consts: Arrays, t: Array, *rest: Any) -> Any:
-        """Return the field, in which the switches have the `values` (m,) unless `over`."""
+        """Return the value of the field, in which switches have the `values` (m,), or, if `over`,
+        their own.
+        """
         parts = np.cumsum([s.size for s in self.switches])[:-1]
         own = dict(
             zip(

@@ -39,7 +39,7 @@ class Changes(NamedTuple):
 
 
 def _monotonic_elements(found: Switches) -> tuple[np.ndarray, np.ndarray]:
-    """Return the elements whose heights are not bent, and for each the number of its change.
+    """Return the elements whose heights are not bent, and the numbers of their changes, from 0.
 
     An element of a function such as `floor` stands there `MOST` times.
     """
@@ -90,7 +90,9 @@ def _at(values: Array, i: Array) -> Array:
 def _bisect(
     found: Switches, consts: Arrays, low: Array, high: Array, element: Any, base: Array, level: Any
 ) -> Array:
-    """Return for each interval the time at which an element differs from `base` by its `level`."""
+    """Return, for each interval from `low` to `high`, the time at which the value of its `element`
+    becomes different from `base` by `level`.
+    """
     pick = jax.vmap(lambda t, i: _at(found.heights_and_values(consts, t)[1], i))
 
     def half(_: Any, ends: Any) -> Any:
@@ -201,7 +203,8 @@ def _cells_with_one_change(
 def _times_with_derivatives(
     found: Switches, consts: Arrays, t: Array, element: Array, there: Array
 ) -> Array:
-    """Return the times of changes of elements with derivatives, where a change is `there`.
+    """Return the times t of changes of elements, with derivatives by `consts` where a change is
+    `there`.
 
     A step of Newton's method leaves the times as they are, and makes the derivatives of one more
     order right.
@@ -247,7 +250,9 @@ def _times_with_derivatives(
 
 
 def values_between(found: Switches, changes: Changes, stops: Array, t: Array) -> Array:
-    """Return the values (m,) of the elements at the time t, from the `stops` (k,) passed."""
+    """Return the values (m,) of the elements at the time t, after all changes whose `stops` (k,) it
+    has passed.
+    """
     element, number = _monotonic_elements(found)
     sizes = jnp.where(t >= stops, changes.sizes, 0)
     plain, bent = sizes[: element.size], sizes[element.size :]
