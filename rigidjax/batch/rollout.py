@@ -206,7 +206,7 @@ class FixedSteps(NamedTuple):
 
 
 class Arrays(NamedTuple):
-    """Hold the numbers of a rollout."""
+    """Hold the arrays of a rollout."""
 
     shared: PyTree
     per_body: tuple[PyTree, PyTree]  # of bodies, states and torque, and the inputs of the torque

@@ -51,8 +51,8 @@ def compiler_options() -> dict[str, Any]:
 
 
 class CompiledFunction:
-    """Call a function under `jit`, with the options of `compiler_options` where JAX takes them: at
-    the outermost `jit`, that is, unless the last argument is traced.
+    """Call a function under `jit`, with the options of `compiler_options` unless the last argument
+    is traced: JAX takes options only at the outermost `jit`.
     """
 
     def __init__(self, function: Callable[..., Any]):

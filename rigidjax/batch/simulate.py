@@ -254,15 +254,14 @@ _UNROLLED = 32
 
 
 def sorted_for_chunks(key: Array, chunk: int, num_devices: int) -> tuple[Array, Array]:
-    """Return the order in which bodies that are computed together need similar numbers of steps
-    (its element i is the old index at the new place i), and its inverse; `key` is (N,), such as a
-    speed, and consecutive chunks go to the devices one after another.
+    """Return an order of the bodies in which those of a chunk need similar numbers of steps, by
+    `key` (N,), such as a speed, and its inverse; its element i is the old index at the new place i.
 
-    All bodies of a chunk wait for the slowest. XLA computes the bodies of a chunk in groups, so
-    that the rounding of a body's results depends on its place within the chunk. Each body therefore
-    keeps its place within a chunk, whatever the keys of other bodies are, and only its chunk is
-    chosen by its key. If `chunk` is a multiple of 32, which is the size of a group, only the place
-    within the group is kept.
+    All bodies of a chunk wait for the slowest, and consecutive chunks go to the devices in turn.
+    XLA computes the bodies of a chunk in groups, so that the rounding of a body's results depends
+    on its place within the chunk. Each body therefore keeps its place within a chunk, whatever the
+    keys of other bodies are, and only its chunk is chosen by its key. If `chunk` is a multiple of
+    32, the size of a group, only the place within the group is kept.
     """
     count = key.shape[0]
     chunk = min(chunk, -(-count // num_devices))

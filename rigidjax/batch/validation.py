@@ -27,7 +27,7 @@ TorqueAxes = int | Callable[[Any], Any] | PyTree
 
 
 class Check(NamedTuple):
-    """Hold what a check of many bodies found."""
+    """Hold the result of one check of many bodies."""
 
     index: Any  # of the first wrong body, or −1
     refuse: Callable[[int], None]  # raise the error for this body
@@ -60,7 +60,7 @@ class BodyBatch(NamedTuple):
 
 
 class OneBody(NamedTuple):
-    """Hold the parts of one run of a batch."""
+    """Hold body, initial state and torque of one run of a batch."""
 
     body: Inertia | MassProperties
     state0: Any  # NaN if it is invalid

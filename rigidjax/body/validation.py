@@ -61,7 +61,7 @@ def require_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch
     got = f", got principal second moments {_text(e)} kg m²" if _checks.is_known(s) else ""
     return _checks.error_if(
         s,
-        (least < -_slack(s) * largest).any() | (largest < 0).any(),
+        (least < -_relative_tolerance(s) * largest).any() | (largest < 0).any(),
         "second moment 𝔖 = ∫ r rᵀ dm: wanted a positive semi-definite matrix (mass is not "
         f"negative){got}; is this an inertia tensor I? then use from_tensor (I = Tr(𝔖) 1 − 𝔖)",
     )
@@ -177,7 +177,7 @@ _THIN = (
 
 
 class Faults(NamedTuple):
-    """Hold what is wrong with inertia tensors, a boolean for each."""
+    """Hold, for each of some inertia tensors, whether it has one of three faults."""
 
     flat: Any  # a principal moment is zero or NaN
     broken: Any  # no real body can have the principal moments
@@ -190,7 +190,7 @@ def _faults(xp: ModuleType, tensor: Array | np.ndarray, allow_zero_moment: bool)
     Moments that no body can have show in the minors (subdeterminants) of the second moment 𝔖 = ½
     Tr(I) 1 − I divided by the trace of I: a real body has an 𝔖 that is positive semi-definite.
     """
-    slack = _slack(tensor)
+    slack = _relative_tolerance(tensor)
     # The nine entries are split by one operation, because nine slices would take NumPy ten times as
     # long.
     nine = xp.moveaxis(xp.asarray(tensor).reshape(*tensor.shape[:-2], 9), -1, 0)
@@ -245,7 +245,7 @@ def _require_triangle(value: Array, moments: Array | np.ndarray) -> Array:
     """
     m1, m2, m3 = moments[..., 0], moments[..., 1], moments[..., 2]
     moments_text = f" {_text(moments)} kg m²" if _checks.is_known(value) else ""
-    slack = _slack(value) * abs(m3)
+    slack = _relative_tolerance(value) * abs(m3)
     value = _checks.error_if(
         value,
         (m1 < -slack).any() | (m3 < 0).any(),
@@ -268,7 +268,7 @@ def _asymmetry(a: Array) -> tuple[Any, Any]:
     fixed = _constant(a)
     difference = abs(fixed - fixed.swapaxes(-1, -2)).max(axis=(-1, -2))
     largest = abs(fixed).max(axis=(-1, -2))
-    return difference, (difference > _slack(a) * largest).any()
+    return difference, (difference > _relative_tolerance(a) * largest).any()
 
 
 def _require_symmetric(a: Array, name: str) -> Array:
@@ -297,7 +297,7 @@ def _eigenvalues(a: Array) -> Array | np.ndarray:
     return jnp.linalg.eigvalsh(lax.stop_gradient(a) / scale) * scale[..., 0]
 
 
-def _slack(a: Array | np.ndarray) -> float:
+def _relative_tolerance(a: Array | np.ndarray) -> float:
     """Return the relative error that a check tolerates in an array."""
     return float(_FORGIVEN * jnp.finfo(a.dtype).eps)
 

@@ -43,7 +43,7 @@ class ClosedFormConstants(NamedTuple):
 
 @one_kernel
 def closed_form_constants(moments: Triple, momentum: Triple) -> ClosedFormConstants:
-    """Return the constants of a free motion in ascending principal moments, of which some may be
+    """Return the constants of a free motion; the principal moments ascend, and some may be
     equal.
     """
     (i1, i2, i3), (p1, p2, p3) = moments, momentum
@@ -129,7 +129,7 @@ class MomentumAndTurn(NamedTuple):
 
 @one_kernel
 def momentum_and_turn(constants: ClosedFormConstants, t: Scalar) -> MomentumAndTurn:
-    """Return the motion at the time t."""
+    """Return the momentum and the turn at the time t."""
     half_time = reduce_time(0.5 * t, constants.half.time, constants.modulus)
     return from_elliptic(
         constants,
@@ -142,8 +142,8 @@ def momentum_and_turn(constants: ClosedFormConstants, t: Scalar) -> MomentumAndT
 def from_elliptic(
     constants: ClosedFormConstants, functions: Elliptic, half_time: ReducedTime, t: Scalar
 ) -> MomentumAndTurn:
-    """Return the motion at the time t from the elliptic functions and their phase at the time t/2
-    reduced by whole half periods, `half_time.near`.
+    """Return the motion at the time t from the elliptic functions and their phase at
+    `half_time.near`, which is t/2 less whole half periods.
     """
     big = jnp.maximum(constants.modulus.p, constants.modulus.q)
     whole = jnp.where(half_time.halves == 0, 0.0, half_time.halves)

@@ -130,9 +130,7 @@ def _free_motion_jvp(
 
 
 class Inputs(NamedTuple):
-    """Hold what the derivative rules of a free motion share: numbers that follow from the inputs,
-    and their tangents.
-    """
+    """Hold the inverse inertia and the ten variables of a free motion, and the tangents of both."""
 
     inverse: Inverse
     d_inverse: Inverse
@@ -143,9 +141,7 @@ class Inputs(NamedTuple):
 def _inputs(
     primals: tuple[SymmetricEntries, Triple, Scalar], tangents: tuple[PyTree, ...]
 ) -> Inputs:
-    """Return the inverse inertia, the ten variables, and the tangents of both, from the inertia,
-    Π(0) and t and their tangents.
-    """
+    """Return the `Inputs` for the inertia, Π(0) and t, and their tangents."""
     inverse, change = jax.jvp(inverted, primals[:2], tangents[:2])
     variables = ten_variables(inverse, *primals[1:])
     return Inputs(inverse, change, variables, ten_variables(change, *tangents[1:]))
@@ -317,7 +313,7 @@ class MotionDerivatives(NamedTuple):
 
 
 class MotionAndDerivatives(NamedTuple):
-    """Hold a free motion, its derivatives, and the parts from which these are computed."""
+    """Hold a free motion, its derivatives, and the parts from which these derivatives follow."""
 
     motion: Motion
     rows: MotionDerivatives
@@ -442,7 +438,7 @@ def ten_variables(inverse: Inverse, momentum: Triple, t: Scalar) -> Float[Array,
 def _turn_and_parts(
     constants: ClosedFormConstants, inertia: SymmetricEntries, momentum: Triple, t: Scalar
 ) -> tuple[MomentumAndTurn, MomentumParts]:
-    """Return the motion at the time t and the parts of its derivatives."""
+    """Return the motion at the time t, and the parts from which its derivatives are computed."""
     half_time = reduce_time(0.5 * t, constants.half.time, constants.modulus)
     half = elliptic_integrals(
         half_time.near, constants.modulus, constants.mu, constants.phase_factor
@@ -463,7 +459,7 @@ def _parts_tangent(
     variables: Float[Array, "10"],
     change_of_variables: Float[Array, "10"],
 ) -> MomentumParts:
-    """Return the tangent of the parts of the derivatives for a change of the ten variables.
+    """Return the tangent of `MomentumParts` for a change of the ten variables.
 
     The motion is taken from the module `sigma_form`, where it is a smooth function of the whole
     inertia tensor.

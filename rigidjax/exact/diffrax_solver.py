@@ -117,16 +117,14 @@ class FreeSolver(dfx.AbstractSolver):
 
 
 class FieldAndDirection(NamedTuple):
-    """Hold what lies inside the terms that diffrax gives to a solver."""
+    """Hold vector field and direction of time of the terms that diffrax gives to a solver."""
 
     field: Any  # the vector field, or None
     direction: Any  # −1 if diffrax integrates backwards, else 1
 
 
 def field_and_direction(terms: PyTree[dfx.AbstractTerm]) -> FieldAndDirection:
-    """Return the vector field and the direction of time of an `ODETerm`, or of diffrax's object
-    around it.
-    """
+    """Return both of an `ODETerm`, or of diffrax's object around it."""
     # Read the attributes of the term and of the object around it: the public methods of a term,
     # `vf` and `contr`, return numbers only, but the solver needs the inertia in the vector field.
     term = getattr(terms, "term", terms)

@@ -64,13 +64,11 @@ def momentum_jacobian(
     duration_of_halves: Scalar,
     mean_of_s_squared: Scalar,
 ) -> MomentumParts:
-    """Return the derivatives of the momentum and the matrix G.
+    """Return the derivatives of the momentum and the matrix G; `inverse_inertia` is diagonal.
 
-    - `inverse_inertia`: with off-diagonal entries that are zero.
-    - `half_time_integrals`: at t/2 less the whole number `halves` of half periods, with the p and q
-      of `sigma_form.invariants` for the axes in the order of `inverse_inertia`.
-    - `duration_of_halves`: the duration of 2 × `halves` half periods.
-    - `mean_of_s_squared`: the mean of S² over a period.
+    The `half_time_integrals` are those at t/2 less `halves` half periods, with the p and q of
+    `sigma_form.invariants` for the axes in the order of `inverse_inertia`; 2 × `halves` half
+    periods last `duration_of_halves`; the mean of S² is that over a period.
     """
     d12, d13, d23 = inverse_inertia[:3]
     p1, p2, p3 = momentum

@@ -242,7 +242,7 @@ def divisor_of_step(
     )
 
 
-def step_and_term(
+def step_and_integral_term(
     inverse_inertia: Differences,
     divisor_terms: DivisorTerms,
     sigma_of_step: Sigma,
@@ -277,7 +277,7 @@ def step_and_term(
     return barrier(MomentumAndIntegral(after, part))
 
 
-def four_parts(
+def integral_in_four_parts(
     inverse_inertia: Differences, momentum: Triple, constants: Invariants, duration: Scalar
 ) -> MomentumAndIntegral:
     """Return the momentum after a time of either sign, and G over this time, in four equal parts.
@@ -305,7 +305,7 @@ def four_parts(
         # a part Π is the momentum at the middle of the part: the second step, with an odd i, gives
         # the term of the integral that belongs to this part.
         point, total = state
-        point, part = step_and_term(inverse_inertia, terms, sigma, point)
+        point, part = step_and_integral_term(inverse_inertia, terms, sigma, point)
         odd = i % 2 == 1
         total = tuple(a + jnp.where(odd, c, 0.0) for a, c in zip(total, part, strict=True))
         return MomentumAndIntegral(point, total)
@@ -377,7 +377,7 @@ def momentum_and_integral(
     # The time t is `count` whole periods and the rest r. Compute the motion over r and over one
     # whole period by the same program, in one loop, so that this program is compiled once.
     both = jax.tree.map(lambda *a: jnp.stack(a), (v, r), (usual, whole))
-    out, g = jax.lax.map(lambda a: four_parts(inverse_inertia, momentum, *a), both)
+    out, g = jax.lax.map(lambda a: integral_in_four_parts(inverse_inertia, momentum, *a), both)
     g = tuple(c[0] + jnp.where(several, count * c[1], 0.0) for c in g)
     return MomentumAndIntegral(tuple(p[0] for p in out), g)
 

@@ -118,8 +118,8 @@ def jump_times_within(*laws: object) -> Float[Array, " n"]:
     """Return the times, s, at which any of the `laws` (forces, torques, functions of time) jumps or
     has a kink, in no particular order.
 
-    A scene or torque that contains other laws must have the jump times of all these laws, because
-    the solver reads the `jump_times` of the outermost scene or torque only.
+    A scene or torque with other laws inside declares their jump times, too: the solver reads only
+    the `jump_times` of the outermost one.
     """
     jumps = (getattr(law, "jump_times", None) for law in laws)
     times = [jnp.asarray(times, float) for times in jumps if times is not None]

@@ -282,8 +282,8 @@ def require_frame(frame: object, name: str) -> MovingFrame:
 
 
 class _ComposedMotion(eqx.Module):
-    """Describe the motion of a frame that moves relative to `outer` as `inner` does relative to an
-    inertial frame, by functions of time for a `MovingFrame`.
+    """Describe, by functions of time, the motion of a frame that moves relative to `outer` as
+    `inner` does relative to an inertial frame.
     """
 
     outer: MovingFrame
@@ -303,9 +303,7 @@ class _ComposedMotion(eqx.Module):
 
 
 class _InverseMotion(eqx.Module):
-    """Describe the motion of the inertial frame relative to the moving frame `frame`, by functions
-    of time for a `MovingFrame`.
-    """
+    """Describe, by functions of time, the motion of the inertial frame relative to `frame`."""
 
     frame: MovingFrame
 

@@ -211,8 +211,8 @@ class _Checked(NamedTuple):
 
 
 def _checked(body: Body, state: PyTree, torque: Torque | None, t: ScalarLike) -> _Checked:
-    """Check a state, a torque and a time. Of a torque with states of its own the values of these
-    states, which a `Coupled` holds, are inserted.
+    """Return a state, a torque and a time after checks; the values of the torque's own states,
+    which a `Coupled` holds, are inserted.
     """
     if isinstance(state, Coupled):
         state, torque = state.motion, freeze_own_states(torque, state.own)

@@ -78,8 +78,8 @@ def family(
 
 
 def _is_lost(start: Array, numbers: Array, residuals: Array) -> Bool[Array, " members"]:
-    """Return for each member whether Newton's method failed, or went to another orbit: its period
-    is less than half or more than twice that of the member before it.
+    """Return for each member whether Newton's method failed, or found another orbit: one whose
+    period is less than half or more than twice that of the member before it.
     """
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
@@ -89,8 +89,8 @@ def _is_lost(start: Array, numbers: Array, residuals: Array) -> Bool[Array, " me
 def _unless_lost(
     numbers: Array, is_lost: Array, describe_member: Callable[[int], str], message: str, advice: str
 ) -> PeriodicOrbit:
-    """Return the members of a family, or raise an error with the words `describe_member` (called
-    only if `is_lost` is not traced) of the first lost one.
+    """Return the members of a family, or raise an error for the first lost one, in the words of
+    `describe_member`, which is called only if `is_lost` is not traced.
     """
     known = _checks.is_known(is_lost) and bool(is_lost.any())
     member = describe_member(int(np.argmax(np.asarray(is_lost)))) if known else ""

@@ -129,7 +129,7 @@ def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
 
 
 def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> Float[Array, "4"]:
-    """Return the four numbers of an orbit from three and the one that is held, at the place
+    """Return the four numbers of an orbit: three `unknown` ones, and `held_value` at the place
     `index`.
     """
     parts = list(unknown)
@@ -270,7 +270,7 @@ def _correct_orbit_jvp(
     """Return the corrected orbit and its tangent, by the implicit function theorem.
 
     The result does not depend on the `unknown` numbers from which Newton's method starts; the
-    tangent of what is left of the residual is taken as zero.
+    tangent of the remaining residual is taken as zero.
     """
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents

@@ -138,7 +138,7 @@ def tumble(
     >>> tumble(body, sol.ts, sol.ys, fps=2).data[:6]
     b'GIF89a'
     """
-    seconds, pictures = _length(ts, seconds, fps)
+    seconds, pictures = _duration_and_count(ts, seconds, fps)
     body = validation.require_single_body(body, (Inertia, MassProperties), "body")
     moments, q = resampled(ts, states, pictures)
     _warn_of_aliases(ts, states, moments, seconds)
@@ -196,7 +196,9 @@ def tumble(
     return Film(out.getvalue(), "gif", size)
 
 
-def _length(ts: NumbersLike, seconds: float | int | None, fps: float | int) -> tuple[float, int]:
+def _duration_and_count(
+    ts: NumbersLike, seconds: float | int | None, fps: float | int
+) -> tuple[float, int]:
     """Return the duration of a film, s, by default that of the motion, but at most 20 s; and the
     number of its pictures, at least 2.
     """
@@ -225,7 +227,7 @@ def player(
     **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises** as
     `tumble`.
     """
-    seconds, pictures = _length(ts, seconds, fps)
+    seconds, pictures = _duration_and_count(ts, seconds, fps)
     moments, q = resampled(ts, states, pictures)
     _warn_of_aliases(ts, states, moments, seconds)
     solid = _solid(validation.require_single_body(body, (Inertia, MassProperties), "body"), surface)
@@ -299,7 +301,7 @@ def resampled(ts: NumbersLike, states: PyTree, count: int) -> tuple[np.ndarray, 
 
 
 class _Solid(NamedTuple):
-    """Hold what a film draws, in body axes."""
+    """Hold the polygons that a film draws, in body axes."""
 
     polygons: np.ndarray  # (m, k, 3)
     sides: np.ndarray  # (m,) which of the colours `SHADES` is nearest
@@ -309,7 +311,7 @@ class _Solid(NamedTuple):
 
 
 def _solid(body: Inertia | MassProperties, surface: Any) -> _Solid:
-    """Return what is drawn for a body: its `surface`, or the uniform box that moves as it does."""
+    """Return the polygons of a body: its `surface`, or the uniform box that moves as it does."""
     half, axes = equal_box(body)
     if surface is None:
         polygons = ((CORNERS * half) @ axes.T)[np.array(FACES)]

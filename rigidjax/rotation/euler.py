@@ -132,7 +132,7 @@ def is_singular(angles: Vec3Like, sequence: str = "ZXZ") -> Bool[Array, ""]:
     True
     """
     axes, _ = _turns(sequence)
-    return _reach(_checked_angles(angles)[1], axes)[1]
+    return _triple_product(_checked_angles(angles)[1], axes)[1]
 
 
 def rates_to_omega(
@@ -182,11 +182,11 @@ def omega_to_rates(
     if frame == "world":
         omega = apply(to_matrix(angles, sequence).T, omega)
     first, second, third = _body_axes(axes, _in_order(angles, reverse))
-    reach, singular = _reach(angles[1], axes)
+    product, singular = _triple_product(angles[1], axes)
     # `second` is normal to `first` and `third`, so that `aside`, `second` and `third` are an
     # orthonormal frame: the rates follow from the components of `omega` in this frame.
     aside, along = cross(third, second), dot(first, third)
-    a = dot(aside, omega) / jnp.where(singular, 1, reach)
+    a = dot(aside, omega) / jnp.where(singular, 1, product)
     a = jnp.where(singular, 0 if reverse else along * dot(third, omega), a)
     c = jnp.where(singular & (not reverse), 0, dot(third, omega) - along * a)
     b = dot(second, omega)
@@ -201,7 +201,7 @@ class _Turns(NamedTuple):
 
 
 def _turns(sequence: str) -> _Turns:
-    """Return the turns of a sequence such as "ZXZ" or "xyz"; raise a `ValueError` for an unknown
+    """Return the turns of a sequence such as "ZXZ" or "xyz"; raise `ValueError` for an unknown
     one.
     """
     extrinsic = isinstance(sequence, str) and sequence.islower()
@@ -268,7 +268,9 @@ def _body_axes(
     return first, quaternion.rotate_inverse(last, second), third
 
 
-def _reach(middle_angle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
+def _triple_product(
+    middle_angle: Scalar, axes: tuple[int, int, int]
+) -> tuple[Scalar, Bool[Array, ""]]:
     """Return the product first · (third × second) of the axes of the turns, which vanishes in the
     singular case, and whether it is zero to round-off.
     """

@@ -181,9 +181,7 @@ def _estimate(
 
 
 class Turned(NamedTuple):
-    """Hold the directions bᵢ of the body, turned by a rotation M, beside the directions aᵢ of the
-    world.
-    """
+    """Hold directions bᵢ of the body, turned by a rotation M, beside directions aᵢ of the world."""
 
     moved: Float[Array, "n 3"]  # M bᵢ
     ratio: Float[Array, "n"]  # |M bᵢ|/|aᵢ|

@@ -212,8 +212,8 @@ def fit_light_curve(
 
 
 def _require_one_brightness(model: Model) -> Reading:
-    """Return the readings of the model's only sensor, a `Brightness`, without the axis that counts
-    recordings; refuse any other model.
+    """Return the readings of the only sensor, a `Brightness`, without their axis of recordings;
+    refuse any other model.
     """
     require_single(model)
     if not _checks.is_known(model):
@@ -270,9 +270,7 @@ def _alias(model: Model, x: Array, cost: float) -> Alias:
 
 
 def _distinct(model: Model, ends: list[Attempt]) -> list[Alias]:
-    """Return the different motions among the results of searches with a finite cost, the smallest
-    first.
-    """
+    """Return the different motions among the results of searches, the smallest cost first."""
     out: list[Alias] = []
     for end in sorted(ends, key=lambda one: float(one.cost)):
         if not np.isfinite(float(end.cost)):

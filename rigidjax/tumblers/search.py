@@ -67,12 +67,10 @@ def starts_of_pairs(
     noise: Float[np.ndarray, " times"] | None,
     pairs: Float[np.ndarray, "pairs 2"],
 ) -> list[Float[Array, " n"]]:
-    """Return the best starting points of the searches, as the parameters of the model, over all
-    given pairs of frequencies.
+    """Return the best starting points of the searches, as parameters of the model, for all `pairs`.
 
-    - `squared_flux`, `noise`: squared fluxes divided by the square of the median flux, and their
-      noise or `None`.
-    - `pairs`: the frequency of the mean precession and twice that of the rotation, 1/s.
+    Squared fluxes and their `noise` are divided by the square of the median flux; a pair is the
+    frequency of the mean precession and twice that of the rotation, 1/s.
     """
     sensor: Any = reading.sensor
     sigma = np.ones(t.shape) if noise is None else noise
@@ -122,9 +120,8 @@ def _step_from(q: Quat, principal_to_body: Mat3, reference: Quat) -> Vec3:
 
 
 def noise_of(reading: Reading, flux: np.ndarray, scatter: float) -> tuple[Float[Array, "1 1"], ...]:
-    """Return the noise of the readings in the unit of the sensor; one that is not known follows
-    from the `scatter`, the standard deviation of the squared `flux` (divided by its median) about
-    its best Fourier series.
+    """Return the noise of the readings in the unit of the sensor, if not known from `scatter`, the
+    deviation of the squared `flux` (over its median) about its best Fourier series.
     """
     sensor: Any = reading.sensor
     if sensor.noise is not None:

@@ -66,12 +66,11 @@ def best_candidates(
     areas: Float[np.ndarray, "3"] | None,
     body_count: int,
 ) -> list[Candidate]:
-    """Return the best motions on a grid of bodies and phases that have a given pair of frequencies,
-    the smallest χ² first, for `count` bodies of the grid.
+    """Return, on a grid of bodies and phases, the best motions that have a given pair of
+    frequencies, the smallest χ² first, of `body_count` bodies.
 
     - `pair`: the frequency of the mean precession, and twice that of the rotation, 1/s.
-    - `mode`: "long" or "short", for a momentum that circulates in the body about the axis of the
-      smallest or of the largest moment.
+    - `mode`: "long" or "short", as in `Alias`.
     - `light`: of the squared fluxes, with times in s, `z` not yet divided by the noise.
     - `bisector`: the direction n half way between sun and observer, world frame.
     - `areas`: (bc)², (ca)², (ab)² of an ellipsoid whose semi-axes a, b, c are known, or `None`.
@@ -170,8 +169,8 @@ def _grid_motions(
     """Return the motions with the frequencies `pair` of bodies with given moments, ascending, and
     `forms` M = (bc)², (ca)², (ab)² up to a common factor.
 
-    The level in the result is the factor by which the model Σ_k M_k (n·r_k)² is multiplied to give
-    the squared fluxes.
+    In `GridMotions` the level is the factor by which Σ_k M_k (n·r_k)² is multiplied to give the
+    squared fluxes.
     """
     ratio = 0.5 * pair[1] / pair[0]
 

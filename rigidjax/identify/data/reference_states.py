@@ -41,7 +41,7 @@ _DETERMINED = 1e-3
 
 
 class Samples(NamedTuple):
-    """Hold what readings show at some times."""
+    """Hold a quantity that readings show at some times."""
 
     # In s.
     t: Float[np.ndarray, " n"]
@@ -90,7 +90,8 @@ def attitudes(recording: Recording) -> Samples:
 
 @jax.jit
 def _wahba(sums: Float[ArrayLike, "n 3 3"]) -> Float[Array, "n 4"]:
-    """Return the attitudes of the sums Σ w bᵀ over directions w in the world and b in the body.
+    """Return the attitudes that solve Wahba's problem for each sum Σ w bᵀ over directions w in the
+    world and b in the body.
 
     It is `so3.wahba` without its check: a `Model` calls it within `jax.ensure_compile_time_eval`,
     where `equinox.error_if` in a compiled function always raises an error.
@@ -196,7 +197,7 @@ def _typical_rate(recording: Recording) -> float:
 class _Motion(NamedTuple):
     """Hold the first motion of the centre of mass, or with markers of the body frame's origin.
 
-    What no sensor shows is zero, the length 1.
+    A vector that no sensor shows is zero; the length is then 1.
     """
 
     # In m, and m/s.

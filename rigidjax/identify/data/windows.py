@@ -315,7 +315,7 @@ def _by_part(
 
 
 class Sampling(NamedTuple):
-    """Hold how a record is sampled."""
+    """Hold the step and the gaps of a record."""
 
     # The median interval between successive times, s.
     step: float
@@ -324,7 +324,7 @@ class Sampling(NamedTuple):
 
 
 def _sampling(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) -> Sampling:
-    """Return how a record is sampled, after a check of its rows.
+    """Return the step and the gaps of a record, after a check of its rows.
 
     States and inputs must be finite, quaternions of length 1 to within 0.01, and the intervals
     within a thousandth of their median, or gaps of more than 1.5 times the median.

@@ -566,7 +566,7 @@ class Outcome(NamedTuple):
 
 
 def outcome(beliefs: Belief, reads: tuple[ReadNumbers, ...], t0: Array) -> Outcome:
-    """Return whether a filter, which began at the time t0, followed the readings."""
+    """Return whether a filter followed the readings after the time t0, and when it was lost."""
     t, times = beliefs.t, jnp.arange(beliefs.t.shape[0])
     lost = jnp.zeros(t.shape, bool)
     for read in reads:

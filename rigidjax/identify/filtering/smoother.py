@@ -210,8 +210,8 @@ def _iteration(
     path: ExtendedState,
     kicks: Float[Array, "stops normals"],
 ) -> _Iteration:
-    """Return the most probable motion of the problem linearised about a `path` of N + 1 states and
-    the noise that `kicks` make: one Gauss–Newton iteration.
+    """Return one Gauss–Newton iteration: the most probable motion of the problem linearised about a
+    `path` of N + 1 states and the noise that `kicks` make.
     """
     dtype = belief.root.dtype
 

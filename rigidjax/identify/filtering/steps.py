@@ -145,8 +145,8 @@ class Dynamics(eqx.Module):
     def predict(
         self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array | None = None
     ) -> "Prediction":
-        """Return the state after a step of duration h, s, from the state x at the time t, and how
-        its errors come about, at the noise that `kicks` give (zeros for `None`).
+        """Return the state after a step of duration h, s, from the state x at the time t, and the
+        transition and noise of its errors, linearised at the `kicks` (zeros for `None`).
         """
         kicks = jnp.zeros(self.normals_per_step, x.motion.omega.dtype) if kicks is None else kicks
         after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
@@ -177,7 +177,7 @@ class Prediction(NamedTuple):
 
 
 def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: ExtendedState) -> Dynamics:
-    """Return what a filter uses of a `scene` whose torque reads no `Input`, for states like x."""
+    """Return the `Dynamics` of a `scene` whose torque reads no `Input`, for states like x."""
     dtype = x.motion.omega.dtype
     body: Any = needed_body(in_precision(scene.body, dtype), type(x.motion))
     return Dynamics(

@@ -188,7 +188,7 @@ class _Data(NamedTuple):
 def _recorded(
     recordings: list[Any], charts: Charts, torque: Torque | None, integrator: Any, **_: Any
 ) -> _Data:
-    """Return the parts of a `Model` that come from recordings, after checks."""
+    """Return those fields of a `Model` that come from recordings, after checks."""
     if not recordings:
         raise ValueError("Model: wanted at least one Recording, got an empty sequence")
     for item in recordings:
@@ -250,7 +250,7 @@ def _windowed(
     integrator: Any,
     **_: Any,
 ) -> _Data:
-    """Return the parts of a `Model` that come from windows, after checks."""
+    """Return those fields of a `Model` that come from windows, after checks."""
     require_inputs(torque, windows)
     records = windows.records()
     sensors = records.sensors

@@ -412,10 +412,9 @@ def body_places(
 def body_at(
     charts: Charts, vector: Numbers, body_index: Int[Array, ""] | None
 ) -> Inertia | MassProperties:
-    """Return the body of one recording from its row, in which the parameters of the body come
-    first.
+    """Return the body of one recording, whose parameters come first in the row `vector`.
 
-    The index of the body among several, which may be traced, is `None` for a single body.
+    `body_index`, its index among several bodies, may be traced; it is `None` for a single body.
     """
     if body_index is None:
         return charts[0].body(vector[: charts[0].size])

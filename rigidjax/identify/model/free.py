@@ -166,7 +166,7 @@ class Groups(NamedTuple):
 def group_recordings(each: str | tuple[Any, ...], body_names: Sequence[str], name: str) -> Groups:
     """Return the groups of recordings with the same label, or of the same body for `"body"`.
 
-    `name` is what has the labels in an error.
+    `name` stands in errors for the object with the labels.
     """
     row = list(body_names) if isinstance(each, str) else list(each)
     if len(row) != len(body_names):
@@ -308,8 +308,8 @@ def leaf_at(where: Callable[[Any], Any], tree: PyTree, name: str, role: str) -> 
     """Return the path and the value of the numbers that `where` picks from a pytree, such as a
     `Scene`.
 
-    An error calls what has `where` the `name`, and what needs a starting value the `role`.
-    `ValueError` is raised if `where` does not pick one array of numbers.
+    In errors, `name` stands for the object with this `where`, and `role` for the object that needs
+    a starting value. `ValueError` is raised if `where` does not pick one array of numbers.
     """
     pairs, structure = jax.tree.flatten_with_path(tree)
     paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]

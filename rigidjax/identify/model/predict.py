@@ -112,7 +112,7 @@ class FixedSteps(AbstractIntegrator):
 
 
 def _tolerance(value: ScalarLike, name: str) -> Array:
-    """Return a tolerance as an array: another one needs no new compilation."""
+    """Return a tolerance as an array, so that a new value needs no new compilation."""
     return jnp.asarray(_checks.python_float(value, name), jnp.result_type(float))
 
 
@@ -287,7 +287,7 @@ def sensor_inputs(
     states: PyTree,
     delay: Array | None = None,
 ) -> Along:
-    """Return what a sensor with the time stamps `ts`, s, reads along a motion.
+    """Return the `Along` of a sensor with the time stamps `ts`, s.
 
     The `states` are those at `ts`. `delay`, one number or one for each time, s, is added to the
     clock offset of the sensor.

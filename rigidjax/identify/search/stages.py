@@ -59,7 +59,7 @@ PARTS, SHORTEST, FEW = (9, 3), 5, 10
 
 
 class Evaluation(NamedTuple):
-    """Hold what a search keeps from its last evaluation of the cost."""
+    """Hold the blocks of the last evaluation of the cost, and the gradients of all recordings."""
 
     blocks: Blocks
     # For each kind and recording the gradient of the cost of its readings in its row.
@@ -77,7 +77,7 @@ class Attempt(eqx.Module):
 
 
 class Task(NamedTuple):
-    """Hold what a search has to fit, and how precisely."""
+    """Hold the model and the noise of a search, and its precision."""
 
     model: Model
     noise: Noise
@@ -175,7 +175,7 @@ def marquardt(
 
 
 class _Kind(NamedTuple):
-    """Hold what a search reads of one kind of recordings."""
+    """Hold the model of one kind of recordings for one search."""
 
     part: Part
     # Its integrator computes no states long after the last reading with a weight.
@@ -186,7 +186,7 @@ class _Kind(NamedTuple):
 
 
 def _kind(model: Model, part: Part, noise: Noise, weights: Float[Array, "records times"]) -> _Kind:
-    """Return what a search reads of one `part` of a `model`."""
+    """Return the `_Kind` of a `part` of a `model`."""
     one, places = (
         dataclasses.replace(part.model, loss=model.loss),
         model.index.places[part.recordings_slice],

@@ -120,8 +120,8 @@ _POSSIBLE = 1e-4
 
 
 def carried_bodies(model: Model, names: list[str]) -> dict[str, Any]:
-    """Return the bodies of carried recordings, by name, by weighted linear least squares, made
-    possible.
+    """Return the bodies of carried recordings, by name, by weighted linear least squares; an
+    impossible result is replaced by the body of a pseudo-inertia with positive eigenvalues.
     """
     from scipy.linalg import lstsq
 
@@ -159,7 +159,7 @@ def carried_bodies(model: Model, names: list[str]) -> dict[str, Any]:
 
 
 def _body_of_ten(ten: Float[Array, "10"]) -> MassProperties:
-    """Return the body of ten numbers, in the order of `_TEN`, in which its wrench is linear."""
+    """Return the body of ten numbers in the order of `_TEN`; its wrench is linear in them."""
     xx, yy, zz, yz, xz, xy = ten[:6]
     com = ten[6:9] / ten[9]
     about_origin = from_components(xx, yy, zz, xy, xz, yz)

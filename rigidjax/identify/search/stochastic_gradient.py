@@ -147,7 +147,7 @@ def _descent_steps(
     keys: Array,
 ) -> tuple[Array, Any, Array]:
     """Return x, the state of the optimiser and the cost before each step, after a step for each of
-    the `keys`, which draw the recordings of a batch.
+    the `keys`, by which batches of recordings are drawn.
     """
 
     def descent_step(carry: tuple, key: Array) -> tuple[tuple, Array]:

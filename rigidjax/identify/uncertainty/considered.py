@@ -201,7 +201,7 @@ def usual_shifts(
     covariance: Float[np.ndarray, "n n"],
     slopes: Float[np.ndarray, "quantities n"],
 ) -> list[UsualShifts]:
-    """Return how much a `USUAL` error of each sensor without a `Tolerance` would change quantities.
+    """Return the shifts of quantities by a `USUAL` error of each sensor without a `Tolerance`.
 
     The `covariance` is that for white errors; `slopes` are the derivatives of the quantities.
     """

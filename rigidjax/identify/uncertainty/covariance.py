@@ -375,7 +375,7 @@ class _RangeAndNull(NamedTuple):
 
 
 def _range_and_null(rows: Float[np.ndarray, "q k"]) -> _RangeAndNull:
-    """Compute the range and the null space of a matrix whose columns are of order one."""
+    """Return range and null space of a matrix whose columns are of order one."""
     u, singular, directions = np.linalg.svd(rows, full_matrices=False)
     determined = singular > BLIND * singular.max(initial=1.0)
     root = directions[determined].T / singular[determined]
@@ -551,7 +551,7 @@ class CorrelationTimes(eqx.Module):
 
 
 def correlation_times(linear: Linearisation) -> CorrelationTimes:
-    """Return over how many samples the errors of each channel are correlated.
+    """Return the number of samples over which the errors of each channel are correlated.
 
     Readings at full scale are left out.
     """

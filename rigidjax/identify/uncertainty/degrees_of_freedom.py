@@ -20,7 +20,7 @@ class _Width(NamedTuple):
 
 
 class Freedom(eqx.Module):
-    """Hold what gives the degrees of freedom of the variance of any function of the parameters.
+    """Hold the degrees of freedom of noise and widths, and the covariance that weighs them.
 
     **Fields:**
 

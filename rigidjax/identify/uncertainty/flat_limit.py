@@ -174,7 +174,7 @@ def limits(
     step_to_minimum: Float[np.ndarray, " n"],
     body_suffixes: list[str],
 ) -> tuple[Limit, ...]:
-    """Return how far each body with free moments is from a flat body.
+    """Return the `Limit` of each body with free moments.
 
     The rows of `quantities`, as `quantities_on_host` returns them, end with the flatness of each
     body; `step_to_minimum` leads from the best point to the minimum of the linearised model.

@@ -111,7 +111,7 @@ class Label(NamedTuple):
 
 
 def labels(model: Model) -> list[Label]:
-    """Return what each reported quantity is called, in the order of `quantity_vector`."""
+    """Return a `Label` for each reported quantity, in the order of `quantity_vector`."""
     out = []
     for name, chart in named_charts(model):
         for names, positive in ((chart.log_names, True), (chart.plain_names, False)):

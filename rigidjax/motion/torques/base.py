@@ -239,8 +239,8 @@ def evaluate_torque(
 def force_and_torque(
     model: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> tuple[Vec3 | None, Vec3]:
-    """Return the force on the centre of mass, N, world frame, or `None` of a pure torque, and the
-    torque about the centre of mass, N m, body frame, in the precision of the state.
+    """Return the force on the centre of mass, N, world frame (`None` for a pure torque), and the
+    torque about it, N m, body frame, in the precision of the state.
     """
     require_compatible(model, state, body)
     dtype = state.omega.dtype

@@ -184,7 +184,7 @@ def _motion(value: Any) -> Any:
 
 
 def _spline(t: Any, rows: Any, name: str) -> Series:
-    """Return the spline through logged vectors, in whose errors their `name` stands."""
+    """Return the spline through logged vectors; `name` is their name in errors."""
     size = 7 if name == "x or q" else 3
     try:
         return Series(t, _checks.array_of_shape(rows, (size,), name, batched=True))
@@ -193,7 +193,7 @@ def _spline(t: Any, rows: Any, name: str) -> Series:
 
 
 def _smoothed(t: Float[np.ndarray, " n"], rows: Float[np.ndarray, "n k"]) -> Any:
-    """Return the spline of degree 5 of the least generalised cross-validation."""
+    """Return the spline of degree 5 with the least generalised cross-validation."""
     from scipy.interpolate import make_lsq_spline
 
     best: tuple[float, Any] = np.inf, None
@@ -248,7 +248,7 @@ class Carried(AbstractForce):
 
 
 def relative_acceleration(omega: Vec3, alpha: Vec3, place: Vec3) -> Vec3:
-    """Return the acceleration of a `place` r of a body beside that of the origin of r, m/s², body
-    frame: `dΩ/dt × r + Ω × (Ω × r)` (notes, eq 88).
+    """Return the acceleration of the point r = `place` of a body relative to that of the origin of
+    r, m/s², body frame: `dΩ/dt × r + Ω × (Ω × r)` (notes, eq 88).
     """
     return cross(alpha, place) + cross(omega, cross(omega, place))

@@ -74,7 +74,7 @@ class HeavyTop(base.AbstractTorque):
 
 
 class _Pull(NamedTuple):
-    """Hold what the gravity of a far point mass depends on at one time."""
+    """Hold the gravity of a far point mass at one time."""
 
     # The unit vector u from the body to the point mass, body axes.
     direction: Vec3

@@ -134,8 +134,8 @@ def state_rates(
 
 
 def _inserted(torque: PyTree, states_of: Callable[[PyTree], PyTree]) -> PyTree:
-    """Return a torque in which each one with states of its own is a `FrozenLaw` with the states
-    that `states_of` returns, which is called for inner torques first.
+    """Return a torque with each part that has states of its own replaced by a `FrozenLaw` with the
+    states from `states_of`, which is called for inner parts first.
     """
 
     def is_leaf(node: PyTree) -> bool:
@@ -150,9 +150,7 @@ def _inserted(torque: PyTree, states_of: Callable[[PyTree], PyTree]) -> PyTree:
 
 
 def _is_node(node: PyTree) -> bool:
-    """Return whether `node` has states of its own, or is a `FrozenLaw`, in which they are
-    inserted.
-    """
+    """Return whether `node` has states of its own, or is a `FrozenLaw`, which holds them."""
     return isinstance(node, FrozenLaw) or has_own_states(node)
 
 

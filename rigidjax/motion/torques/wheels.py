@@ -278,9 +278,7 @@ class ReactionWheels(base.AbstractTorque):
 
 
 def _checked(value: NumbersLike | None, count: int, name: str, requirement: str) -> Array | None:
-    """Return a property of the wheels, such as the largest torque, as one number, or one for each
-    wheel.
-    """
+    """Return a property of the wheels after checks, one number or one for each wheel."""
     if value is None:
         return None
     numbers = base.one_or_each(value, count, name)
