@@ -223,8 +223,7 @@ def _combined(
     tree: PyTree,
     checkpoint: str | os.PathLike[str] | None,
 ) -> PyTree:
-    """Return the arrays of a tree, joined or summed over all processes by `combine`, which sends
-    one array.
+    """Return a tree whose arrays `combine` has joined or summed over all processes, one by one.
 
     The tree is written to the folder `checkpoint`, if there is one, before it is sent, so that it
     is not lost if another process has ended; a folder that cannot be written only makes a warning.

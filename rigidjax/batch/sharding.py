@@ -108,9 +108,7 @@ def divide_batch(
     dtype: np.dtype,
     num_bodies: int,
 ) -> Division:
-    """Return how a batch is divided, for the arguments of `rollout` and the dtype of the numbers,
-    after checks.
-    """
+    """Return how a batch is divided, by checked arguments of `rollout` and its dtype."""
     if progress_meter is not None and devices is not None:
         raise ValueError(
             "progress_meter: wanted devices=None, since several devices would move one meter; got "
@@ -167,9 +165,7 @@ def fit_chunk(
 
 
 def memory_of(mesh: Mesh | None) -> float:
-    """Return how many bytes of its memory JAX may use on a device, or infinity if JAX does not
-    know.
-    """
+    """Return how many bytes JAX may use on a device, or infinity if it does not know."""
     default: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     chosen = default if isinstance(default, jax.Device) else jax.devices()[0]
     device = chosen if mesh is None else mesh.devices.flat[0]

@@ -68,9 +68,7 @@ class OneBody(NamedTuple):
 
 
 def one_body(shared: PyTree, row: PyTree, constants: PyTree) -> OneBody:
-    """Return one body of a batch, from a row of the tree `per_body` and the other two trees of a
-    `BodyBatch`.
-    """
+    """Return one body of a batch, from a row of `per_body` and the rest of a `BodyBatch`."""
     body, state0, torque = eqx.combine(shared, row, constants)
     return OneBody(body, project_to_group(validation.checked_start(state0, False)), torque)
 
@@ -225,9 +223,7 @@ def _own_arrays(torque: Torque | None, torque_axes: TorqueAxes, num_bodies: int)
 def _check_inertia(
     bodies: Inertia | MassProperties,
 ) -> tuple[Inertia | MassProperties, list[Check]]:
-    """Return the bodies, with NaN for a traced impossible inertia, and, if they are known, a check
-    of their inertias.
-    """
+    """Return the bodies, with NaN for impossible traced inertias, and checks of known ones."""
     tensor = tensor_of(bodies)
     if not _checks.is_known(tensor):
         return validation.real_or_nan(bodies), []

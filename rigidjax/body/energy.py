@@ -185,9 +185,7 @@ def _rate(state: HasSpin | Vector) -> Vec3:
 
 
 def _tensor(body: Inertia | MassProperties) -> Mat3:
-    """Return the inertia tensor, kg m², of one possible body; of `MassProperties`, the one about
-    the centre of mass.
-    """
+    """Return the checked inertia tensor, kg m²; that of `MassProperties` is about its com."""
     return tensor_of(
         validation.require_single_body(body, (Inertia, MassProperties), "body", hint=_HINT)
     )

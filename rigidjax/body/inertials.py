@@ -87,9 +87,7 @@ _CHANGES = {
 
 
 def _equals_one_of(value: str, options: Sequence[str]) -> bool:
-    """Return whether an attribute equals one of several texts, as numbers if all of them are
-    numbers: "0.0" equals "0".
-    """
+    """Return whether an attribute equals one of some texts; numbers are compared as numbers."""
     try:
         return float(value) in map(float, options)
     except ValueError:
@@ -216,9 +214,7 @@ def _body(
 def _read_numbers(
     element: Tree.Element | None, key: str, count: int, default: list[float] | None = None
 ) -> np.ndarray:
-    """Return the `count` finite numbers in an attribute of an element, or the `default` if there is
-    none.
-    """
+    """Return the `count` finite numbers in an attribute of an element, else the `default`."""
     text = None if element is None else element.get(key)
     if text is None:
         if default is None:

@@ -111,9 +111,7 @@ def _tetrahedra(vertices: Float[Array, "n 3"], faces: Int[Array, "m 3"]) -> Tetr
 
 
 def _positive_volume(volume: Array, vertices: Array, faces: Array) -> Array:
-    """Return the volume of a mesh, m³, or raise an error if it is negative (the mesh is inside out)
-    or zero to round-off.
-    """
+    """Return the volume of a mesh, m³; raise an error if the mesh is flat or inside out."""
     # The volume counts as zero if it is below the area of the mesh times a few units of round-off
     # of its longest extent: the mesh is then as thin as the last digit of its length.
     a, b, c = (jax.lax.stop_gradient(vertices[faces[:, k]]) for k in range(3))

@@ -11,16 +11,12 @@ from jaxtyping import Array, Float, Int
 
 
 def binary_exponent(x: Float[Array, "..."]) -> Int[Array, ""]:
-    """Return the integer n with 2ⁿ⁻¹ ≤ max |x| < 2ⁿ, or 0 if all entries are zero; in derivatives
-    it is constant.
-    """
+    """Return the constant integer n with 2ⁿ⁻¹ ≤ max |x| < 2ⁿ, or 0 if all entries are 0."""
     return jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(x))))[1]
 
 
 def times_power_of_two(x: Float[Array, "..."], n: Int[Array, ""]) -> Float[Array, "..."]:
-    """Return x 2ⁿ for an integer n with |n| ≤ 2044 (float32: 252), exact if the product is a normal
-    number.
-    """
+    """Return x 2ⁿ, |n| ≤ 2044 (float32: 252), exact if the product is a normal number."""
     half = n // 2
     # 2ⁿ itself may overflow: `x` is multiplied by two smaller powers, one after the other. Without
     # the barrier XLA, where it knows n, would first multiply the two powers. The powers are made

@@ -190,9 +190,7 @@ def _checked_lengths(value: NumbersLike, shape: tuple[int, ...], name: str) -> A
 def _checked_radii(
     inner: ScalarLike, outer: ScalarLike, names: tuple[str, str] = ("inner", "outer")
 ) -> tuple[Array, Array]:
-    """Return the inner and the outer radius, m, or raise an error if they are known and negative or
-    in the wrong order.
-    """
+    """Return both radii, m; raise an error for known ones below 0 or in the wrong order."""
     r, R = _checked_lengths(inner, (), names[0]), _checked_lengths(outer, (), names[1])
     if _checks.is_known((r, R)):
         _checks.error_if(

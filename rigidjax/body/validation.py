@@ -39,9 +39,7 @@ def require_physical_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array,
 
 
 def require_physical_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Return the principal moments, kg m², in any order, or raise an error if no real body has
-    them.
-    """
+    """Return principal moments, kg m², in any order; raise an error if no body has them."""
     if not _checks.is_known(moments) and _checks.is_known(plain := lax.stop_gradient(moments)):
         # The numbers are known, and are traced only to be differentiated: check them once by NumPy,
         # instead of by twenty compiled programs.
@@ -53,9 +51,7 @@ def require_physical_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def require_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Return the second moment ∫ r rᵀ dm, kg m², or raise an error if it is not symmetric and
-    positive semi-definite.
-    """
+    """Return the second moment ∫ r rᵀ dm, kg m², if symmetric and positive semi-definite."""
     s = _require_symmetric(_checks.require_finite(s, "second moment"), "second moment")
     least, largest = (e := _eigenvalues(s))[..., 0], e[..., 2]
     got = f", got principal second moments {_text(e)} kg m²" if _checks.is_known(s) else ""
@@ -75,8 +71,7 @@ def require_single_body(
     requirement: str = "",
     hint: str = "",
 ) -> Any:
-    """Return `value` if it is one body of one of the classes `kinds`, of a mass and inertia that a
-    real body can have.
+    """Return `value` if it is one real body of one of the classes `kinds`.
 
     Impossible numbers raise an error if they are known, and become NaN if they are traced. A moment
     may be zero: a function that divides by the moments calls `require_physical_body`. The other
@@ -224,17 +219,13 @@ def _faults(xp: ModuleType, tensor: Array | np.ndarray, allow_zero_moment: bool)
 
 
 def is_physical_inertia(tensor: Float[Array, "*batch 3 3"]) -> Bool[Array, "*batch"]:
-    """Return whether a real body can have the inertia tensor, kg m², and none of its moments is
-    zero.
-    """
+    """Return whether a body can have the inertia tensor, kg m², and no moment is zero."""
     flat, broken, skew = _faults(jnp, lax.stop_gradient(tensor), allow_zero_moment=False)
     return ~(flat | broken | skew)
 
 
 def unit_attitude(q: Quaternion) -> Quat:
-    """Return a unit quaternion, scaled to length 1, or raise an error if it is known and not finite
-    or not of unit length.
-    """
+    """Return a quaternion at length 1; raise an error if it is known and not of unit length."""
     q = _checks.finite_array(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
     return quaternion.normalise(require_near_unit(q, "q", rotation_tolerance(q.dtype)))
 
@@ -280,16 +271,12 @@ def _require_symmetric(a: Array, name: str) -> Array:
 
 
 def _constant(a: Array) -> Array | np.ndarray:
-    """Return an array as a constant, of NumPy if it is known, with which a check takes only
-    microseconds.
-    """
+    """Return an array as a constant, of NumPy if it is known: a check then takes microseconds."""
     return np.asarray(a) if _checks.is_known(a) else lax.stop_gradient(a)
 
 
 def _eigenvalues(a: Array) -> Array | np.ndarray:
-    """Return the ascending eigenvalues of symmetric matrices as constants, by NumPy if they are
-    known.
-    """
+    """Return ascending eigenvalues of symmetric matrices as constants, of NumPy if known."""
     if _checks.is_known(a):
         return np.linalg.eigvalsh(np.asarray(a))
     scale = jnp.abs(a).max(axis=(-1, -2), keepdims=True)

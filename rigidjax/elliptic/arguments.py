@@ -36,8 +36,7 @@ def common(**numbers_by_name: Real) -> tuple[RealOrArray, ...]:
 
 
 def with_complement(name: str, value: Real, complement: Real | None) -> dict[str, RealOrArray]:
-    """Return a number and its complement, 1 minus the number, as a dictionary with the keys `name`
-    and `name` + "1".
+    """Return a number and its complement to 1 by the keys `name` and `name` + "1".
 
     The `complement` is given by a caller who knows it with more digits than 1 − `value`; a
     `ValueError` is raised if the two differ by more than round-off.

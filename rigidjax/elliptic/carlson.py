@@ -169,9 +169,7 @@ def _rd_jvp(
 
 
 def _duplication_shift(x: Array, y: Array, z: Array) -> Array:
-    """Return λ = √x√y + √x√z + √y√z, by which the duplication theorem shifts its arguments (DLMF
-    19.26.18).
-    """
+    """Return √x√y + √x√z + √y√z, by which duplication shifts arguments (DLMF 19.26.18)."""
     a, b, c = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
     return a * b + b * c + c * a
 

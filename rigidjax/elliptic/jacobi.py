@@ -113,9 +113,7 @@ def functions(u: Array, m: Array, m1: Array) -> Functions:
 
 @jax.custom_jvp
 def _sncndn(u: Array, m: Array, m1: Array) -> SnCnDn:
-    """Return sn, cn and dn for a parameter m ≤ 1 that equals 1 − m1; derivatives are taken with
-    respect to u and m1 alone.
-    """
+    """Return sn, cn and dn for m = 1 − m1 ≤ 1, with derivatives by u and m1 alone."""
     turns, angle, rows = _reduced(u, m1)
     sign = power_of_minus_one(turns)
     theta = jnp.abs(angle)

@@ -148,9 +148,7 @@ def ellippiinc(
 def incomplete_integral(
     orders: tuple[int, int, int], sine: Array, cosine: Array, m1: Array, n1: Array
 ) -> Array:
-    """Return I_jkl for the `orders` (j, k, l) and |φ| ≤ π/2, from sin φ and cos φ, so that no digit
-    is lost near φ = π/2.
-    """
+    """Return I_jkl, |φ| ≤ π/2, from sin φ and cos φ, which lose no digit near φ = π/2."""
     j, k, last = orders
     s, c2 = sine, cosine * cosine
     one, delta2 = jnp.ones_like(s), c2 + m1 * s * s

@@ -43,9 +43,7 @@ class ClosedFormConstants(NamedTuple):
 
 @one_kernel
 def closed_form_constants(moments: Triple, momentum: Triple) -> ClosedFormConstants:
-    """Return the constants of a free motion; the principal moments ascend, and some may be
-    equal.
-    """
+    """Return the constants of a free motion; principal moments ascend, and some may be equal."""
     (i1, i2, i3), (p1, p2, p3) = moments, momentum
     r1, r2, r3 = 1.0 / i1, 1.0 / i2, 1.0 / i3
     d12, d13, d23 = (i2 - i1) * (r1 * r2), (i3 - i1) * (r1 * r3), (i3 - i2) * (r2 * r3)
@@ -89,9 +87,7 @@ def reduce_time(u: Scalar, half_period: Scalar, modulus: Modulus) -> ReducedTime
 
 
 def momentum_at(constants: ClosedFormConstants, functions: Elliptic) -> Triple:
-    """Return the body momentum, in the labels of `constants`, at the time of the elliptic
-    functions.
-    """
+    """Return the body momentum, in the labels of `constants`, from the elliptic functions."""
     p1, p2, p3 = constants.P
     S, C, D, *_ = functions
     # Compute the larger of C² and D² again from the smaller, by D² − C² = (p − q)S². If the

@@ -75,9 +75,7 @@ def adjugate(matrix: SymmetricEntries) -> SymmetricEntries:
 
 
 def half_product(q: QuaternionEntries, vector: Triple) -> QuaternionEntries:
-    """Return ½ q ⊗ (0, v), which is the rate of change of the quaternion q if v = `vector` is the
-    body rate.
-    """
+    """Return ½ q ⊗ (0, v), the derivative of q by time if v = `vector` is the body rate."""
     w, x, y, z = q
     a, b, c = 0.5 * vector[0], 0.5 * vector[1], 0.5 * vector[2]
     return (

@@ -90,9 +90,7 @@ class Inverse(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Hold the momentum Π(t), the turn from time 0 to t, and the rate Ω(t) of a free body, along
-    principal axes.
-    """
+    """Hold Π(t), the turn from time 0 to t, and Ω(t) of a free body, in principal axes."""
 
     momentum: Triple
     turn: QuaternionEntries
@@ -100,9 +98,7 @@ class Motion(NamedTuple):
 
 
 class RateAndTurn(NamedTuple):
-    """Hold the body rate Ω(t) of a free body, and the quaternion of its turn from time 0 to t, both
-    in the body frame.
-    """
+    """Hold Ω(t) and the turn from time 0 to t of a free body, both in the body frame."""
 
     rate: Float[Array, "*n 3"]
     turn: Float[Array, "*n 4"]
@@ -300,8 +296,7 @@ def _rate_rows(
 
 
 class MotionDerivatives(NamedTuple):
-    """Hold the derivatives of Π(t), θ and Ω(t) with respect to the variables of
-    `ten_variables`.
+    """Hold the derivatives of Π(t), θ and Ω(t) by the variables of `ten_variables`.
 
     θ is the small rotation vector that changes the turn R: δR = R hat(θ), where hat(θ) is the
     matrix of the cross product with θ.
@@ -325,9 +320,7 @@ class MotionAndDerivatives(NamedTuple):
 def motion_and_derivatives(
     inertia: SymmetricEntries, momentum: Triple, t: Scalar
 ) -> MotionAndDerivatives:
-    """Return the motion of a free body with its derivatives, for the inputs of
-    `free_motion`.
-    """
+    """Return the motion of a free body and its derivatives, for the inputs of `free_motion`."""
     (out, turn), parts = _turn_and_parts(
         closed_form_constants(inertia[:3], momentum), inertia, momentum, t
     )
@@ -344,9 +337,7 @@ def _motion_and_derivatives_jvp(
     primals: tuple[SymmetricEntries, Triple, Scalar],
     tangents: tuple[PyTree, ...],
 ) -> tuple[MotionAndDerivatives, MotionAndDerivatives]:
-    """Return the motion of a free body with its derivatives, and their tangents, by which JAX takes
-    second derivatives.
-    """
+    """Return motion and derivatives, and their tangents, which second derivatives need."""
     motion, rows, parts = motion_and_derivatives(*primals)
     (body, *k), (_, *d_k), variables, change = _inputs(primals, tangents)
     d_motion = _motion_tangent(motion, rows, change)

@@ -180,9 +180,7 @@ def _checked_time(t: ScalarLike, omega: Array) -> Scalar:
 
 
 def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
-    """Return the inertia after checks of it and of the state; a traced inertia that no real body
-    has becomes NaN.
-    """
+    """Return the inertia after checks of it and the state; a traced impossible one is NaN."""
     if isinstance(state0, HasPose) or not isinstance(state0, HasSpin):
         raise TypeError(
             f"state0: wanted a Spin or an Attitude, got {type(state0).__name__}; the centre "

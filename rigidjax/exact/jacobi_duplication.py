@@ -157,9 +157,7 @@ def third_kind_series(S: Scalar, modulus: Modulus, mu: Scalar) -> Scalar:
 
 
 def elliptic_functions(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Elliptic:
-    """Return the elliptic functions and the phase at the time u, where |u| is at most a quarter
-    period and 0 ≤ μ ≤ √(pq).
-    """
+    """Return elliptic functions and phase at u, at most a quarter period, for 0 ≤ μ ≤ √(pq)."""
     n = iteration_limits(u.dtype).doublings
     f = elliptic_series(u * 2.0**-n, modulus, mu, phase_factor)
     # Double the time in a loop: it compiles eight times sooner than nine doublings written out.
@@ -167,9 +165,7 @@ def elliptic_functions(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Sc
 
 
 class HalfPeriod(NamedTuple):
-    """Hold the duration of half a period of the elliptic function S, the phase ξ at its end, and
-    the mean of S² over it.
-    """
+    """Hold the duration of half a period of S, the phase ξ at its end, and the mean of S²."""
 
     time: Scalar  # the least time T > 0 with S(T) = 0; infinite on the separatrix
     phase: Scalar  # the phase ξ at the end of the half period

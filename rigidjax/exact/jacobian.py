@@ -167,9 +167,7 @@ def momentum_jacobian(
 
 
 def elliptic_integrals(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Integrals:
-    """Return the elliptic functions, their phase and the integrals at the time u, where |u| is at
-    most a quarter period.
-    """
+    """Return elliptic functions, phase and integrals at u, at most a quarter period."""
     n = iteration_limits(u.dtype).doublings
     f = elliptic_series(u * 2.0**-n, modulus, mu, phase_factor)
     # The integrand S²/D² is S²/(1 + μS²) with μ = −q, and S²/C² is the same with μ = −p: one series

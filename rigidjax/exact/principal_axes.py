@@ -21,9 +21,7 @@ _SWEEPS = 6
 
 
 class PrincipalAxes(NamedTuple):
-    """Hold an inertia tensor in principal axes, and the rotation matrix whose columns are these
-    axes, in the body frame.
-    """
+    """Hold an inertia tensor in principal axes, and the matrix with these axes as columns."""
 
     inertia: SymmetricEntries  # with ascending moments
     axes: Mat3
@@ -42,8 +40,7 @@ def principal_axes(tensor: Mat3) -> PrincipalAxes:
 
 @jax.custom_jvp
 def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> SymmetricEntries:
-    """Return the inertia tensor in principal axes, AᵀIA, where the columns of A = `axes` are the
-    axes.
+    """Return the inertia tensor AᵀIA in the principal axes, the columns of A = `axes`.
 
     In value the result is the diagonal matrix of the `moments`. Its tangent for δI is AᵀδI A, with
     A held fixed: a full symmetric matrix.
@@ -74,9 +71,7 @@ def components_along(axes: Mat3, vector: Vec3 | Triple) -> Triple:
 
 
 def combine_columns(axes: Mat3, components: Triple) -> Triple:
-    """Return the vector with the given `components` along the columns of `axes`, the inverse of
-    `components_along`.
-    """
+    """Return the vector with the `components` along the columns of `axes`."""
     return tuple(
         axes[i, 0] * components[0] + axes[i, 1] * components[1] + axes[i, 2] * components[2]
         for i in range(3)

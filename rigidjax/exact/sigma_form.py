@@ -102,9 +102,7 @@ class Sigma(NamedTuple):
 
 
 class MomentumAndIntegral(NamedTuple):
-    """Hold the body momentum Π after some time, and the matrix G = ∫ Π Πᵀ dt over it (or one term
-    of G).
-    """
+    """Hold the body momentum Π after some time, and G = ∫ Π Πᵀ dt over it (or a term of G)."""
 
     momentum: Triple
     integral: SymmetricEntries
@@ -143,8 +141,7 @@ _MORE = 10
 
 
 def sigma_series(u: Scalar, constants: Invariants) -> Sigma:
-    """Return the sigma functions at a time u so short that two terms of their Taylor series are
-    exact to round-off.
+    """Return the sigma functions at a time u so short that two Taylor terms are exact.
 
     The matrix T = √(1 − X) is taken to second order in the matrix X = σ² (E − E₂₂ 1).
     """
@@ -164,9 +161,7 @@ def sigma_series(u: Scalar, constants: Invariants) -> Sigma:
 
 
 def doubled_sigma(sigma: Sigma, constants: Invariants) -> Sigma:
-    """Return the sigma functions at the time 2u from those at the time u, by T(2u) = T⁴ − σ⁴ χ'(E)
-    and σ(2u) = 2 σ det T.
-    """
+    """Return the sigma functions at 2u by T(2u) = T⁴ − σ⁴ χ'(E) and σ(2u) = 2 σ det T."""
     t1, t2, t3, t12, t13, t23 = sigma.t
     s = sigma.s
     ss = s * s
@@ -355,9 +350,7 @@ def momentum_period(constants: Invariants) -> Scalar:
 def momentum_and_integral(
     inverse_inertia: Differences, momentum: Triple, t: Scalar
 ) -> MomentumAndIntegral:
-    """Return Π(t) and G at a time t of either sign and any size, both smooth functions of the whole
-    inertia tensor.
-    """
+    """Return Π(t) and G for any t, both smooth functions of the whole inertia tensor."""
     v = barrier(invariants(inverse_inertia, momentum))
     m = jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap))
     endless = is_aperiodic(m)

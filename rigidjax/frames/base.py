@@ -127,7 +127,5 @@ def jump_times_within(*laws: object) -> Float[Array, " n"]:
 
 
 def cast_like(x: Array, *values: Array) -> tuple[Array, ...]:
-    """Return `values`, constants of a scene, in the dtype of the state x, so that a float32 solve
-    stays in float32.
-    """
+    """Return constants of a scene in the dtype of the state x: float32 then stays float32."""
     return tuple(value.astype(x.dtype) for value in values)

@@ -82,8 +82,7 @@ class InFrame(AbstractScene):
 
 
 def scene_of_force(force: object) -> AbstractScene:
-    """Return the scene (the equations of motion of a particle) that `simulate` solves for a
-    particle under `force`.
+    """Return the scene that `simulate` solves for a particle under `force`.
 
     `force` is a scene, which is returned unchanged; a `MovingFrame`, in which the particle moves
     freely; a force per mass `(t, state, body) → (3,)`, m/s²; or `None` for a free particle.

@@ -130,9 +130,7 @@ def fictitious_of_rotation(instant: Instant, x: Vector, v: Vector) -> Vec3:
 
 
 def _require_transformable(state: PyTree) -> None:
-    """Raise an error unless `state` is one state with `x` and `v`, with `q` and `omega`, or with
-    all four.
-    """
+    """Raise an error unless `state` is one state with `x` and `v`, `q` and `omega`, or all."""
     point = hasattr(state, "x") and hasattr(state, "v")
     attitude = hasattr(state, "q") and hasattr(state, "omega")
     if not (point or attitude):

@@ -107,8 +107,7 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
 
 
 class _QuadraticAngle(eqx.Module):
-    """Compute the angle Ωt + ½αt², rad, by which a uniformly accelerated frame has turned at the
-    time t, s.
+    """Compute the angle Ωt + ½αt², rad, of a uniformly accelerated frame at the time t, s.
 
     **Fields:** `rate` Ω at t = 0, rad/s; `growth` α = dΩ/dt, rad/s².
     """

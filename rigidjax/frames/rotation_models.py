@@ -99,9 +99,7 @@ def forward_mode(rotation: PyTree) -> PyTree:
 
 
 def value_at(rotation: PyTree, t: Array) -> PyTree:
-    """Return the matrix, quaternion or state that a function of time, or a solution of `simulate`,
-    has at the time t.
-    """
+    """Return matrix, quaternion or state of a function of time, or a `Solution`, at t."""
     return rotation.evaluate(t) if hasattr(rotation, "evaluate") else rotation(t)
 
 

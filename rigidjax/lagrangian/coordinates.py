@@ -81,9 +81,7 @@ class LagrangeEquations(eqx.Module):
         return jnp.sum(y.rate * momentum) - self._value(y.q, y.rate)
 
     def _value(self, q: Array, q_rate: Array) -> Scalar:
-        """Return the Lagrangian, J, or raise an error unless the user's function returns one
-        number.
-        """
+        """Return the Lagrangian, J; raise an error unless the user's function returns a number."""
         return _checks.array_of_shape(
             self.lagrangian(q, q_rate), (), "lagrangian", hint="one number, J"
         )

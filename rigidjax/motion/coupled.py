@@ -68,9 +68,7 @@ class CoupledEquations(eqx.Module):
 
 
 def with_own_states(body: Body | None, state0: PyTree, torque: PyTree, t: ScalarLike) -> PyTree:
-    """Return `state0`, or a `Coupled` if the torque has states of its own; a `Coupled` is returned
-    unchanged.
-    """
+    """Return `state0`, or a new `Coupled` if the torque has states of its own."""
     if isinstance(state0, Coupled) or not contains_own_states(torque):
         return state0
     return Coupled.start(body, state0, torque, t)

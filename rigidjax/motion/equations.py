@@ -153,9 +153,7 @@ class EulerEquations(eqx.Module):
         return self.acceleration_under(torque, state)
 
     def acceleration_under(self, torque: Vec3 | None, state: HasSpin) -> Vec3:
-        """Return dΩ/dt = I⁻¹ (IΩ × Ω + τ), rad/s², body frame, under a given torque τ, N m, body
-        frame.
-        """
+        """Return dΩ/dt = I⁻¹ (IΩ × Ω + τ), rad/s², under a torque τ, N m, body frame."""
         dtype = state.omega.dtype
         momentum = apply(self.inertia.tensor.astype(dtype), state.omega)
         turning = cross(momentum, state.omega)

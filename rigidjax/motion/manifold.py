@@ -21,16 +21,12 @@ from rigidjax.rotation.linalg3 import components
 
 
 def dimension(state: PyTree) -> int:
-    """Return the length of the vector of a change of `state`: the count of its numbers, less one
-    for each quaternion.
-    """
+    """Return the length of a change of `state`: its numbers, less one for each quaternion."""
     return max((place.stop for place in _slices(state)), default=0)
 
 
 def leaf_names(state: PyTree) -> tuple[str, ...]:
-    """Return the names of the leaves of `state`, such as "q" and "omega", in the order of their
-    changes.
-    """
+    """Return the names of the leaves of `state`, such as "q", in the order of their changes."""
     paths = jax.tree.leaves_with_path(state)
     return tuple(jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths)
 
@@ -44,9 +40,7 @@ def parts_by_name(
 
 
 def rotation_slices(state: PyTree) -> tuple[slice, ...]:
-    """Return the places of the rotation vectors in the vector of a change, one for each quaternion
-    of `state`.
-    """
+    """Return the places of the rotation vectors, one for each quaternion, in a change."""
     pairs = zip(_slices(state), _are_rotations(state), strict=True)
     return tuple(place for place, turned in pairs if turned)
 
@@ -88,16 +82,12 @@ def minus_small(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
 
 
 def vector_to_tangent(state: PyTree, change: Float[Array, " n"]) -> PyTree:
-    """Return the tangent of `state` along a change: the derivative of `plus(state, α * change)` by
-    α at α = 0.
-    """
+    """Return the tangent of `state`: the derivative of `plus(state, α * change)` at α = 0."""
     return _moved(state, change, quaternion.rate, lambda _, part: part)
 
 
 def tangent_to_vector(state: PyTree, tangent_vector: PyTree) -> Float[Array, " n"]:
-    """Return the change of `state` whose tangent is `tangent_vector`: the inverse of
-    `vector_to_tangent`.
-    """
+    """Return the change of `state` whose `vector_to_tangent` is `tangent_vector`."""
     return _vector(
         tangent_vector,
         state,
@@ -107,9 +97,7 @@ def tangent_to_vector(state: PyTree, tangent_vector: PyTree) -> Float[Array, " n
 
 
 def _are_rotations(state: PyTree) -> list[bool]:
-    """Return, for each leaf of `state`, whether it is the quaternion of a state with an
-    attitude.
-    """
+    """Return for each leaf whether it is the quaternion of a state with an attitude."""
     out = []
     for node in jax.tree.leaves(state, is_leaf=lambda node: isinstance(node, HasAttitude)):
         q = node.q if isinstance(node, HasAttitude) else None

@@ -129,9 +129,7 @@ def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
 
 
 def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> Float[Array, "4"]:
-    """Return the four numbers of an orbit: three `unknown` ones, and `held_value` at the place
-    `index`.
-    """
+    """Return the four numbers: three `unknown` ones, and `held_value` at the place `index`."""
     parts = list(unknown)
     parts.insert(index, held_value)
     return jnp.stack(parts)
@@ -158,9 +156,7 @@ def integrate(
 def state_after(
     scene: AbstractScene, numbers: Float[Array, "6"], t: Array, *, rtol: float, atol: float
 ) -> Float[Array, "6"]:
-    """Return the position and velocity after a motion of duration `t`; an error is raised if the
-    solve fails.
-    """
+    """Return position and velocity after the duration `t`; raise an error if the solve fails."""
     out = integrate(scene, Point(numbers[:3], numbers[3:]), t.astype(numbers.dtype), rtol, atol)
     end: Any = out.result.error_if(out.ys, out.result != dfx.RESULTS.successful)
     return jnp.concatenate([end.x[0], end.v[0]])

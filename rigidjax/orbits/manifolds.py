@@ -234,9 +234,7 @@ def manifold_start(
 
 
 def _positive(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
-    """Return a positive number in the given dtype, or its own for `None`, or raise an error that
-    begins with `name`.
-    """
+    """Return a positive number in the dtype, if any; raise an error with its `name`."""
     distance = _checks.array_of_shape(value, (), name)
     return _checks.require_positive(
         distance if dtype is None else distance.astype(dtype), name, "a positive number"

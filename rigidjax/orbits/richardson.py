@@ -15,8 +15,7 @@ from rigidjax.orbits.differential_correction import PeriodicOrbit
 
 
 def lagrange_points(mu: Scalar) -> Float[Array, "5 3"]:
-    """Return the positions of L1 … L5, rotating axes, for the mass ratio μ of the second body, 0 <
-    μ ≤ ½.
+    """Return the positions of L1 … L5, rotating axes, for the mass ratio 0 < μ ≤ ½.
 
     L1, L2 and L3 are roots of Euler's quintic polynomials (Szebehely 1967, sec. 4.4).
     """

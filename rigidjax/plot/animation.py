@@ -251,9 +251,7 @@ def player(
 
 
 def _page(server: Any, solid: "_Solid", q: np.ndarray, seconds: float) -> str:
-    """Return a page that plays attitudes, evenly spaced over `seconds`, drawn in a server of viser
-    without browsers.
-    """
+    """Return a page that plays attitudes over `seconds`, drawn by viser without browsers."""
     scene = server.scene
     scene.set_up_direction("+z")
     server.initial_camera.position = tuple(1.8 * solid.reach * np.array([1.0, -1.2, 0.7]))
@@ -284,9 +282,7 @@ def _page(server: Any, solid: "_Solid", q: np.ndarray, seconds: float) -> str:
 
 
 def resampled(ts: NumbersLike, states: PyTree, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return evenly spaced times, s, and the attitudes at them, interpolated along the
-    shorter arc.
-    """
+    """Return evenly spaced times, s, and attitudes there, along the shorter arcs."""
     q = host_attitudes(states)
     t = host_times(ts, q.shape[0])
     if t.size < 2:
@@ -343,9 +339,7 @@ def _triangles(mesh: Any) -> np.ndarray:
 
 
 def _warn_of_aliases(ts: NumbersLike, states: PyTree, moments: np.ndarray, seconds: float) -> None:
-    """Warn if the body makes half a turn between two pictures of a film, or a quarter between two
-    of its states.
-    """
+    """Warn of half a turn between two pictures of a film, or a quarter between two states."""
     t, rates = host_times(ts, len(states.omega)), np.linalg.norm(states.omega, axis=-1)
     turns = np.abs(np.diff(t)) * 0.5 * (rates[1:] + rates[:-1]) / (2 * np.pi)
     sign = np.sign(t[-1] - t[0])
@@ -364,8 +358,7 @@ def _warn_of_aliases(ts: NumbersLike, states: PyTree, moments: np.ndarray, secon
 
 
 def equal_box(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
-    """Return the half-lengths and the axes (columns, in body axes) of the uniform box that moves as
-    the body does.
+    """Return half-lengths and axes (columns, body axes) of the uniform box that moves alike.
 
     Of the mass m and the principal second moments λ = m a²/3 follow the half-lengths a, in metres;
     for an `Inertia` they are scaled so that the longest is 1.

@@ -112,9 +112,7 @@ def _draw(ax: Any, matrices: dict[str, np.ndarray], unit: str) -> None:
 
 
 def _matrix(body: Inertia | MassProperties) -> Any:
-    """Return the matrix A of the ellipsoid r·A⁻¹r = 1 of a body: 5𝔖/mass, m², or 𝔖, kg m², for an
-    `Inertia`.
-    """
+    """Return A of the ellipsoid r·A⁻¹r = 1: 5𝔖/mass, m², or 𝔖, kg m², of an `Inertia`."""
     if isinstance(body, MassProperties):
         return body.second_moment * (5.0 / body.mass)
     return body.second_moment

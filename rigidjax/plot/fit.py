@@ -149,9 +149,7 @@ def _draw_sensor(
 @jax.jit
 @jax.vmap
 def _turned_back(q: Quat, rotation_vector: Vec3) -> Quat:
-    """Return the attitudes that a turn by rotation vectors, rad, body axes, takes to the attitudes
-    `q`.
-    """
+    """Return the attitudes that turns by `rotation_vector`, rad, body axes, take to `q`."""
     return quaternion.multiply(q, quaternion.exp(-rotation_vector))
 
 

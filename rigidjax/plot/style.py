@@ -125,9 +125,7 @@ def axes_of_shape(ax: Any, shape: tuple[int, ...], **options: Any) -> Any:
 
 
 def draw_legend_below(ax: Any, *entries: Any, distance: float = 0.16) -> None:
-    """Draw the legend below the axes, at a `distance` in heights of the axes: inside it would cover
-    the curves.
-    """
+    """Draw the legend below the axes, at a `distance` in heights of the axes."""
     place = dict(loc="upper center", bbox_to_anchor=(0.5, -distance))
     ax.legend(*entries, **place, ncols=3, fontsize=8, frameon=False)
 
@@ -154,9 +152,7 @@ def host_rows(values: object, column_count: int, name: str) -> np.ndarray:
 
 
 def host_attitudes(states: Any) -> np.ndarray:
-    """Return the attitudes of one body over time as NumPy float64; raise `TypeError` for states
-    without one.
-    """
+    """Return attitudes of one body over time in NumPy; raise `TypeError` for other states."""
     if not hasattr(states, "q"):
         got = type(states).__name__
         raise TypeError(f"states: wanted states with an attitude (Attitude, Rigid), got {got}")
@@ -170,9 +166,7 @@ def rotation_matrices(q: np.ndarray) -> np.ndarray:
 
 
 def sphere_points(longitude: np.ndarray, colatitude: np.ndarray) -> np.ndarray:
-    """Return points (3, …) on the unit sphere from their longitude and colatitude (the angle from
-    the z axis), rad.
-    """
+    """Return points (3, …) on the unit sphere; colatitude, rad, is counted from the z axis."""
     ring, height = np.sin(colatitude), np.cos(colatitude)
     return np.stack(np.broadcast_arrays(np.cos(longitude) * ring, np.sin(longitude) * ring, height))
 
@@ -186,9 +180,7 @@ def viewpoint(ax: Any) -> np.ndarray:
 def draw_on_sphere(
     ax: Any, path: np.ndarray, *, hidden_style: dict[str, Any] | None = None, **style: Any
 ) -> None:
-    """Draw a line (T, 3) on the unit sphere; what the sphere hides has the `hidden_style`, by
-    default faint.
-    """
+    """Draw a line (T, 3) on the unit sphere, its hidden part in the `hidden_style`."""
     front, label = path @ viewpoint(ax) > 0, style.pop("label", None)
     for seen, more in ((front, {"label": label}), (~front, hidden_style or {"alpha": 0.25})):
         # The visible and the hidden part of the line overlap by one point, so that no gap opens

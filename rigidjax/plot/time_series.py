@@ -74,9 +74,7 @@ def motion(
 
 
 def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, form: str) -> None:
-    """Draw the attitudes, body → world, in one of the forms of `motion`; `t` is in the unit of the
-    picture.
-    """
+    """Draw attitudes, body → world, in a form of `motion`, over `t` in the picture's unit."""
     _checks.require_option(form, ("quaternion", "axes", "angles"), "attitude")
     if form == "quaternion":
         names, lines, label = [f"q{n}" for n in "wxyz"], q.T, "attitude q"

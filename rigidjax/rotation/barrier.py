@@ -77,8 +77,7 @@ def platform() -> str:
 
 
 def barrier(tree: Tree) -> Tree:
-    """Return the arrays of `tree` unchanged, such that XLA on CPU computes each array once for all
-    its uses.
+    """Return `tree` unchanged, such that XLA on CPU computes each array once for all uses.
 
     This is done by `lax.optimization_barrier`, or, where XLA drops such barriers, by a division by
     one. On a GPU each barrier would end a kernel, which costs more than computing some numbers
@@ -103,8 +102,7 @@ def computed_once(x: Array) -> Array:
 
 
 def one_kernel(function: Function) -> Function:
-    """Return `function`, such that XLA compiles it as one kernel, unless `jax.vmap` batches an
-    argument.
+    """Return `function`, which XLA compiles as one kernel unless `jax.vmap` batches it.
 
     Many small kernels for one body take long to compile; XLA on CPU makes one kernel of a loop with
     a small state. Therefore `function` runs in a loop with one iteration. XLA knows neither the
@@ -151,8 +149,7 @@ def one_kernel(function: Function) -> Function:
 
 @jax.custom_jvp
 def match_batch_axes(tree: PyTree, reference: PyTree) -> PyTree:
-    """Return the arrays of `tree` unchanged; under `jax.vmap` each has a batch axis if any array of
-    `reference` has one.
+    """Return `tree`, whose arrays are all batched under `jax.vmap` if one of `reference` is.
 
     A function from `one_kernel` gives all of its results a batch axis if any argument
     has one; the rule for its derivative does the same by this function. Under `jit`, JAX takes the
@@ -172,9 +169,7 @@ def _match_batch_axes_jvp(
 
 @jax.custom_batching.custom_vmap
 def _with_batch_axes(tree: PyTree, reference: PyTree) -> PyTree:
-    """Return `tree`, under `jax.vmap` with a batch axis in every array if any array of the
-    arguments has one.
-    """
+    """Return `tree`, whose arrays are all batched under `jax.vmap` if one of both trees is."""
     del reference
     return tree
 
@@ -183,9 +178,7 @@ def _with_batch_axes(tree: PyTree, reference: PyTree) -> PyTree:
 def _with_batch_axes_vmap(
     size: int, batched: PyTree, tree: PyTree, reference: PyTree
 ) -> tuple[PyTree, PyTree]:
-    """Return `tree` with a batch axis in front of every array, and which arrays of the result are
-    batched.
-    """
+    """Return `tree` with batch axes in front, and which arrays of the result have them."""
     del reference
     if not any(jax.tree.leaves(batched)):
         return tree, batched[0]

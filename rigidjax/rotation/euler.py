@@ -201,9 +201,7 @@ class _Turns(NamedTuple):
 
 
 def _turns(sequence: str) -> _Turns:
-    """Return the turns of a sequence such as "ZXZ" or "xyz"; raise `ValueError` for an unknown
-    one.
-    """
+    """Return the turns of a sequence such as "ZXZ"; raise `ValueError` for an unknown one."""
     extrinsic = isinstance(sequence, str) and sequence.islower()
     letters = "xyz" if extrinsic else "XYZ"
     reason = ""
@@ -221,9 +219,7 @@ def _turns(sequence: str) -> _Turns:
 
 
 def _checked_angles(angles: Vec3Like) -> Vec3:
-    """Return three Euler angles, rad, and warn if a known one is beyond four turns: it may be in
-    degrees.
-    """
+    """Return three angles, rad; warn of a known one beyond four turns (degrees?)."""
     angles = require_turn(_checks.array_of_shape(angles, (3,), "angles"), "angles")
     if _checks.is_known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
         words = "are over four turns: are they degrees? use jnp.deg2rad"

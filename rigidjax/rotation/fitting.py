@@ -189,9 +189,7 @@ class Turned(NamedTuple):
 
 
 def _turned(rotation: Mat3, world: Float[Array, "n 3"], body: Float[Array, "n 3"]) -> Turned:
-    """Return the turned directions; `apart` has small numbers where M fits, so that their round-off
-    is small, too.
-    """
+    """Return turned directions; `apart` is small where M fits, and so is its round-off."""
     moved = (rotation[None] * body[:, None, :]).sum(-1)
     # The derivative of the ratio of the lengths makes the derivative of the difference small, too,
     # if the length of a direction with a large weight changes.
@@ -214,8 +212,7 @@ def _newton_turn(
     world: Float[Array, "n 3"],
     body: Float[Array, "n 3"],
 ) -> Vec3:
-    """Return one step of Newton's method for the M with the largest Σ wᵢ aᵢ · M bᵢ, a rotation
-    vector in the world frame.
+    """Return Newton's step to the M with the largest Σ wᵢ aᵢ · M bᵢ, a world rotation vector.
 
     The cross product of aᵢ and M bᵢ is computed from the small difference of these two vectors:
     otherwise the rounding of a direction with a large weight would turn the body about it.
@@ -294,9 +291,7 @@ def mean_quaternion(
 # `_karcher_mean` is compiled once: outside of `jit` its loop would be compiled again at each call.
 @partial(jax.jit, inline=True)
 def _karcher_mean(quaternions: Float[Array, "n 4"], weights: Float[Array, "n"]) -> Quat:
-    """Return the Karcher mean of rotations by Newton's method; each quaternion may have either
-    sign.
-    """
+    """Return the Karcher mean of rotations by Newton's method, for quaternions of any sign."""
 
     def newton(_: Array | int, start: Quat, q: Array, w: Array) -> Quat:
         apart = jax.vmap(lambda each: quaternion.multiply(quaternion.conjugate(start), each))(q)
@@ -370,9 +365,7 @@ def _curvature(rotation: Mat3, b: Mat3) -> Mat3:
 
 @jax.custom_jvp
 def nearest_rotation(b: Mat3) -> Mat3:
-    """Return the rotation R nearest to a matrix b with entries of any size: the R with the largest
-    Tr(Rᵀb).
-    """
+    """Return the rotation R nearest to a matrix b: that with the largest Tr(Rᵀb)."""
     b = of_order_one(b)
     b = b / jnp.sqrt((b * b).sum())
     root, zeta = _root_and_zeta(b)

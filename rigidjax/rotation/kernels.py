@@ -29,9 +29,7 @@ _compiled = partial(jax.jit, inline=True)
 
 @_compiled
 def vector_to_quaternion(v: Vec3) -> Quat:
-    """Return the unit quaternion of a rotation vector, rad: (cos θ/2, ½ v sin(θ/2)/(θ/2)), with the
-    angle θ = |v|.
-    """
+    """Return (cos θ/2, ½ v sin(θ/2)/(θ/2)) of a rotation vector v, rad, with θ = |v|."""
     x, y, z = parts = components(v)
     s = 0.25 * squared_length(parts)
     half = 0.5 * stumpff(1, s)
@@ -53,9 +51,7 @@ def vector_to_matrix(v: Vec3) -> Mat3:
 
 @_compiled
 def matrix_to_quaternion(m: Mat3) -> Quat:
-    """Return the canonical unit quaternion q of a rotation matrix, from the largest row of 4 q
-    qᵀ.
-    """
+    """Return the canonical quaternion q of a rotation matrix, by the largest row of 4 q qᵀ."""
     a, b, c, d, e, f, g, h, i = entries(m)
     w, x, y, z = 1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i
     wx, wy, wz, xy, yz, zx = h - f, c - g, d - b, b + d, f + h, c + g
@@ -71,9 +67,7 @@ def matrix_to_quaternion(m: Mat3) -> Quat:
 
 @jax.custom_jvp
 def _log(q: Quat) -> Vec3:
-    """Return the rotation vector, rad, of the shortest turn that q, of any length, describes; it is
-    that of −q, too.
-    """
+    """Return the rotation vector, rad, of the shortest turn of q, of any length, and of −q."""
     w, x, y, z = parts = components(power_of_two_scale(*components(q)) * q)
     n2 = x * x + y * y + z * z
     # Let n² = x² + y² + z², and let θ be the angle of the rotation. The tangent of θ/2 is n/|w|,

@@ -20,9 +20,7 @@ from rigidjax.rotation.barrier import computed_once
 
 
 def components(v: Float[Array, "n"]) -> tuple[Scalar, ...]:
-    """Return the entries of a vector as scalars, by one `lax.split`, which is faster in gradients
-    than indices.
-    """
+    """Return a vector's entries by one `lax.split`, in gradients faster than by indices."""
     return tuple(part.reshape(()) for part in lax.split(v, (1,) * v.shape[0]))
 
 
@@ -53,9 +51,7 @@ def dot_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
 
 
 def squared_length(v: Sequence[Scalar]) -> Scalar:
-    """Return |v|², which XLA computes once for all its uses, because costly functions depend on
-    it.
-    """
+    """Return |v|², which XLA computes once: costly functions depend on it."""
     return computed_once(dot_components(v, v))
 
 

@@ -91,9 +91,7 @@ def switch(sigma: Vec3Like) -> Vec3:
 
 
 def _shadow(sigma: Vec3) -> Vec3:
-    """Return the shadow −σ/|σ|² of parameters that are not zero: the other parameters of the same
-    rotation.
-    """
+    """Return −σ/|σ|² of parameters that are not zero: the others of the same rotation."""
     scale = power_of_two_scale(*components(sigma))
     near = scale * sigma
     return -scale * (near / dot(near, near))

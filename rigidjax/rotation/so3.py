@@ -130,9 +130,7 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
 
 
 def _between(a: Mat3, b: Mat3) -> Mat3:
-    """Return aᵀb; raise a `ValueError` if JAX does not trace it and it is not finite or far from a
-    rotation.
-    """
+    """Return aᵀb; raise `ValueError` if it is known and not finite or far from a rotation."""
     between = product(a.T, b)
     if _checks.is_known(between):
         _checks.require_finite(between, "aᵀb")

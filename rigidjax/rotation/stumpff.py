@@ -64,9 +64,7 @@ def inverse_coefficient(t: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def arctan_ratio(square: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return arctan(x)/x from x², from 0 to tan²(π/8), by the Taylor series (Abramowitz & Stegun
-    4.4.42).
-    """
+    """Return arctan(x)/x from x² ≤ tan²(π/8), by Taylor series (Abramowitz & Stegun 4.4.42)."""
     tiny = jnp.finfo(square.dtype).eps / 4
     terms = next(n for n in range(1, 40) if _REACH**n / (2 * n + 1) < tiny)
     return _polynomial([(-1) ** n / (2 * n + 1) for n in range(terms)], square)
@@ -92,9 +90,7 @@ def _cos_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def split_half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Return n and r with angle = nπ + r, an integer n and |r| ≤ π/2; in derivatives n is
-    constant.
-    """
+    """Return n and r of angle = nπ + r with |r| ≤ π/2 and an integer n without derivative."""
     turns = jax.lax.stop_gradient(jnp.round(angle * (1 / math.pi)))
     # π is the sum of three parts. The number n of half turns (`turns`) times `head`, and times
     # `middle`, is exact, so that the remainder r keeps the digits of the angle (Cody & Waite 1980).

@@ -20,8 +20,7 @@ def rotation_tolerance(dtype: object) -> float:
 
 
 def require_direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
-    """Return the vector `v`, or raise a `ValueError` if it is known and has no direction: for zero,
-    NaN and infinity.
+    """Return `v`; raise `ValueError` if it is known to be zero, NaN or infinite.
 
     Entries that are all below the least normal number of the dtype, 2e-308 in float64, count as
     zero, because XLA on some machines takes such numbers for zero.
@@ -79,9 +78,7 @@ def require_rotation(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "
 
 
 def require_near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"]:
-    """Return the quaternion, or raise a `ValueError` if it is known and its length differs from 1
-    by more than `limit`.
-    """
+    """Return `q`; raise `ValueError` if it is known and ||q| − 1| is above the `limit`."""
     if _checks.is_known(q):
         length = float(np.linalg.norm(np.asarray(q, float)))
         words = f"{name}: wanted a unit quaternion (w, x, y, z), got one of length {length:.6g}"
@@ -91,9 +88,7 @@ def require_near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Ar
 
 
 def require_unit(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
-    """Return quaternions scaled to length 1, or raise an error, also under `jit`, if a length is
-    not nearly 1.
-    """
+    """Return `q` at length 1; raise an error, also under `jit`, if |q| is far from 1."""
     q = _checks.require_finite(q, name)
     # Known numbers are checked by NumPy: under `jit`, JAX would trace also what is computed from
     # known numbers, and the check could not be made at once.

@@ -45,9 +45,7 @@ class Sums(NamedTuple):
 
 
 class Light(NamedTuple):
-    """Hold the readings of a light curve as arrays that may be padded with readings of no weight,
-    for which w = 0.
-    """
+    """Hold a light curve as arrays that may be padded with readings of weight w = 0."""
 
     x: Float[Array, " times"]  # the times since the first, s, or divided by the span
     z: Float[Array, " times"]  # the values divided by their noise
@@ -138,9 +136,7 @@ def chi2_of_padded(pairs: Array, table: Sums, order: int) -> Float[Array, " pair
 def remainder(
     rows: Float[Array, "k times"], z: Float[Array, " times"]
 ) -> tuple[Float[Array, ""], Float[Array, " k"]]:
-    """Fit z by a linear combination of rows; return the smallest value of `|z − cᵀ rows|²` and the
-    coefficients c there.
-    """
+    """Return the least `|z − cᵀ rows|²` over the coefficients c, and the best c."""
     gram, side = rows @ rows.T, rows @ z
     gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(side.size, dtype=z.dtype)
     c = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(gram), side)
@@ -148,9 +144,7 @@ def remainder(
 
 
 def pad_rows(rows: np.ndarray) -> np.ndarray:
-    """Return the rows padded with copies of the first, so that few lengths occur and few programs
-    are compiled.
-    """
+    """Return rows padded with copies of the first, so that few programs are compiled."""
     size = FEW if len(rows) <= FEW else -(-len(rows) // MANY) * MANY
     return np.concatenate([rows, np.repeat(rows[:1], size - len(rows), axis=0)])
 

@@ -212,9 +212,7 @@ def fit_light_curve(
 
 
 def _require_one_brightness(model: Model) -> Reading:
-    """Return the readings of the only sensor, a `Brightness`, without their axis of recordings;
-    refuse any other model.
-    """
+    """Return the readings of the only sensor of a single recording, a `Brightness`."""
     require_single(model)
     if not _checks.is_known(model):
         words = "got traced ones; call it outside of jax.jit, jax.grad and jax.vmap"

@@ -158,9 +158,7 @@ class Brightness(AbstractSensor):
 
 
 def directions_at(sensor: Brightness, t: ScalarLike, dtype: DTypeLike | None = None) -> list[Vec3]:
-    """Return the unit vectors from the body to the sun and to the observer at the time `t`, s,
-    world frame.
-    """
+    """Return the unit vectors from the body to sun and observer at `t`, s, world frame."""
     vectors = vector_at(sensor.sun, t, "sun"), vector_at(sensor.observer, t, "observer")
     return [_unit(v if dtype is None else v.astype(dtype)) for v in vectors]
 

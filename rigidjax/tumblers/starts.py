@@ -116,9 +116,7 @@ def _shortest_rotation(u: Any, v: Any, xp: ModuleType) -> Any:
 
 
 class Rate(NamedTuple):
-    """Hold a free motion with the angular momentum 1; the values have no meaning unless `exists`
-    is true.
-    """
+    """Hold a free motion of angular momentum 1; it means nothing unless it `exists`."""
 
     omega: Float[Array, "3"]  # principal axes
     precession: Scalar  # the precession period

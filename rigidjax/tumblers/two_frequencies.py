@@ -183,16 +183,13 @@ def two_frequencies(
 
 
 def pad_light_curve(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> Light:
-    """Return the arrays padded with zeros to a multiple of `BLOCK`, so that few programs are
-    compiled.
-    """
+    """Return arrays padded with zeros to a multiple of `BLOCK`: few programs are compiled."""
     more = -x.size % BLOCK
     return Light(*(jnp.asarray(np.pad(v, (0, more))) for v in (x, z, w)))
 
 
 def strongest_lines(light: Light, highest: float, count: int) -> np.ndarray:
-    """Return the frequencies of the strongest lines of the spectrum up to `highest`, all in 1/span,
-    the strongest first.
+    """Return the strongest lines of the spectrum up to `highest`, 1/span, strongest first.
 
     A line is a sinusoid plus a constant. Each is subtracted before the next one is sought.
     """
@@ -288,8 +285,7 @@ def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
 
 
 def lower_chi2(table: Sums, pairs: np.ndarray, order: int) -> Pairs:
-    """Return the pairs of frequencies, each moved nine times to the best of its neighbours on a
-    square grid.
+    """Return each pair, moved nine times to the best of its neighbours on a square grid.
 
     Where no neighbour has a lower χ², the pair stays and its grid becomes finer.
     """

@@ -17,9 +17,7 @@ from rigidjax.motion.torques import Held
 
 
 class Reading(eqx.Module):
-    """Hold the readings of one sensor; inside a `Model` all arrays have a leading axis of
-    recordings.
-    """
+    """Hold the readings of one sensor; inside a `Model` with a leading axis of recordings."""
 
     sensor: AbstractSensor
     values: Float[Array, "..."]
@@ -196,8 +194,7 @@ def readings_of(recording: Recording, sensor_class: type) -> list[Any]:
 
 
 def input_functions(recording: Recording) -> dict[str, Callable[[Any], Any]]:
-    """Return the inputs of a `recording` as functions of time, which hold each sample until the
-    next.
+    """Return inputs as functions of time, which hold each sample until the next.
 
     If an input is samples, the times must be evenly spaced.
     """
@@ -214,9 +211,7 @@ def input_functions(recording: Recording) -> dict[str, Callable[[Any], Any]]:
 
 
 def numbers_read(reading: Reading) -> int:
-    """Return how many numbers a sensor read: its unmasked readings times the components of its
-    error.
-    """
+    """Return the number of unmasked readings times the components of the sensor's error."""
     return reading.sensor.components * int(reading.host_mask.sum())
 
 

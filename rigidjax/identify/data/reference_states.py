@@ -49,8 +49,7 @@ class Samples(NamedTuple):
 
 
 def attitudes(recording: Recording) -> Samples:
-    """Return the attitudes (quaternions body → world) that the readings of a `recording` show, if
-    any.
+    """Return the attitudes (quaternions body → world) that the readings show, if any.
 
     They are the readings of an attitude sensor, or computed from at least three markers or two
     directions in the way of `rigidjax.so3.wahba`.

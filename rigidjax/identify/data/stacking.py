@@ -141,9 +141,7 @@ def _padded(count: int) -> int:
 
 
 def pick(records: PyTree, index: int | slice | Int[Array | np.ndarray, "*rows"]) -> PyTree:
-    """Return the recordings at `index` from a pytree whose arrays have a leading axis of
-    recordings.
-    """
+    """Return the recordings at `index`, in the leading axis of all arrays of a pytree."""
 
     def chosen(leaf: PyTree) -> Any:
         if not eqx.is_array(leaf):

@@ -503,9 +503,7 @@ def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) 
 
 
 def _update(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, ReadNumbers]:
-    """Return the estimate after a step to a new time and its readings, and these readings compared
-    with their predictions.
-    """
+    """Return the belief after a step and its readings, and these beside their predictions."""
     dtype = belief.root.dtype
     # Subtract times before they are rounded to the dtype of the state: after a thousand seconds the
     # seven digits of float32 are too few.
@@ -526,9 +524,7 @@ class Scan(NamedTuple):
 
 
 def scan_filter(run: FilterInput, keep: Callable[[Belief, ReadNumbers], PyTree[Array]]) -> Scan:
-    """Run the filter over all its times, and store what `keep` picks of the `Belief` and the
-    `ReadNumbers` at each time.
-    """
+    """Run the filter over all times, and store the result of `keep` at each of them."""
     scene, drifts, recording, first, grid = run
     dtype = first.root.dtype
     dynamics = dynamics_of(scene, drifts, first.x)

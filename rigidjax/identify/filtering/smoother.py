@@ -218,8 +218,7 @@ def _iteration(
     def linearise(
         row: tuple[Array, Stops, ExtendedState, ExtendedState, Array],
     ) -> tuple[Moves, steps.LinearReadings]:
-        """Return a step from the state x of the path to its state y, and the readings there, both
-        linearised.
+        """Return a step from the state x of the path to y, and the readings at y, linearised.
 
         An error e of x becomes `F e + d + G u` at y, with the unit normal noise u; F, G and d are
         returned.

@@ -300,9 +300,7 @@ def interval_steps(records: Recording, reference: ReferenceStates) -> int:
 
 
 def require_inputs(torque: Torque | None, windows: Windows) -> None:
-    """Raise `ValueError` if `windows` lack an input that the `torque` reads, or samples for its
-    delays.
-    """
+    """Raise `ValueError` if `windows` lack an input of the `torque`, or samples for its delays."""
     missing = [name for name in input_names_of(torque) if name not in windows.inputs]
     if missing:
         have = ", ".join(map(repr, windows.inputs)) or "none"

@@ -168,9 +168,7 @@ class PrincipalRatios(AbstractBodyChart):
 
 
 def _typical(value: object) -> Array:
-    """Return the argument `typical` of a chart as an array, after checks: it is easily taken for a
-    body.
-    """
+    """Return `typical` of a chart as an array, after checks: it is easily taken for a body."""
     if isinstance(value, Inertia | MassProperties):
         raise TypeError(
             "typical: wanted the rough size of the moments, one number, kg m², got "
@@ -302,9 +300,7 @@ class Mass(AbstractBodyChart):
 
     @property
     def _free_indices(self) -> list[int]:
-        """Return the sorted indices of the numbers of this chart among the ten of
-        `rigidjax.body.parameters.pack`.
-        """
+        """Return the sorted indices of the chart's numbers among the ten of `pack`."""
         return sorted(place for name in self.free for place in _PARTS[name])
 
     @property
@@ -381,8 +377,7 @@ def _pad_with_zeros(
 
 
 def body_with_scale_mark(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
-    """Return the body that `vector` represents; an `Inertia` gets the `scale` of the chart, such as
-    "arbitrary".
+    """Return the body that `vector` represents; an `Inertia` gets the `scale` of the chart.
 
     Inside a fit bodies have no such mark, with which a torque is refused.
     """

@@ -305,8 +305,7 @@ _ELSEWHERE = {
 
 
 def leaf_at(where: Callable[[Any], Any], tree: PyTree, name: str, role: str) -> Leaf:
-    """Return the path and the value of the numbers that `where` picks from a pytree, such as a
-    `Scene`.
+    """Return the path and the value of the numbers that `where` picks from a pytree.
 
     In errors, `name` stands for the object with this `where`, and `role` for the object that needs
     a starting value. `ValueError` is raised if `where` does not pick one array of numbers.
@@ -371,9 +370,7 @@ def overlap(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
 
 
 def entries_at(leaf: Any, path: tuple[Any, ...], axes: int = 0) -> Array:
-    """Return the numbers of a `leaf` to which its `path` leads; its first `axes` axes count
-    recordings.
-    """
+    """Return the numbers at the `path` in a `leaf`, whose first `axes` count recordings."""
     leaf, (_, some) = jnp.asarray(leaf), split_path(path)
     if some is None:
         return leaf

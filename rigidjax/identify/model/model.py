@@ -406,9 +406,7 @@ def part_of_sensor(model: Model, index: int) -> Part:
 
 
 def padded(model: Model, arrays: Sequence[Array | np.ndarray]) -> tuple[Any, ...]:
-    """Return the arrays (R, T, k, …) of each sensor with zeros at the recordings, times and columns
-    of other kinds.
-    """
+    """Return the arrays (R, T, k, …) of each sensor, zero in the places of other kinds."""
     if not model.parts:
         return tuple(arrays)
     (count, times), columns = model.records.t.shape, model.index.places.shape[1]
@@ -484,9 +482,7 @@ def require_single(model: PyTree) -> Model:
 
 
 def checked_x(model: Model, x: NumbersLike) -> Float[Array, " n"]:
-    """Return the parameters x of a `model` as an array, after a check of shape, type and
-    finiteness.
-    """
+    """Return the parameters x of a `model` as an array of right shape and finite numbers."""
     require_single(model)
     hint = "model.start(body) makes them"
     numbers = _checks.numeric_array(x, "x")
@@ -599,9 +595,7 @@ def sensor_errors(
 def scene_errors(
     model: Model, scene: Scene, record: Recording, delay: Array | None = None
 ) -> tuple[Array, ...]:
-    """Return the errors of each sensor in a `scene` of the recording `record`, as `sensor_errors`
-    does.
-    """
+    """Return the errors of each sensor in a `scene` of a recording, as `sensor_errors` does."""
     states, torque = motion_in(model, scene, record)
     assert scene.body is not None and scene.start is not None
     out, motion = [], (scene.body, torque, record.t, scene.start, states)
@@ -713,9 +707,7 @@ def _row_jacobians(
 
 @eqx.filter_jit
 def delay_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
-    """Return the derivative of each sensor's errors with respect to a delay of its clock, per
-    second.
-    """
+    """Return the derivative of each sensor's errors by a delay of its clock, per second."""
 
     def derivative_of_recording(row: Row, *rest: PyTree) -> Any:
         now = jnp.zeros((), model.records.t.dtype)

@@ -24,8 +24,7 @@ class OwnBlocks(eqx.Module):
 
 
 class NormalMatrix(eqx.Module):
-    """Hold the normal matrix of a least-squares problem of n parameters, such as JᵀJ with the
-    Jacobian J.
+    """Hold the normal matrix JᵀJ of a least-squares problem of n parameters, Jacobian J.
 
     The first s parameters, the core, are shared; n = s + R k for R recordings with k own
     parameters.
@@ -52,8 +51,7 @@ class NormalMatrix(eqx.Module):
         )
 
     def add_rows(self, rows: Float[Array, "m n"]) -> "NormalMatrix":
-        """Return the normal matrix of the problem with m more residuals, from their Jacobian
-        `rows`.
+        """Return the normal matrix with m more residuals, from their Jacobian `rows`.
 
         These residuals may depend on the core alone.
         """
@@ -80,9 +78,7 @@ class NormalMatrix(eqx.Module):
         return self._join(first, jnp.einsum("rkl,rl->rk", alone.own, own) + from_core)
 
     def solve(self, rhs: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
-        """Return the solution x of `matrix @ x = rhs`, or NaN unless this matrix is positive
-        definite.
-        """
+        """Return x of `matrix @ x = rhs`, or NaN unless this matrix is positive definite."""
         alone, count = self.own_blocks, self.core.shape[0]
         if alone is None:
             return _cholesky_solve(self.core, rhs)
@@ -94,8 +90,7 @@ class NormalMatrix(eqx.Module):
         return self._join(first, last).reshape(rhs.shape)
 
     def _split(self, x: Array) -> tuple[Array, Array]:
-        """Return the entries (s, …) of the core in x (n, …), and those (R, k, …) of the own
-        parameters.
+        """Return the core entries (s, …) of x (n, …), and those (R, k, …) of own parameters.
 
         Without own parameters both are the whole of x.
         """

@@ -175,9 +175,7 @@ def states_at(
     ts: Float[Array, " times"],
     torque: Torque | None,
 ) -> PyTree:
-    """Return the states of a motion at the times `ts`, s; a free body and a carried one need no
-    `integrator`.
-    """
+    """Return the states of a motion at `ts`, s; free and carried ones need no `integrator`."""
     known = _known_motion(body, state0, ts, torque)
     if known is not None:
         return known(ts)
@@ -196,8 +194,7 @@ def _known_motion(
 
 
 class HeldSteps(AbstractIntegrator):
-    """Integrate with one step of order 4 between samples, and hold the inputs constant in each
-    step.
+    """Integrate with one step of order 4 between samples, and hold the inputs in each step.
 
     The samples must be evenly spaced. If a delayed input changes inside a step, the step is split
     there.
@@ -218,8 +215,7 @@ class HeldSteps(AbstractIntegrator):
         torque: Torque,
         inputs: dict[str, Array],
     ) -> PyTree:
-        """Return the states at `ts` under a torque that reads sampled `inputs`, by name (before +
-        T, *k).
+        """Return the states at `ts` under a torque that reads sampled `inputs` (before + T, *k).
 
         The sample in row before + i is held in the step from `ts[i]` to `ts[i + 1]`. The torque's
         own states, such as the speed of a motor, are first integrated over the samples before
@@ -260,16 +256,12 @@ def shifted(field: Callable[..., Any], t: Array, state: PyTree, offset: Array) -
 
 
 def needed_body(body: Body, state_type: type) -> Body:
-    """Return the `Inertia` of a body for all types of state but `Rigid`, which alone needs the
-    mass.
-    """
+    """Return the `Inertia` of a body, unless the state is a `Rigid`, which needs the mass."""
     return body.inertia if isinstance(body, MassProperties) and state_type is not Rigid else body
 
 
 class Along(NamedTuple):
-    """Hold the times at which a sensor reads, the states at these times, and the function (time,
-    state) → `SensorInput`.
-    """
+    """Hold the times of a sensor, the states there, and (time, state) → `SensorInput`."""
 
     # In s, after the clock offset.
     times: Float[Array, " times"]

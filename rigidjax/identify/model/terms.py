@@ -70,8 +70,7 @@ def decorrelate(errors: Float[Array, "*rows k"], jitter_error: Float[Array, "*ro
 def scaled_slopes(
     tangents: Array | np.ndarray, sigma: Array | np.ndarray, jitter_error: Array | None
 ) -> Float[Array, "..."] | Float[np.ndarray, "..."]:
-    """Return tangents of a sensor's errors in standard deviations, made independent as by
-    `decorrelate`.
+    """Return tangents of a sensor's errors in deviations, independent as by `decorrelate`.
 
     The tangents and the `jitter_error` are in the unit of the sensor.
     """
@@ -151,9 +150,7 @@ def residual_jacobians(
 
 
 def prior_weights(model: Model) -> Float[Array, " n"]:
-    """Return one over the standard deviation of the prior of each parameter, or zero without a
-    prior.
-    """
+    """Return 1/standard deviation of each parameter's prior, or zero without a prior."""
     weights = jnp.zeros(model.index.size, model.records.t.dtype)
     for slot in model.slots:
         about = (slot.shared, slot.prior), (slot.own, slot.prior if slot.each else slot.spread)
@@ -179,9 +176,7 @@ def joint_residuals(model: Model, x: Float[Array, " n"]) -> Float[Array, " j"]:
 
 
 def prior_residuals(model: Model, x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """Return all residuals that belong to no reading: of each parameter's prior, and
-    `joint_residuals`.
-    """
+    """Return all residuals of no reading: of parameters' priors, and `joint_residuals`."""
     return jnp.concatenate([prior_weights(model) * x, joint_residuals(model, x)])
 
 

@@ -164,9 +164,7 @@ def _next(
     settings: Settings,
     gain_of_noise: Callable[[Any, NormalMatrix], Array] | None,
 ) -> LMState:
-    """Return the state after the `evaluation` at `state.trial`; the arguments are as for
-    `minimise`.
-    """
+    """Return the state after the `evaluation` at `state.trial`; arguments as of `minimise`."""
     values, cost, normal, slope = evaluation
     parts = jax.tree.leaves((cost, normal, slope))
     finite = jnp.stack([jnp.isfinite(part).all() for part in parts]).all()

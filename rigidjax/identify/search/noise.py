@@ -107,8 +107,7 @@ def chi2_median(degrees_of_freedom: int) -> Chi2Median:
 def _shares(
     model: Model, x: Float[Array, " n"], blocks: Blocks, noise: Noise
 ) -> list[Float[np.ndarray, " groups"]]:
-    """Return the fraction of each group's expected squared errors that a fit leaves, for each
-    sensor.
+    """Return the fraction of each group's expected squared errors that a fit leaves.
 
     It is 1 − N / M, and at least 0.1, for M errors that determine N parameters: the sum of their
     leverages.

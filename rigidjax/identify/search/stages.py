@@ -421,8 +421,7 @@ def unit_noise_count(model: Model) -> int:
 
 
 def accepted_cost(model: Model) -> float:
-    """Return a cost of a `model` that is low enough to accept a fit: wrong minima have a larger
-    one.
+    """Return a cost low enough to accept a fit of a `model`: that of wrong minima is larger.
 
     A sensor of known noise adds the number of its errors, which is twice the cost to expect of
     them. A sensor of unknown noise adds a hundredth of this number, which allows errors of about 1

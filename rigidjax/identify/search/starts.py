@@ -168,9 +168,7 @@ def _body_of_ten(ten: Float[Array, "10"]) -> MassProperties:
 
 @eqx.filter_jit
 def _linear_errors(model: Model, x: Float[Array, " n"]) -> FirstOrder:
-    """Return the errors of all sensors, (R, T, k), for the body `_UNIT`, and their derivative in
-    ten numbers.
-    """
+    """Return all errors (R, T, k) for the body `_UNIT`, and their derivative in ten numbers."""
 
     def of_recording(row: Array, record: Recording, *rest: Any) -> FirstOrder:
         scene = scene_at(model, row, record, *rest)

@@ -168,8 +168,7 @@ def _descent_steps(
 def cost_of_recordings(
     x: Float[Array, " n"], model: Model, noise: Noise, recording_indices: Array
 ) -> Float[Array, ""]:
-    """Return the cost of some recordings, scaled up to the number of all, plus the cost of the
-    priors.
+    """Return the cost of some recordings, scaled up to all, plus the cost of the priors.
 
     The mean over random batches is the cost of the whole model.
     """
@@ -180,9 +179,7 @@ def cost_of_recordings(
 
 
 def chosen(model: Model, recording_indices: Array) -> Model:
-    """Return the model with some of its recordings only, and all parameters; the indices may be
-    traced.
-    """
+    """Return the model with all parameters and some recordings, at indices that may be traced."""
     parts = lambda m: (m.records, m.reference, m.body_indices, m.index.places, m.index.start)  # noqa: E731
     return eqx.tree_at(
         parts,

@@ -126,9 +126,7 @@ def optional_array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[
 
 
 def deviations_field(size: int = 3) -> Callable[[Any], Array | None]:
-    """Return a converter, for `eqx.field`, to standard deviations (size,) that leaves `None`
-    unchanged.
-    """
+    """Return a converter, for `eqx.field`, to standard deviations (size,), or `None`."""
     return lambda value: positive_numbers(value, "noise", "a positive standard deviation", size)
 
 

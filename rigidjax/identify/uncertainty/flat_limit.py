@@ -148,9 +148,7 @@ def _has_limit(chart: AbstractBodyChart) -> bool:
 
 
 def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
-    """Return the flatness (I1 + I2 − I3) / I3 of each body at the parameters x; 1 for a body whose
-    moments are known.
-    """
+    """Return the flatness (I1 + I2 − I3) / I3 of each body at x; 1 if the moments are known."""
     out = []
     bodies = body_list(model.bodies(x))
     for chart, body in zip(model.charts, bodies, strict=True):

@@ -153,9 +153,7 @@ GRAVITY_HINT = "a vector in world axes, such as [0, 0, -9.81]"
 
 
 def require_torque(torque: object, name: str = "torque") -> None:
-    """Raise `TypeError` unless `torque` can be called as a torque or force, with the arguments `(t,
-    state, body)`.
-    """
+    """Raise `TypeError` unless `torque` can be called with the arguments `(t, state, body)`."""
     if isinstance(torque, type):
         made = f"{torque.__name__}(...)"
         raise TypeError(f"{name}: wanted an object, got the class {torque.__name__}; make {made}")
@@ -185,16 +183,12 @@ def may_read_attitude(torque: Torque | None) -> bool:
 
 
 def may_read_rate(torque: Torque | None) -> bool:
-    """Return whether a torque may read the body rate: unless it is `None` or declares `rate_free =
-    True`.
-    """
+    """Return whether a torque may read the body rate: not if it declares `rate_free = True`."""
     return torque is not None and not getattr(torque, "rate_free", False)
 
 
 def require_state_type(torque: Torque, state: object) -> None:
-    """Raise `TypeError` unless `torque` can be called, and `state` has the parts that it declares
-    in `feels`.
-    """
+    """Raise `TypeError` unless `state` has the parts that `torque` declares in `feels`."""
     require_torque(torque)
     feels = getattr(torque, "feels", None)
     if feels is not None and not isinstance(state, feels):
@@ -224,9 +218,7 @@ def require_compatible(torque: Torque | None, state: object, body: object) -> No
 def evaluate_torque(
     torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> Vec3:
-    """Return the value of a torque, N m, body frame; raise `TypeError` for a model that returns a
-    force as well.
-    """
+    """Return a torque, N m, body frame; raise `TypeError` if a model returns a force, too."""
     force, value = force_and_torque(torque, t, state, body)
     if force is not None:
         raise TypeError(
@@ -340,9 +332,7 @@ def positive_converter(
 
 
 def source_converter(name: str) -> Callable[[Any], Any]:
-    """Return a converter for `equinox.field` that makes a finite vector of a value, and leaves a
-    function of time.
-    """
+    """Return a converter for `equinox.field` to a finite vector, or a function of time."""
     return lambda value: checked_source(value, name)
 
 
@@ -354,17 +344,13 @@ def checked_source(source: object, name: str, size: int = 3) -> Any:
 
 
 def jump_times_of(source: object) -> Float[Array, " n"]:
-    """Return the times, s, at which a torque or a function of time declares to jump or to have a
-    kink.
-    """
+    """Return the times, s, at which a torque or function of time declares jumps or kinks."""
     times = getattr(source, "jump_times", None)
     return jnp.zeros(0) if times is None else times
 
 
 def sorted_jumps(*sources: object) -> Float[Array, " n"]:
-    """Return the times, s, ascending, at which any of several torques or functions of time jumps or
-    has a kink.
-    """
+    """Return the ascending times, s, of jumps and kinks of torques or functions of time."""
     times = [jumps for source in sources if (jumps := jump_times_of(source)).shape[0]]
     if len(times) < 2:
         return times[0] if times else jnp.zeros(0)
@@ -378,9 +364,7 @@ def field_jumps(torque: object) -> Float[Array, " n"]:
 
 
 def unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array, "n 3"]:
-    """Return unit vectors, one in each row; raise `ValueError` for a known row of another
-    length.
-    """
+    """Return unit vectors in rows; raise `ValueError` for a known row of another length."""
     rows = _checks.finite_array(value, (count, 3), name)
     if _checks.is_known(rows):
         lengths = np.linalg.norm(np.asarray(rows, float), axis=1)
@@ -390,9 +374,7 @@ def unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array, "n 3"]:
 
 
 def row_count(value: NumbersLike, name: str, item: str) -> int:
-    """Return the number of rows of an array (R, 3): of wheels, from their axes; raise `ValueError`
-    for another shape.
-    """
+    """Return the number R of rows of an array (R, 3); raise `ValueError` for another shape."""
     shape = _checks.numeric_array(value, name).shape
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
         raise ValueError(f"{name}: wanted (R, 3), one row for each {item}, got shape {shape}")

@@ -83,9 +83,7 @@ class Sum(eqx.Module):
 
 
 def parts_of(torque: base.Torque | None) -> tuple[Any, ...]:
-    """Return the single torques and forces in `torque`: the members of a `Sum` and of every `Sum`
-    inside it.
-    """
+    """Return the single torques and forces in `torque`, also of each `Sum` inside a `Sum`."""
     if isinstance(torque, Sum):
         return tuple(inner for part in torque.parts for inner in parts_of(part))
     return () if torque is None else (torque,)

@@ -48,9 +48,7 @@ class Input(eqx.Module):
 
 
 class _Constant(eqx.Module):
-    """Return one value at every time, in the place of an `Input` that is constant, as during one
-    step.
-    """
+    """Return one value at every time, in the place of an `Input` during a step."""
 
     value: Array
 
@@ -275,9 +273,7 @@ def _is_delayed(node: PyTree) -> bool:
 
 
 def delays_of(torque: PyTree) -> list[tuple[str, Array]]:
-    """Return the name and the delay, s, of each delayed input of `torque`, in their order in the
-    torque.
-    """
+    """Return name and delay, s, of each delayed input of `torque`, in their order there."""
     nodes = jax.tree.leaves(torque, is_leaf=_is_delayed)
     return [(node.source.name, node.delay) for node in nodes if _is_delayed(node)]
 
@@ -289,9 +285,7 @@ def input_names_of(torque: PyTree) -> list[str]:
 
 
 def require_inputs(torque: PyTree, inputs: object) -> Mapping[str, Any]:
-    """Return the inputs by name; raise `ValueError` unless the names are exactly those that
-    `torque` reads.
-    """
+    """Return inputs by name; raise `ValueError` unless `torque` reads exactly these."""
     read, mapping = input_names_of(torque), {} if inputs is None else inputs
     if not isinstance(mapping, Mapping):
         raise TypeError(

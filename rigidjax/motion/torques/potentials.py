@@ -295,7 +295,5 @@ class FromPotential(base.AbstractTorque):
         return -0.5 * quaternion.multiply(quaternion.conjugate(state.q), slope)[1:]
 
     def _energy_at(self, q: Quat) -> Scalar:
-        """Return the potential energy, J; raise an error if the user's function does not return one
-        number.
-        """
+        """Return the potential energy, J; raise an error unless the user's value is a number."""
         return _checks.array_of_shape(self.potential(q), (), "potential", hint="one number, J")

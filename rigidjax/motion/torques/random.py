@@ -76,9 +76,7 @@ class CorrelatedTorque(AbstractTorque):
 
 
 def checked_density(value: NumbersLike, name: str = "density", size: int = 3) -> Array:
-    """Return the spectral density of a white noise, one number for each axis; raise `ValueError`
-    for one below zero.
-    """
+    """Return a spectral density, one number for each axis; raise `ValueError` below zero."""
     density = _checks.numeric_array(value, name)
     if density.shape not in ((), (size,)):
         raise ValueError(f"{name}: wanted one number or {size} numbers, got shape {density.shape}")

@@ -25,9 +25,7 @@ _MEMBERS_THAT_TAKE_STATES = ("energy", "internal_momentum")
 
 
 class FrozenLaw(eqx.Module):
-    """Hold a torque or function of time with the values of its own states, so that it can be called
-    without them.
-    """
+    """Hold a torque or function of time with its own states, to be called without them."""
 
     law: Any
     own: tuple[Any]
@@ -46,23 +44,17 @@ class FrozenLaw(eqx.Module):
 
 
 def has_own_states(node: object) -> bool:
-    """Return whether a torque or a function of time has states of its own: the members `state0` and
-    `rate`.
-    """
+    """Return whether a torque or function of time has states: members `state0` and `rate`."""
     return not isinstance(node, type) and hasattr(node, "state0") and hasattr(node, "rate")
 
 
 def contains_own_states(torque: PyTree) -> bool:
-    """Return whether `torque`, or any torque or function of time inside it, has states of
-    its own.
-    """
+    """Return whether `torque`, or a torque or function of time inside it, has own states."""
     return any(map(has_own_states, jax.tree.leaves(torque, is_leaf=_is_node)))
 
 
 def require_no_own_states(torque: PyTree, caller: str) -> None:
-    """Raise `ValueError` if `torque` has states of its own, which the calling function does not
-    integrate.
-    """
+    """Raise `ValueError` if `torque` has own states, which the `caller` does not integrate."""
     if contains_own_states(torque):
         raise ValueError(
             f"{caller}: wanted a torque without states of its own, got one that has some (such as "
@@ -155,7 +147,5 @@ def _is_node(node: PyTree) -> bool:
 
 
 def _cast(tree: PyTree, name: str, dtype: DTypeLike) -> PyTree:
-    """Return a pytree of a user's torque, such as its states, with each array checked and converted
-    to `dtype`.
-    """
+    """Return a pytree, such as states of a user's torque, with arrays checked and cast."""
     return jax.tree.map(lambda leaf: _checks.numeric_array(leaf, name).astype(dtype), tree)

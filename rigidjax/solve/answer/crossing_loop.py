@@ -40,9 +40,7 @@ _MOST = 70
 
 
 class Path(NamedTuple):
-    """Hold the arrays of a run that is searched for crossings; in a batch with a last axis of
-    bodies.
-    """
+    """Hold the arrays of a run that is searched; in a batch with a last axis of bodies."""
 
     t0: Array
     stops: Array  # (J,) the times at which the field jumps, then the end of the run
@@ -105,9 +103,7 @@ class _IntervalEnd(NamedTuple):
 
 
 class _SearchState(NamedTuple):
-    """Hold the state of the search; a pass is a step, or a part of a step that ends at a guess for
-    a zero.
-    """
+    """Hold the state of the search; a pass is a step, or a part of it that ends at a guess."""
 
     t: Array  # the time that is reached
     y: Array  # (n, *bodies) the state at t
@@ -291,8 +287,7 @@ def _newton_step(
 def _hidden_zeros(
     sign_at_low: Array, low: _IntervalEnd, high: _IntervalEnd, round_off: Array
 ) -> tuple[Array, Array]:
-    """Return whether g may have two zeros that its signs hide, and the time after `low` between
-    them.
+    """Return whether g may have two zeros that signs hide, and the time after `low` between.
 
     The cubic polynomial with the values and slopes of g at both ends is examined. An extremum
     "beyond zero" is one at which it has the opposite sign of g at `low`, farther from zero than

@@ -333,9 +333,7 @@ def _unknown_to_nan(crossing: PyTree, jumps: Array, inputs: PyTree) -> PyTree:
 def _crossings(
     setup: AnyRun, event: Event, max_crossings: int, max_steps: int, state0: Any, ts: Array
 ) -> Crossings:
-    """Return the crossings of `event` in a run, such that JAX can differentiate their times and
-    states.
-    """
+    """Return the crossings of `event`, whose times and states JAX can differentiate."""
     state0 = project_to_group(state0)
     crossed, numbers = section_of_run(setup, event, state0, ts)
     found = locate(crossed, Search(event.direction, max_crossings, max_steps), numbers)

@@ -38,8 +38,7 @@ _STEEP = {"tanh", "logistic", "erf", "erfc", "atan", "asinh", "sinh", "cosh", "e
 
 
 def _height(eqn: Any, inputs: list[Any], kinds: list[int], out: Any) -> tuple[Array, bool] | None:
-    """Return a number that is largest at a peak of an equation, and whether it is the result
-    itself.
+    """Return a number that is largest at a peak, and whether it is the equation's own result.
 
     Else it is the logarithm of the result, as far as it matters. `None`: there is no peak.
     """

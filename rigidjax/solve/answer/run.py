@@ -60,9 +60,7 @@ class ClosedFormRun(eqx.Module):
     replays: ClassVar[bool] = False
 
     def moving(self, state0: Any) -> Any:
-        """Return the motion from `state0`, a Module that maps the time since the start, s, to a
-        state.
-        """
+        """Return the motion from `state0`, a Module that maps times since the start to states."""
         if self.torque is None:
             return FreeMotion(self.body, state0)
         body, law = in_precision((self.body, self.torque), state0.angle.dtype)
@@ -168,9 +166,7 @@ class DiffraxRun(eqx.Module):
         return Trajectory(Solved(ys, stats, out.result), end)
 
     def raise_reason(self, ys: Any, result: dfx.RESULTS) -> Any:
-        """Return the states `ys`; raise an error with the reason if the run ended early, but for an
-        event.
-        """
+        """Return the states; raise the reason if the run ended early, but not by an event."""
         if changing_inertia(self.torque) is not None:
             ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
         ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)

@@ -164,9 +164,7 @@ class _Control(NamedTuple):
     order: Any  # the order of the error of a step
 
     def __call__(self, again: bool, constants: Arrays, given: Any, numbers: Any) -> Decision:
-        """Return the decision on a step; a step repeated for a derivative (`again`) moves no
-        progress meter.
-        """
+        """Return the decision on a step; if it is repeated (`again`), the meter stays."""
         controller, meter = eqx.combine(self.arrays(constants), self.static)
         (control, progress), (t0, last, begin, end) = given
         *states, error = (self.tree(y) for y in numbers)

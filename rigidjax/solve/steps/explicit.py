@@ -55,9 +55,7 @@ def direction_and_length(
 def cubic_coefficients(
     change: Array, h: Array, left_slope: Array, right_slope: Array
 ) -> tuple[Array, Array, Array]:
-    """Return F0, F1 and F2 of `runge_kutta.dense_change`, from the change and the slopes at both
-    ends.
-    """
+    """Return F0, F1, F2 of `runge_kutta.dense_change` from change and slopes at both ends."""
     return change, h * left_slope - change, 2 * change - h * (left_slope + right_slope)
 
 

@@ -58,9 +58,7 @@ class Sided(eqx.Module):
             return self.law(self.time_on_correct_side(t), *args)
 
     def time_on_correct_side(self, t: Any) -> Any:
-        """Return the time t, s, or the nearest on the correct side of a jump if t is on its wrong
-        side.
-        """
+        """Return t, s, or, if it is on the wrong side of a jump, the nearest time that is not."""
         still = lax.stop_gradient(jnp.asarray(t))
         # The oldest supported JAX has no derivative of `nextafter`, not even inside
         # `stop_gradient`: `stop_gradient` is therefore applied to its argument.

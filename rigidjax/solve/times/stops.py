@@ -38,8 +38,7 @@ class ProgramWithStops(NamedTuple):
 def program_with_stops(
     function: Callable[..., Array], declared_jumps: list[Array], t0: Array, t1: Array, y: Array
 ) -> ProgramWithStops:
-    """Return a vector field `function(t, y, *sides)`, and the times at which it jumps between t0
-    and t1.
+    """Return a field `function(t, y, *sides)`, and its jump times between t0 and t1.
 
     If several parts declare jumps, `sides` has for each of them the times, s, at which steps end
     because of its jumps, else it is empty. `y` is an example of the state.

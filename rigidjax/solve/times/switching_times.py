@@ -152,8 +152,7 @@ def _cells_with_one_change(
     bent_elements: np.ndarray,
     other_times: Array,
 ) -> _Cells:
-    """Return `MOST` intervals of time (cells): at the ends of each, one of the `bent_elements` has
-    two different values.
+    """Return `MOST` cells of time, at whose ends one of the `bent_elements` has two values.
 
     Cells without a change come last. The grid of times contains `other_times`, at which elements of
     other heights change.
@@ -203,8 +202,7 @@ def _cells_with_one_change(
 def _times_with_derivatives(
     found: Switches, consts: Arrays, t: Array, element: Array, there: Array
 ) -> Array:
-    """Return the times t of changes of elements, with derivatives by `consts` where a change is
-    `there`.
+    """Return the times of changes with derivatives by `consts`, where a change is `there`.
 
     A step of Newton's method leaves the times as they are, and makes the derivatives of one more
     order right.
@@ -250,9 +248,7 @@ def _times_with_derivatives(
 
 
 def values_between(found: Switches, changes: Changes, stops: Array, t: Array) -> Array:
-    """Return the values (m,) of the elements at the time t, after all changes whose `stops` (k,) it
-    has passed.
-    """
+    """Return the values (m,) at the time t, after the changes whose `stops` (k,) it passed."""
     element, number = _monotonic_elements(found)
     sizes = jnp.where(t >= stops, changes.sizes, 0)
     plain, bent = sizes[: element.size], sizes[element.size :]
