@@ -346,9 +346,7 @@ class Switches(NamedTuple):
         return jnp.concatenate(height), jnp.concatenate(value)
 
     def field(self, values: Array, over: Array, consts: Arrays, t: Array, *rest: Any) -> Any:
-        """Return the field's value with all switches at `values` (m,) or, if `over`, at their
-        own.
-        """
+        """Return the field's value, its switches at `values` (m,) or, if `over`, at their own."""
         parts = np.cumsum([s.size for s in self.switches])[:-1]
         own = dict(
             zip(
