@@ -63,11 +63,11 @@ def inverse_coefficient(t: Float[Array, "..."]) -> Float[Array, "..."]:
     return (stumpff(3, t) - 2 * stumpff(4, t)) / stumpff(1, 0.25 * t) ** 2
 
 
-def arctan_ratio(square: Float[Array, "..."]) -> Float[Array, "..."]:
+def arctan_ratio(x_squared: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return arctan(x)/x from x² ≤ tan²(π/8), by Taylor series (Abramowitz & Stegun 4.4.42)."""
-    tiny = jnp.finfo(square.dtype).eps / 4
+    tiny = jnp.finfo(x_squared.dtype).eps / 4
     terms = next(n for n in range(1, 40) if _REACH**n / (2 * n + 1) < tiny)
-    return _polynomial([(-1) ** n / (2 * n + 1) for n in range(terms)], square)
+    return _polynomial([(-1) ** n / (2 * n + 1) for n in range(terms)], x_squared)
 
 
 def _cos_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -1,7 +1,7 @@
 """Fit by stochastic gradient descent with optax, for more recordings than `fit` can use."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -137,6 +137,14 @@ def descend(
     return x
 
 
+class _Descended(NamedTuple):
+    """Hold the parameters x and the optimiser's state after some steps."""
+
+    x: Float[Array, " n"]
+    optimiser_state: Any
+    costs: Float[Array, " steps"]  # before each step
+
+
 @eqx.filter_jit
 def _descent_steps(
     x: Float[Array, " n"],
@@ -145,10 +153,8 @@ def _descent_steps(
     noise: Noise,
     descent: Descent,
     keys: Array,
-) -> tuple[Array, Any, Array]:
-    """Return x, the state of the optimiser and the cost before each step, after a step for each of
-    the `keys`, by which batches of recordings are drawn.
-    """
+) -> _Descended:
+    """Take a step of the optimiser for each of the `keys`, which draw batches of recordings."""
 
     def descent_step(carry: tuple, key: Array) -> tuple[tuple, Array]:
         x, optimiser_state = carry
@@ -162,7 +168,7 @@ def _descent_steps(
         return (x + move, optimiser_state), cost
 
     (x, optimiser_state), costs = jax.lax.scan(descent_step, (x, optimiser_state), keys)
-    return x, optimiser_state, costs
+    return _Descended(x, optimiser_state, costs)
 
 
 def cost_of_recordings(

@@ -15,8 +15,8 @@ class _Width(NamedTuple):
     """Hold an estimated `spread` of a `Free`: the deviation of its values in single recordings."""
 
     places: Int[np.ndarray, " k"]  # of the recordings' deviations from the shared value
-    square: float
-    freedom: float
+    variance: float  # the square of the `spread`
+    freedom: float  # of this variance
 
 
 class Freedom(eqx.Module):

@@ -267,12 +267,12 @@ class _Newton(NamedTuple):
 
 
 def _newton_step(
-    body: _SearchState, low: _IntervalEnd, high: _IntervalEnd, here: _IntervalEnd
+    body: _SearchState, low: _IntervalEnd, high: _IntervalEnd, at_guess: _IntervalEnd
 ) -> _Newton:
-    """Take one step of Newton's method towards a zero of g, from the guess `here`."""
-    rate, eps = here.rate, jnp.finfo(body.h.dtype).eps
-    move = (-here.g / jnp.where(rate == 0, jnp.ones_like(rate), rate)).astype(here.x.dtype)
-    goal = here.x + move
+    """Take one step of Newton's method towards a zero of g, from a guess."""
+    rate, eps = at_guess.rate, jnp.finfo(body.h.dtype).eps
+    move = (-at_guess.g / jnp.where(rate == 0, jnp.ones_like(rate), rate)).astype(at_guess.x.dtype)
+    goal = at_guess.x + move
     width = high.x - low.x
     small = jnp.sqrt(eps) * body.h
     near = (jnp.abs(move) <= small) & (rate != 0)

@@ -106,15 +106,23 @@ def run_replayed(
     return between, unpack_loop(end, like)
 
 
-def _for_bodies(
+class _BodiesLast(NamedTuple):
+    """Hold a run whose method takes arrays with the bodies in the last axis."""
+
+    method: Method
+    run: Run
+    layout: Layout
+    constants: Arrays
+
+
+def _with_bodies_last(
     method: Method,
     trees: tuple[Any, Any],
     layout: Layout,
     constants: Arrays,
     arrays_of_bodies: Arrays,
-) -> tuple[Method, Run, Layout, Arrays]:
-    """Convert a method for one body to one for arrays whose last axis runs over the bodies; return
-    it with the run, the layout and the constants that remain.
+) -> _BodiesLast:
+    """Return a run, whose method is for one body, with a method for bodies in the last axis.
 
     The last `constants`, the states of the controller, become `run.state`. The others are bound,
     without derivatives, to `halt` and `control`.
@@ -131,12 +139,12 @@ def _for_bodies(
     project = jax.vmap(method.project, -1, -1) if layout.bodies else method.project
     field = layout.vmap(method.field)
     method = method._replace(field=field, project=project, halt=halt, control=control)
-    return method, run, layout, constants
+    return _BodiesLast(method, run, layout, constants)
 
 
 def _run_bodies(keep: bool, *bodies: Any) -> Arrays:
     """Run all bodies; return the saved states, the packed end and, to `keep` it, the record."""
-    method, run, layout, constants = _for_bodies(*bodies)
+    method, run, layout, constants = _with_bodies_last(*bodies)
     record = None
     if keep or (run.between.shape[0] and layout.bodies):
         between, end, record = record_run(method, constants, run)
@@ -170,7 +178,7 @@ def _recorded(
     are joined in `arrays_of_bodies`.
     """
     whole, one = trees[0].num_leaves, method.field
-    method, run, layout, constants = _for_bodies(
+    method, run, layout, constants = _with_bodies_last(
         method, trees, layout, constants, arrays_of_bodies[:whole]
     )
     size = len(jax.eval_shape(pack_loop, loop_at_start(run)))

@@ -180,16 +180,18 @@ def _row(a: Array, i: Any) -> Array:
 
 
 def march_steps(
-    stepper: AnyStepper, h: Array, t0: Array, first: Array, count: int, y: PyTree,
+    stepper: AnyStepper, h: Array, t0: Array, first_step: Array, count: int, y: PyTree,
     inputs: PyTree = None,
 ) -> PyTree:  # fmt: skip
-    """Take `count` equal steps from number `first`; return the numbers of the state after them.
+    """Take `count` equal steps from number `first_step`; return the numbers of the state after.
 
     In reverse mode the run is divided into about √count pieces. The states at the starts of all
     pieces are stored; those within a piece are stored for one piece at a time.
     """
     if platform() != "cpu":
-        return march_on_gpu(lambda y, i: equal_step(stepper, h, t0, i, y, inputs), first, count, y)
+        return march_on_gpu(
+            lambda y, i: equal_step(stepper, h, t0, i, y, inputs), first_step, count, y
+        )
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def one(y: Any, i: Array) -> tuple[Any, None]:
@@ -202,8 +204,8 @@ def march_steps(
     length = steps_per_piece(count)
     pieces, left = divmod(count, length)
     if pieces > 1:
-        starts = first + length * jnp.arange(pieces, dtype=jnp.int32)
+        starts = first_step + length * jnp.arange(pieces, dtype=jnp.int32)
         y, _ = lax.scan(lambda y, begin: (some(y, begin, length), None), y, starts)
     else:
-        y = some(y, first, length)
-    return some(y, first + pieces * length, left) if left else y
+        y = some(y, first_step, length)
+    return some(y, first_step + pieces * length, left) if left else y

@@ -72,24 +72,27 @@ class _Pieces:
     turn: int  # the number of steps in one iteration of the loop in forward direction
 
     def take_steps(
-        self, constants: Arrays, y: Arrays, first: Array, number: int, keep_starts: bool = False
+        self,
+        constants: Arrays,
+        y: Arrays,
+        first_step: Array,
+        number: int,
+        keep_starts: bool = False,
     ) -> tuple[Arrays, Arrays | None]:
-        """Take `number` steps from `y`, the first with the number `first`; return the state at
-        their end and, if wanted, the starts of all.
+        """Take `number` steps from `y`; return the state at their end and, if wanted, all
+        starts.
         """
 
         def one(y: Arrays, i: Array) -> tuple[Arrays, Any]:
             return self.call(constants, y, i), y if keep_starts else None
 
-        return lax.scan(one, y, first + jnp.arange(number, dtype=jnp.int32), unroll=self.turn)
+        return lax.scan(one, y, first_step + jnp.arange(number, dtype=jnp.int32), unroll=self.turn)
 
     def run_saving_starts(
-        self, constants: Arrays, first: Array, y: Arrays
+        self, constants: Arrays, first_step: Array, y: Arrays
     ) -> tuple[Arrays, _PieceStarts]:
-        """Take all steps, of which the first has the number `first`; return the state at their end,
-        and the starts of the pieces.
-        """
-        firsts, length, left = self.divide(first)
+        """Take all steps; return the state at their end, and the starts of the pieces."""
+        firsts, length, left = self.divide(first_step)
 
         def piece(y: Arrays, begin: Array) -> tuple[Arrays, Arrays]:
             return self.take_steps(constants, y, begin, length)[0], y
@@ -97,19 +100,19 @@ class _Pieces:
         end, starts = lax.scan(piece, y, firsts)
         last = end
         if left:
-            end, _ = self.take_steps(constants, end, first + self.count - left, left)
+            end, _ = self.take_steps(constants, end, first_step + self.count - left, left)
         return end, _PieceStarts(starts, last)
 
     def pull_back(
         self,
         constants: Arrays,
         has_derivative: Sequence[bool],
-        first: Array,
+        first_step: Array,
         starts: _PieceStarts,
         cotangent_of_end: Arrays,
     ) -> tuple[Arrays, Arrays]:
         """Return the cotangents of the constants with a derivative, and of the start."""
-        firsts, length, left = self.divide(first)
+        firsts, length, left = self.divide(first_step)
         chosen = [c for c, m in zip(constants, has_derivative, strict=True) if m]
 
         def step_of(i: Array) -> Callable[[Arrays, Arrays], Arrays]:
@@ -128,7 +131,7 @@ class _Pieces:
 
         sums = [jnp.zeros_like(c) for c in chosen], cotangent_of_end
         if left:
-            sums = piece(sums, starts.of_left, first + self.count - left, left)
+            sums = piece(sums, starts.of_left, first_step + self.count - left, left)
 
         def whole(sums: tuple[Arrays, Arrays], at: tuple[Arrays, Array]) -> tuple[Any, None]:
             y, begin = at
@@ -136,21 +139,21 @@ class _Pieces:
 
         return lax.scan(whole, sums, (starts.of_pieces, firsts), reverse=True)[0]
 
-    def divide(self, first: Array) -> _Division:
-        """Return how all steps are divided into pieces; the first step has the number `first`."""
+    def divide(self, first_step: Array) -> _Division:
+        """Return how all steps are divided into pieces; the first has the number `first_step`."""
         length = steps_per_piece(self.count)
         many, left = divmod(self.count, length)
-        return _Division(first + length * jnp.arange(many, dtype=jnp.int32), length, left)
+        return _Division(first_step + length * jnp.arange(many, dtype=jnp.int32), length, left)
 
 
-def march_on_gpu(step: Callable[[Any, Array], Any], first: Array, count: int, y: Any) -> Any:
+def march_on_gpu(step: Callable[[Any, Array], Any], first_step: Array, count: int, y: Any) -> Any:
     """Take many equal steps `step(state, i)`, several in one kernel; return the state after them.
 
     In reverse mode the run is divided into pieces (see `_Pieces`). Second derivatives are forward
     over reverse.
     """
     start, tree = jax.tree.flatten(y)
-    one = trace_program(lambda y, i: jax.tree.leaves(step(tree.unflatten(y), i)), start, first)
+    one = trace_program(lambda y, i: jax.tree.leaves(step(tree.unflatten(y), i)), start, first_step)
     turn = min(max(_LONG // len(one.closed.jaxpr.eqns), 1), _MOST)
     # `turn` is how many steps are taken in one iteration of the loop over the steps. It is a power
     # of two, because the number of steps in a piece is often a multiple of a power of two.
@@ -192,4 +195,4 @@ def march_on_gpu(step: Callable[[Any, Array], Any], first: Array, count: int, y:
         return out, linear_map(push, pull, [*primals, *rows], along)
 
     run.defjvp(run_jvp, symbolic_zeros=True)
-    return tree.unflatten(run(*constants, first, *start))
+    return tree.unflatten(run(*constants, first_step, *start))

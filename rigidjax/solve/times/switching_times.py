@@ -38,44 +38,47 @@ class Changes(NamedTuple):
     over: Array  # whether there are more changes than can be stored
 
 
-def _monotonic_elements(found: Switches) -> tuple[np.ndarray, np.ndarray]:
+def _monotonic_elements(switches: Switches) -> tuple[np.ndarray, np.ndarray]:
     """Return the elements whose heights are not bent, and the numbers of their changes, from 0.
 
     An element of a function such as `floor` stands there `MOST` times.
     """
-    kinds, leaps = found.of_elements(lambda s: s.kind), found.of_elements(lambda s: s.leaps)
+    kinds, leaps = switches.of_elements(lambda s: s.kind), switches.of_elements(lambda s: s.leaps)
     element = np.repeat(np.arange(kinds.size), np.where(kinds < BENT, np.where(leaps, MOST, 1), 0))
     return element, (np.arange(element.size) - np.searchsorted(element, element)).astype(float)
 
 
-def find_changes(found: Switches, consts: Arrays, t0: Array, t1: Array) -> Changes:
+def find_changes(switches: Switches, consts: Arrays, t0: Array, t1: Array) -> Changes:
     """Return the changes of the switches of a field after the time t0 and until t1, s."""
     still, (begin, end) = lax.stop_gradient((consts, (t0, t1)))
     # A change within 8 units of round-off after the start counts as one before it.
     begin = begin + 8 * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(begin), jnp.abs(end - begin))
-    first, last = (found.heights_and_values(still, t)[1] for t in (begin, end))
-    kinds, leaps = found.of_elements(lambda s: s.kind), found.of_elements(lambda s: s.leaps) > 0
-    element, number = _monotonic_elements(found)
+    first, last = (switches.heights_and_values(still, t)[1] for t in (begin, end))
+    kinds, leaps = (
+        switches.of_elements(lambda s: s.kind),
+        switches.of_elements(lambda s: s.leaps) > 0,
+    )
+    element, number = _monotonic_elements(switches)
     rise, level = (last - first)[element], jnp.asarray(number + 0.5, t0.dtype)
     there = jnp.abs(rise) > level
     sizes = jnp.where(there, jnp.where(leaps[element], jnp.sign(rise), rise), 0)
     over = jnp.any(jnp.where((kinds < BENT) & leaps, jnp.abs(last - first) > MOST, False))
     low, high = jnp.full(element.size, begin), jnp.full(element.size, end)
-    t = _bisect(found, still, low, high, element, first[element], level)
+    t = _bisect(switches, still, low, high, element, first[element], level)
     bent = np.flatnonzero(kinds == BENT)
     others, which = t, jnp.zeros(0, jnp.int32)
     if bent.size:
-        cells = _cells_with_one_change(found, still, begin, end, bent, others)
+        cells = _cells_with_one_change(switches, still, begin, end, bent, others)
 
         def bisect(low: Array, high: Array, element: Array, value: Array) -> Array:
-            return _bisect(found, still, low, high, element, value, 0.5)
+            return _bisect(switches, still, low, high, element, value, 0.5)
 
         cell = cells.low, cells.high, cells.element, cells.value
         t = jnp.concatenate([t, _in_chunks(bisect, jnp.sum(cells.change != 0), *cell)])
         sizes, which = jnp.concatenate([sizes, cells.change]), cells.element
         over = over | cells.over
         element = jnp.concatenate([element, which])
-    t = _times_with_derivatives(found, consts, t, jnp.asarray(element), sizes != 0)
+    t = _times_with_derivatives(switches, consts, t, jnp.asarray(element), sizes != 0)
     t = jnp.where(sizes != 0, t, t1)
     # A change that is not stored has no derivative: then none is known.
     t = with_derivatives(lax.stop_gradient(t), jnp.where(over, jnp.nan, 1.0).astype(t.dtype) * t)
@@ -88,12 +91,16 @@ def _at(values: Array, i: Array) -> Array:
 
 
 def _bisect(
-    found: Switches, consts: Arrays, low: Array, high: Array, element: Any, base: Array, level: Any
+    switches: Switches,
+    consts: Arrays,
+    low: Array,
+    high: Array,
+    element: Any,
+    base: Array,
+    level: Any,
 ) -> Array:
-    """Return, for each interval from `low` to `high`, the time at which the value of its `element`
-    becomes different from `base` by `level`.
-    """
-    pick = jax.vmap(lambda t, i: _at(found.heights_and_values(consts, t)[1], i))
+    """Return, in each interval, the time at which the `element` differs from `base` by `level`."""
+    pick = jax.vmap(lambda t, i: _at(switches.heights_and_values(consts, t)[1], i))
 
     def half(_: Any, ends: Any) -> Any:
         middle = ends[0] + 0.5 * (ends[1] - ends[0])
@@ -145,7 +152,7 @@ class _Cells(NamedTuple):
 
 
 def _cells_with_one_change(
-    found: Switches,
+    switches: Switches,
     consts: Arrays,
     begin: Array,
     end: Array,
@@ -157,7 +164,11 @@ def _cells_with_one_change(
     Cells without a change come last. The grid of times contains `other_times`, at which elements of
     other heights change.
     """
-    bent, m, both = bent_elements, bent_elements.size, lambda t: found.heights_and_values(consts, t)
+    bent, m, both = (
+        bent_elements,
+        bent_elements.size,
+        lambda t: switches.heights_and_values(consts, t),
+    )
     count = _GRID if m <= 8 else max(256, 8 * _GRID // m)
     grid = begin + (end - begin) * jnp.linspace(0.0, 1.0, count, dtype=begin.dtype)
     if other_times.size:
@@ -193,26 +204,26 @@ def _cells_with_one_change(
     element = jnp.concatenate([jnp.tile(bent, grid.size - 1), *[jnp.asarray(bent)[which]] * 2])
     before = jnp.concatenate([value[:-1].ravel(), value[row, which], value_at])
     lows, highs = jnp.concatenate([cells[0], low, at]), jnp.concatenate([cells[1], at, high])
-    leaps = np.flatnonzero(found.of_elements(lambda s: s.leaps)[bent])
+    leaps = np.flatnonzero(switches.of_elements(lambda s: s.leaps)[bent])
     over = (jnp.sum(changes != 0) > MOST) | (jnp.sum(near) > MOST)
     over |= jnp.any(jnp.abs(value[1:, leaps] - value[:-1, leaps]) > 1)
     return _Cells(lows[index], highs[index], element[index], before[index], changes[index], over)
 
 
 def _times_with_derivatives(
-    found: Switches, consts: Arrays, t: Array, element: Array, there: Array
+    switches: Switches, consts: Arrays, t: Array, element: Array, is_change: Array
 ) -> Array:
-    """Return the times of changes with derivatives by `consts`, where a change is `there`.
+    """Return the times t of changes with derivatives by `consts`, where there `is_change`.
 
     A step of Newton's method leaves the times as they are, and makes the derivatives of one more
     order right.
     """
     height = jax.vmap(
-        lambda c, t, i: _at(found.heights_and_values(c, t)[0], i), in_axes=(None, 0, 0)
+        lambda c, t, i: _at(switches.heights_and_values(c, t)[0], i), in_axes=(None, 0, 0)
     )
     sloped = lambda c, t: jax.jvp(lambda t: height(c, t, element), (t,), (jnp.ones_like(t),))  # noqa: E731
-    straight = found.of_elements(lambda s: s.kind <= STRAIGHT) > 0
-    moves, at, eps = there, t, jnp.finfo(t.dtype).eps
+    straight = switches.of_elements(lambda s: s.kind <= STRAIGHT) > 0
+    moves, at, eps = is_change, t, jnp.finfo(t.dtype).eps
     if not straight.all():
         # At a pole, or at the end of the numbers with a result, the height is taken beside it.
         still = lax.stop_gradient(consts)
@@ -227,8 +238,10 @@ def _times_with_derivatives(
 
         # Where an operand jumps, the height jumps over zero, and its zero is not the time.
         passes = close(h[1], h[2], rate) | close(1 / h[1], 1 / h[2], rate / here**2)
-        passes |= jnp.asarray(straight | (found.of_elements(lambda s: s.asks_for_nan) > 0))[element]
-        moves = there & passes & jnp.isfinite(rate)
+        passes |= jnp.asarray(straight | (switches.of_elements(lambda s: s.asks_for_nan) > 0))[
+            element
+        ]
+        moves = is_change & passes & jnp.isfinite(rate)
         at = jnp.where(moves, beside, t)
     moved = jnp.zeros_like(t)
     for _ in range(1 if straight.all() else 2):
@@ -247,9 +260,9 @@ def _times_with_derivatives(
     return t
 
 
-def values_between(found: Switches, changes: Changes, stops: Array, t: Array) -> Array:
+def values_between(switches: Switches, changes: Changes, stops: Array, t: Array) -> Array:
     """Return the values (m,) at the time t, after the changes whose `stops` (k,) it passed."""
-    element, number = _monotonic_elements(found)
+    element, number = _monotonic_elements(switches)
     sizes = jnp.where(t >= stops, changes.sizes, 0)
     plain, bent = sizes[: element.size], sizes[element.size :]
     values = changes.first
