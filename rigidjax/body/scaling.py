@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 
 def binary_exponent(x: Float[Array, "..."]) -> Int[Array, ""]:
-    """Return the constant integer n with 2ⁿ⁻¹ ≤ max |x| < 2ⁿ, or 0 if all entries are 0."""
+    """Return the integer n, constant in derivatives, of 2ⁿ⁻¹ ≤ max |x| < 2ⁿ; 0 if x is zero."""
     return jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(x))))[1]
 
 

@@ -154,7 +154,7 @@ def family_slope(
 
 
 def _family_tangent(scene: "AbstractReversible", numbers: Array, index: int) -> Float[Array, "3"]:
-    """Return the derivatives of three of the four numbers by the one with this `index`."""
+    """Return the derivatives along a family of three numbers by that with this `index`."""
     _, matrix = correction.value_and_jacobian(
         lambda n: correction.half_period_residual(scene, n), numbers
     )

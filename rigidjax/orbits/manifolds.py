@@ -234,7 +234,7 @@ def manifold_start(
 
 
 def _positive(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
-    """Return a positive number in the dtype, if any; raise an error with its `name`."""
+    """Return a positive number in the `dtype`, if given; errors begin with its `name`."""
     distance = _checks.array_of_shape(value, (), name)
     return _checks.require_positive(
         distance if dtype is None else distance.astype(dtype), name, "a positive number"

@@ -358,7 +358,7 @@ def _warn_of_aliases(ts: NumbersLike, states: PyTree, moments: np.ndarray, secon
 
 
 def equal_box(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
-    """Return half-lengths and axes (columns, body axes) of the uniform box that moves alike.
+    """Return half-lengths and axes (columns, body axes) of the box that moves as the body does.
 
     Of the mass m and the principal second moments λ = m a²/3 follow the half-lengths a, in metres;
     for an `Inertia` they are scaled so that the longest is 1.

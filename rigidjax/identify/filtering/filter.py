@@ -503,7 +503,7 @@ def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) 
 
 
 def _update(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, ReadNumbers]:
-    """Return the belief after a step and its readings, and these beside their predictions."""
+    """Return the belief after a step and the readings at its end, and their `ReadNumbers`."""
     dtype = belief.root.dtype
     # Subtract times before they are rounded to the dtype of the state: after a thousand seconds the
     # seven digits of float32 are too few.

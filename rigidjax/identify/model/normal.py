@@ -24,7 +24,7 @@ class OwnBlocks(eqx.Module):
 
 
 class NormalMatrix(eqx.Module):
-    """Hold the normal matrix JᵀJ of a least-squares problem of n parameters, Jacobian J.
+    """Hold the normal matrix JᵀJ of a least-squares problem of n parameters with the Jacobian J.
 
     The first s parameters, the core, are shared; n = s + R k for R recordings with k own
     parameters.

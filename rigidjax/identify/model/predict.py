@@ -261,7 +261,7 @@ def needed_body(body: Body, state_type: type) -> Body:
 
 
 class Along(NamedTuple):
-    """Hold the times of a sensor, the states there, and (time, state) → `SensorInput`."""
+    """Hold the times at which a sensor reads, the states there, and a map to `SensorInput`."""
 
     # In s, after the clock offset.
     times: Float[Array, " times"]

@@ -176,7 +176,7 @@ def joint_residuals(model: Model, x: Float[Array, " n"]) -> Float[Array, " j"]:
 
 
 def prior_residuals(model: Model, x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """Return all residuals of no reading: of parameters' priors, and `joint_residuals`."""
+    """Return the residuals that belong to no reading: of each prior, and `joint_residuals`."""
     return jnp.concatenate([prior_weights(model) * x, joint_residuals(model, x)])
 
 

@@ -287,7 +287,7 @@ def _newton_step(
 def _hidden_zeros(
     sign_at_low: Array, low: _IntervalEnd, high: _IntervalEnd, round_off: Array
 ) -> tuple[Array, Array]:
-    """Return whether g may have two zeros that signs hide, and the time after `low` between.
+    """Return whether g may have two zeros that its signs hide, and the time after `low` between.
 
     The cubic polynomial with the values and slopes of g at both ends is examined. An extremum
     "beyond zero" is one at which it has the opposite sign of g at `low`, farther from zero than

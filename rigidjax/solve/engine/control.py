@@ -158,7 +158,7 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         return first.astype(begin.dtype), (inner, least)
 
     def _shortest_step(self, t: ArrayLike, time_scale: ArrayLike) -> Array:
-        """Return the shortest step, s: 8 units of round-off of the larger of |t|, `time_scale`."""
+        """Return the shortest step, s: 8 units of round-off of max(|t|, `time_scale`)."""
         return 8 * jnp.finfo(jnp.result_type(t)).eps * jnp.maximum(jnp.abs(t), time_scale)
 
     # As in diffrax, the arguments come by position; they are those of `StandardController`.

@@ -160,7 +160,7 @@ def _run_bodies(keep: bool, *bodies: Any) -> Arrays:
 HasTangent = tuple[list[bool], list[bool]]
 
 
-class _Seen(NamedTuple):
+class _RunAndTangents(NamedTuple):
     """Hold the recorded run of all bodies, and the tangents or cotangents along it."""
 
     method: Method  # its field takes only the constants below
@@ -173,7 +173,7 @@ class _Seen(NamedTuple):
 def _recorded(
     has_tangent: HasTangent, method: Method, trees: tuple[Any, Any], layout: Layout,
     constants: Arrays, arrays_of_bodies: Arrays,
-) -> _Seen:  # fmt: skip
+) -> _RunAndTangents:  # fmt: skip
     """Return the recorded run whose own arrays, those of its record, and the tangents or cotangents
     are joined in `arrays_of_bodies`.
     """
@@ -194,7 +194,9 @@ def _recorded(
         return field(replaced(constants, there, chosen), t, y)
 
     chosen = [c for c, m in zip(constants, there, strict=True) if m]
-    return _Seen(method._replace(field=of_moving), chosen, run, Record(starts, rows, counts), along)
+    return _RunAndTangents(
+        method._replace(field=of_moving), chosen, run, Record(starts, rows, counts), along
+    )
 
 
 def _push(has_tangent: HasTangent, *bodies: Any) -> Arrays:

@@ -164,7 +164,7 @@ class _Control(NamedTuple):
     order: Any  # the order of the error of a step
 
     def __call__(self, again: bool, constants: Arrays, given: Any, numbers: Any) -> Decision:
-        """Return the decision on a step; if it is repeated (`again`), the meter stays."""
+        """Return the decision on a step; if it is repeated (`again`), no progress is shown."""
         controller, meter = eqx.combine(self.arrays(constants), self.static)
         (control, progress), (t0, last, begin, end) = given
         *states, error = (self.tree(y) for y in numbers)

@@ -219,7 +219,7 @@ class Interpreter(NamedTuple):
     see: Callable[..., Any] = lambda path, inputs, kinds, out: None  # told what is evaluated
 
     def run(self, jaxpr: Any, consts: Any, args: Any, asked: Any = None) -> list[tuple[Any, int]]:
-        """Return the results, of which only those that are `asked` for are computed."""
+        """Return the results of a `jaxpr`; those that are not `asked` for may be `None`."""
         known = dict(zip(jaxpr.constvars, ((c, FIXED) for c in consts), strict=True))
         known |= dict(zip(jaxpr.invars, args, strict=True))
 
