@@ -115,7 +115,7 @@ def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> Py
         sent = np.asarray(multihost_utils.process_allgather(jnp.asarray(filled)))
         return np.concatenate([part[:n] for part, n in zip(sent, counts, strict=True)])
 
-    return _combined(rows_of_all, _on_host(tree, "gather"), checkpoint)
+    return _combined_tree(rows_of_all, _on_host(tree, "gather"), checkpoint)
 
 
 def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyTree:
@@ -135,7 +135,7 @@ def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyT
     [1.0, 1.0]
     """
     add = lambda leaf: multihost_utils.process_allgather(jnp.asarray(leaf)).sum(axis=0)  # noqa: E731
-    return _combined(add, _on_host(tree, "total"), checkpoint)
+    return _combined_tree(add, _on_host(tree, "total"), checkpoint)
 
 
 def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
@@ -218,7 +218,7 @@ def _on_host(tree: PyTree, caller: str) -> PyTree:
     return jax.tree.map(np.asarray, tree)
 
 
-def _combined(
+def _combined_tree(
     combine: Callable[[np.ndarray], np.ndarray | Array],
     tree: PyTree,
     checkpoint: str | os.PathLike[str] | None,

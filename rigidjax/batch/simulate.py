@@ -38,7 +38,7 @@ from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation.barrier import platform
 from rigidjax.solve import equations_of_motion, simulate as simulate_one
 from rigidjax.solve.answer import validation
-from rigidjax.solve.engine.loop import NONFINITE, finite, result_of_body
+from rigidjax.solve.engine.loop import NONFINITE, is_finite, result_of_body
 from rigidjax.solve.steps.explicit import DormandPrince8
 from rigidjax.solve.steps.magnus import Magnus4
 
@@ -241,7 +241,7 @@ def _results(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
     """
 
     def status(row: PyTree, ys: PyTree) -> dfx.RESULTS:
-        result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
+        result = dfx.RESULTS.where(is_finite(ys), dfx.RESULTS.successful, NONFINITE)
         return result_of_body(result, one_body(batch.shared, row, batch.constants)[0])
 
     return jax.vmap(status)(batch.per_body, ys)

@@ -43,7 +43,7 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     hint = "for an Inertia use pack_second_moment(body.second_moment), or pack_shape"
     _checks.require_unbatched_instance(body, MassProperties, "body", hint=hint)
     alpha = _limit_exponent(0.5 * jnp.log(body.mass), jnp.expm1)
-    shape = _packed(body.second_moment / body.mass)
+    shape = _six_numbers(body.second_moment / body.mass)
     return jnp.concatenate([alpha[None], shape, body.com])
 
 
@@ -73,7 +73,7 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
     >>> pack_second_moment(jnp.eye(3))
     Array([0., 0., 0., 0., 0., 0.], dtype=float64)
     """
-    return _packed(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))
+    return _six_numbers(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))
 
 
 def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
@@ -99,7 +99,7 @@ def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
     >>> pack_shape(jnp.diag(jnp.array([4.0, 4.0, 0.0])))  # a plate
     Array([0.5, 0.5, 0. , 0. , 0. ], dtype=float64)
     """
-    return _packed(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))[1:]
+    return _six_numbers(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))[1:]
 
 
 def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
@@ -216,7 +216,7 @@ def _root(shape: Float[Array, "5"]) -> Mat3:
     return from_components(1.0 + d1, 1.0 + d2, 1.0 - d1 - d2, s12, s13, s23)
 
 
-def _packed(s: Mat3) -> Float[Array, "6"]:
+def _six_numbers(s: Mat3) -> Float[Array, "6"]:
     """Return the six numbers of `pack_second_moment`, in any unit."""
     total = _positive_trace(s[0, 0] + s[1, 1] + s[2, 2])
     root = _sqrt(_divide_by_large(require_second_moment(s), total))

@@ -70,16 +70,18 @@ def to_inertia(
     + 𝔖33, …, so that no digit cancels.
     """
     x, y, z = second_moment[..., 0, 0], second_moment[..., 1, 1], second_moment[..., 2, 2]
-    return _negative(second_moment, jnp.stack([y + z, z + x, x + y], axis=-1))
+    return _negative_matrix(second_moment, jnp.stack([y + z, z + x, x + y], axis=-1))
 
 
 def to_second_moment(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Return the second moment `½ Tr(I) 1 − I` of an inertia tensor (notes, eqs 76–78 solved)."""
     x, y, z = tensor[..., 0, 0], tensor[..., 1, 1], tensor[..., 2, 2]
-    return _negative(tensor, 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1))
+    return _negative_matrix(
+        tensor, 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1)
+    )
 
 
-def _negative(a: Array, diagonal: Array) -> Array:
+def _negative_matrix(a: Array, diagonal: Array) -> Array:
     """Return −A, but with the given entries on the diagonal."""
     eye = jnp.broadcast_to(jnp.eye(3, dtype=bool), a.shape)
     return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)

@@ -16,7 +16,7 @@ RealOrArray = Float[Array, "..."]
 Tangent = ArrayLike | SymbolicZero
 
 
-def common(**numbers_by_name: Real) -> tuple[RealOrArray, ...]:
+def common_arrays(**numbers_by_name: Real) -> tuple[RealOrArray, ...]:
     """Convert numbers or arrays to arrays of one dtype and one shape, in the order of the
     arguments, whose keywords name them in errors.
 

@@ -15,7 +15,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
-from rigidjax.elliptic.arguments import Real, RealOrArray, Tangent, common
+from rigidjax.elliptic.arguments import Real, RealOrArray, Tangent, common_arrays
 from rigidjax.elliptic.carlson_r import (
     largest_or_one,
     nan_where_negative,
@@ -41,7 +41,7 @@ def rf(x: Real, y: Real, z: Real) -> RealOrArray:
     >>> float(rf(4.0, 4.0, 4.0))
     0.5
     """
-    return _rf(common(x=x, y=y, z=z))
+    return _rf(common_arrays(x=x, y=y, z=z))
 
 
 def rd(x: Real, y: Real, z: Real) -> RealOrArray:
@@ -56,7 +56,7 @@ def rd(x: Real, y: Real, z: Real) -> RealOrArray:
     >>> float(rd(4.0, 4.0, 4.0))
     0.125
     """
-    return _rd(common(x=x, y=y, z=z))
+    return _rd(common_arrays(x=x, y=y, z=z))
 
 
 def rj_(x: Real, y: Real, z: Real, p: Real) -> RealOrArray:
@@ -73,7 +73,7 @@ def rj_(x: Real, y: Real, z: Real, p: Real) -> RealOrArray:
     >>> round(float(rj_(4.0, 4.0, 4.0, 4.0)), 14)
     0.125
     """
-    return 1.5 * r_integral((0.5, 0.5, 0.5, 1.0), common(x=x, y=y, z=z, p=p))
+    return 1.5 * r_integral((0.5, 0.5, 0.5, 1.0), common_arrays(x=x, y=y, z=z, p=p))
 
 
 def rc(x: Real, y: Real) -> RealOrArray:
@@ -86,7 +86,7 @@ def rc(x: Real, y: Real) -> RealOrArray:
     >>> float(rc(4.0, 4.0))
     0.5
     """
-    x, y = common(x=x, y=y)
+    x, y = common_arrays(x=x, y=y)
     below = y < 0
     length = jnp.where(below, x - y, 1)
     # For y > 0 the factor is 1. Take the root of 1, not of x, in this case: for x = 0 the infinite

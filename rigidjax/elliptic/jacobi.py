@@ -29,7 +29,7 @@ from rigidjax.elliptic.arguments import (
     RealOrArray,
     Tangent,
     by_complement,
-    common,
+    common_arrays,
     with_complement,
 )
 from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, sncndn_near_one
@@ -63,7 +63,7 @@ def sncndn(
     >>> [round(float(x), 12) for x in sncndn(1.0, 0.5)]
     [0.803001824896, 0.595976567672, 0.823161001632]
     """
-    u, m, m1 = common(u=u, **with_complement("m", m, m1))
+    u, m, m1 = common_arrays(u=u, **with_complement("m", m, m1))
     s, c, d, _ = functions(u, by_complement(m, m1), m1)
     return s, c, d
 
@@ -78,7 +78,7 @@ def am(u: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     >>> round(float(am(1.0, 0.5)), 12)
     0.932315079884
     """
-    u, m, m1 = common(u=u, **with_complement("m", m, m1))
+    u, m, m1 = common_arrays(u=u, **with_complement("m", m, m1))
     s, c, _, turns = functions(u, by_complement(m, m1), m1)
     sign = power_of_minus_one(turns)
     return jnp.arctan2(sign * s, sign * c) + math.pi * turns
@@ -106,7 +106,7 @@ def functions(u: Array, m: Array, m1: Array) -> Functions:
     inner_m1 = jnp.where(above, -m1, m1) / divisor
 
     s, c, d = _sncndn(v, inner_m, inner_m1)
-    turns = _reduced(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
+    turns = _reduced_argument(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
     c, d = jnp.where(above, d, c), jnp.where(above, c, d)
     return Functions(s / root, c, d, jnp.where(above, 0, turns))
 
@@ -114,7 +114,7 @@ def functions(u: Array, m: Array, m1: Array) -> Functions:
 @jax.custom_jvp
 def _sncndn(u: Array, m: Array, m1: Array) -> SnCnDn:
     """Return sn, cn and dn for m = 1 − m1 ≤ 1, with derivatives by u and m1 alone."""
-    turns, angle, rows = _reduced(u, m1)
+    turns, angle, rows = _reduced_argument(u, m1)
     sign = power_of_minus_one(turns)
     theta = jnp.abs(angle)
     # Bulirsch's recursion squares the cotangent of the angle, which must not overflow if u is near
@@ -205,7 +205,7 @@ def _by_m_integral(u: Array, m: Array, m1: Array) -> SnCnDn:
     Carlson's R_D, after whole half periods are subtracted from u.
     """
     s, c, d = _sncndn(u, m, m1)
-    turns = _reduced(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
+    turns = _reduced_argument(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = power_of_minus_one(turns)
     # The integral X grows as 1/dn² and must not overflow. If cn and dn are tiny, X is 1/dn² times a
     # function of their ratio alone, with a relative error of the square of `_FLOOR`. Therefore
@@ -229,7 +229,7 @@ class HalfPeriods(NamedTuple):
     means: list[tuple[Array, Array]]  # the arithmetic and geometric means from (1, √m1) to π/(2K)
 
 
-def _reduced(u: Array, m1: Array) -> HalfPeriods:
+def _reduced_argument(u: Array, m1: Array) -> HalfPeriods:
     """Return the argument less whole half periods."""
     rows = agm_iterates(jnp.where(m1 == 0, 1, m1))
     turns, angle = split_half_turns(u * rows[-1][0])

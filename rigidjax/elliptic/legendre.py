@@ -23,7 +23,7 @@ from rigidjax.elliptic.arguments import (
     Real,
     RealOrArray,
     Tangent,
-    common,
+    common_arrays,
     with_complement,
 )
 from rigidjax.elliptic.carlson import rd, rf
@@ -50,7 +50,7 @@ def ellipk(m: Real, m1: Real | None = None) -> RealOrArray:
     >>> round(float(ellipk(1.0, 1e-30)), 12)
     35.925070756031
     """
-    _, m1 = common(**with_complement("m", m, m1))
+    _, m1 = common_arrays(**with_complement("m", m, m1))
     return _complete_first_kind(m1)
 
 
@@ -64,7 +64,7 @@ def ellipe(m: Real, m1: Real | None = None) -> RealOrArray:
     >>> float(ellipe(1.0))
     1.0
     """
-    _, m1 = common(**with_complement("m", m, m1))
+    _, m1 = common_arrays(**with_complement("m", m, m1))
     return complete_integral((0, -1, 0), m1)
 
 
@@ -84,7 +84,7 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
     >>> round(float(ellippi(0.5, 0.5)), 12)
     2.701287762095
     """
-    _, n1, _, m1 = common(**with_complement("n", n, n1), **with_complement("m", m, m1))
+    _, n1, _, m1 = common_arrays(**with_complement("n", n, n1), **with_complement("m", m, m1))
     return complete_integral((0, 0, 1), m1, n1)
 
 
@@ -100,7 +100,7 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     >>> round(float(ellipf(1.0, 0.5)), 12)
     1.083216772845
     """
-    phi, _, m1 = common(phi=phi, **with_complement("m", m, m1))
+    phi, _, m1 = common_arrays(phi=phi, **with_complement("m", m, m1))
     return _at_amplitude((0, 0, 0), phi, m1)
 
 
@@ -116,7 +116,7 @@ def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     >>> round(float(ellipeinc(1.0, 0.5)), 12)
     0.927329883624
     """
-    phi, _, m1 = common(phi=phi, **with_complement("m", m, m1))
+    phi, _, m1 = common_arrays(phi=phi, **with_complement("m", m, m1))
     return _at_amplitude((0, -1, 0), phi, m1)
 
 
@@ -138,7 +138,7 @@ def ellippiinc(
     >>> round(float(ellippiinc(0.5, 1.0, 0.5)), 12)
     1.288978174245
     """
-    _, n1, phi, _, m1 = common(
+    _, n1, phi, _, m1 = common_arrays(
         **with_complement("n", n, n1), phi=phi, **with_complement("m", m, m1)
     )
     return _at_amplitude((0, 0, 1), phi, m1, n1)

@@ -16,7 +16,7 @@ from rigidjax.exact.jacobi_duplication import (
     HalfPeriod,
     Modulus,
     clip_time,
-    doubled,
+    doubled_functions,
     elliptic_functions,
     half_period,
 )
@@ -161,7 +161,9 @@ def from_elliptic(
     )
     phase = whole * jnp.where(half_time.halves == 0, 0.0, constants.half.phase) + spin
     functions, phase = barrier((functions, phase))
-    full = barrier(doubled(functions, constants.modulus, constants.mu, constants.phase_factor))
+    full = barrier(
+        doubled_functions(functions, constants.modulus, constants.mu, constants.phase_factor)
+    )
     _, k2, k3 = barrier(momentum_at(constants, functions))
     m1, m2, m3 = barrier(momentum_at(constants, full))
 

@@ -138,7 +138,7 @@ def _inputs(
     primals: tuple[SymmetricEntries, Triple, Scalar], tangents: tuple[PyTree, ...]
 ) -> Inputs:
     """Return the `Inputs` for the inertia, Π(0) and t, and their tangents."""
-    inverse, change = jax.jvp(inverted, primals[:2], tangents[:2])
+    inverse, change = jax.jvp(inverse_and_energy, primals[:2], tangents[:2])
     variables = ten_variables(inverse, *primals[1:])
     return Inputs(inverse, change, variables, ten_variables(change, *tangents[1:]))
 
@@ -257,7 +257,7 @@ def _rows_by_body(
     # axes, by δK = −BᵀδI B with B = A K, where the columns of A are the principal axes. The
     # products are written as sums of products of entries, because on a GPU a product of matrices is
     # rounded to ten bits in float32.
-    k = jnp.stack(symmetric_rows(inverted(moments, momentum)[1]))
+    k = jnp.stack(symmetric_rows(inverse_and_energy(moments, momentum)[1]))
     b = jnp.sum(axes[:, :, None] * k[None], axis=1)
     d_k = lambda i, j: -(b[:, None, i] * b[None, :, j]).ravel()  # noqa: E731
     c1, c2, c3 = d_k(0, 0), d_k(1, 1), d_k(2, 2)
@@ -324,7 +324,7 @@ def motion_and_derivatives(
     (out, turn), parts = _turn_and_parts(
         closed_form_constants(inertia[:3], momentum), inertia, momentum, t
     )
-    _, k, energy2 = inverted(inertia, momentum)
+    _, k, energy2 = inverse_and_energy(inertia, momentum)
     motion = Motion(out, turn, matvec(k, out))
     rows = _motion_rows(k, energy2, momentum, t, motion, *parts)
     return MotionAndDerivatives(motion, rows, parts)
@@ -440,7 +440,7 @@ def _turn_and_parts(
     )
     none = half_time.halves == 0
     whole = jnp.where(none, 0.0, 2.0 * half_time.halves) * jnp.where(none, 0.0, constants.half.time)
-    body, _, _ = inverted(inertia, momentum)
+    body, _, _ = inverse_and_energy(inertia, momentum)
     parts = momentum_jacobian(body, momentum, t, half, half_time.halves, whole, constants.half.mean)
     return from_elliptic(constants, f, half_time, t), parts
 
@@ -473,7 +473,7 @@ def _parts_tangent(
     return MomentumParts(d_rows, tuple(jnp.sum(g * change_of_variables) for g in by_inputs))
 
 
-def inverted(inertia: SymmetricEntries, momentum: Triple) -> Inverse:
+def inverse_and_energy(inertia: SymmetricEntries, momentum: Triple) -> Inverse:
     """Return the inverse of an inertia tensor in principal axes, and twice the energy."""
     i1, i2, i3, i12, i13, i23 = inertia
     r = 1.0 / determinant(inertia)

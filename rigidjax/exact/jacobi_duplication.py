@@ -88,7 +88,9 @@ def clip_time(reduced_time: Scalar, modulus: Modulus) -> Scalar:
     )
 
 
-def doubled(functions: Elliptic, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Elliptic:
+def doubled_functions(
+    functions: Elliptic, modulus: Modulus, mu: Scalar, phase_factor: Scalar
+) -> Elliptic:
     """Return the elliptic functions and the phase at the time 2u from those at the time u.
 
     The phase is ξ(2u) = 2ξ + arctan(B/A), with A = C² + pS²D² + μS²(C²D² + C² + D²) and B = 2κS³CD
@@ -161,7 +163,7 @@ def elliptic_functions(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Sc
     n = iteration_limits(u.dtype).doublings
     f = elliptic_series(u * 2.0**-n, modulus, mu, phase_factor)
     # Double the time in a loop: it compiles eight times sooner than nine doublings written out.
-    return jax.lax.fori_loop(0, n, lambda _, g: doubled(g, modulus, mu, phase_factor), f)
+    return jax.lax.fori_loop(0, n, lambda _, g: doubled_functions(g, modulus, mu, phase_factor), f)
 
 
 class HalfPeriod(NamedTuple):

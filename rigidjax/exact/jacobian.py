@@ -26,7 +26,7 @@ from rigidjax.exact.components3 import SymmetricEntries, Triple
 from rigidjax.exact.jacobi_duplication import (
     Elliptic,
     Modulus,
-    doubled,
+    doubled_functions,
     elliptic_series,
     iteration_limits,
     third_kind_series,
@@ -191,6 +191,6 @@ def doubled_integrals(
 ) -> Integrals:
     """Return the elliptic functions and integrals at the time 2u from those at the time u."""
     f, three = start.f, modulus.gap > 0
-    after = doubled(f, modulus, mu, phase_factor)
+    after = doubled_functions(f, modulus, mu, phase_factor)
     a, b = f.S / jnp.where(three, f.D, f.C), after.S / jnp.where(three, after.D, after.C)
     return Integrals(after, 2.0 * start.y2 + f.S * f.S * after.S, 2.0 * start.y + a * a * b)

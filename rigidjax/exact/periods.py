@@ -13,7 +13,7 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.body.scaling import binary_exponent, times_power_of_two
 from rigidjax.exact import sigma_form
 from rigidjax.exact.components3 import HALF, SymmetricEntries, Triple, matvec
-from rigidjax.exact.derivatives import inverted, motion_and_derivatives
+from rigidjax.exact.derivatives import inverse_and_energy, motion_and_derivatives
 from rigidjax.exact.jacobi_duplication import Modulus, half_period, is_aperiodic
 from rigidjax.exact.principal_axes import components_along, principal_axes
 
@@ -90,7 +90,7 @@ def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
     exponent = binary_exponent(omega)
     moments, axes = principal_axes(times_power_of_two(tensor, -binary_exponent(tensor)))
     momentum = matvec(moments, components_along(axes, times_power_of_two(omega, -exponent)))
-    body, _, _ = inverted(moments, momentum)
+    body, _, _ = inverse_and_energy(moments, momentum)
     v = sigma_form.invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
     endless = is_aperiodic(jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap)))
@@ -102,7 +102,7 @@ def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
     safe_moments, safe_momentum = jax.tree.map(
         lambda a, b: jnp.where(endless, a, b), other, (moments, momentum)
     )
-    body, _, _ = inverted(safe_moments, safe_momentum)
+    body, _, _ = inverse_and_energy(safe_moments, safe_momentum)
     period = sigma_form.momentum_period(sigma_form.invariants(body, safe_momentum))
     angle = _precession_angle(safe_moments, safe_momentum, period)
     still = h == 0
@@ -117,7 +117,7 @@ def _precession_angle(inertia: SymmetricEntries, momentum: Triple, period: Scala
     """Return the angle, rad, by which the axis that the momentum circles turns about the momentum
     in one `period` of the body rate.
     """
-    body, k, _ = inverted(inertia, momentum)
+    body, k, _ = inverse_and_energy(inertia, momentum)
     v = sigma_form.invariants(body, momentum)
     about_three, h = v.a2 > 0, jnp.sqrt(v.h2)
     mu = jnp.where(about_three, body.d23 * v.a3, body.d12 * v.a1)
@@ -134,7 +134,9 @@ def _precession_angle_jvp(
 ) -> tuple[Scalar, Scalar]:
     """Return the angle and its tangent, by the formula for Π·θ in the head of `derivatives`."""
     moments, momentum, period = primals
-    (_, _, energy2), (_, d_k, d_energy2) = jax.jvp(inverted, (moments, momentum), tangents[:2])
+    (_, _, energy2), (_, d_k, d_energy2) = jax.jvp(
+        inverse_and_energy, (moments, momentum), tangents[:2]
+    )
     g = _period_integral(moments, momentum, period)
     along = 0.5 * period * d_energy2 + energy2 * tangents[2]
     along = along + sum(w * a * b for w, a, b in zip(HALF, g, d_k, strict=True))
@@ -152,7 +154,7 @@ def _period_integral(
     have the means `A₃(1 − p⟨S²⟩)/d₁₃`, `A₁A₃⟨S²⟩` and `A₁(1 − q⟨S²⟩)/d₁₃`, with the numbers of
     `sigma_form.invariants`, and ⟨S²⟩ of `half_period`.
     """
-    body, _, _ = inverted(inertia, momentum)
+    body, _, _ = inverse_and_energy(inertia, momentum)
     v = sigma_form.invariants(body, momentum)
     mean = half_period(Modulus(v.p, v.q, v.gap), jnp.zeros_like(period), period).mean
     zero = jnp.zeros_like(period)

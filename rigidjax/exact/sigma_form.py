@@ -149,15 +149,15 @@ def sigma_series(u: Scalar, constants: Invariants) -> Sigma:
     c1 = (constants.p + constants.q) * uu
     s = barrier(u * (1.0 - c1 / 6))
     x = barrier(
-        _scaled(
+        _scaled_matrix(
             (constants.q, zero, constants.p, constants.e12, constants.e13, constants.e23), s * s
         )
     )
     t = tuple(-0.5 * (a + 0.25 * b) for a, b in zip(x, commuting_product(x, x), strict=True))
     # The integral Y of σ² T⁻² from 0 to u is ⅓u³ (1 − c₁/5 + 3X/5) to the fifth power of u, where
     # `c1` is c₁ = (p + q) u², and `x` is the matrix X of the docstring.
-    y = _scaled(_shifted(_scaled(x, 0.6), 1.0 - 0.2 * c1), u * uu / 3)
-    return _normalised(s, _shifted(t, 1.0), y)
+    y = _scaled_matrix(_shifted_matrix(_scaled_matrix(x, 0.6), 1.0 - 0.2 * c1), u * uu / 3)
+    return _normalised_sigma(s, _shifted_matrix(t, 1.0), y)
 
 
 def doubled_sigma(sigma: Sigma, constants: Invariants) -> Sigma:
@@ -191,12 +191,12 @@ def doubled_sigma(sigma: Sigma, constants: Invariants) -> Sigma:
     n12 = 2.0 * (m12 * m33 - m13 * m23)
     n13 = 2.0 * (m13 * m22 - m12 * m23)
     n23 = 2.0 * (m23 * m11 - m12 * m13)
-    after = _normalised(2.0 * s * sigma.det, (n11, n22, n33, n12, n13, n23), sigma.y)
+    after = _normalised_sigma(2.0 * s * sigma.det, (n11, n22, n33, n12, n13, n23), sigma.y)
     # The integral Y = ∫₀ᵘ σ² T⁻² du at the double time is Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u).
-    before = barrier(_scaled(sigma.adjugate, s / sigma.det))
+    before = barrier(_scaled_matrix(sigma.adjugate, s / sigma.det))
     more = commuting_product(
         barrier(commuting_product(before, before)),
-        _scaled(after.adjugate, after.s / after.det),
+        _scaled_matrix(after.adjugate, after.s / after.det),
     )
     return after._replace(y=barrier(tuple(2.0 * a + b for a, b in zip(sigma.y, more, strict=True))))
 
@@ -305,7 +305,7 @@ def integral_in_four_parts(
         total = tuple(a + jnp.where(odd, c, 0.0) for a, c in zip(total, part, strict=True))
         return MomentumAndIntegral(point, total)
 
-    first = MomentumAndIntegral(momentum, _scaled(commuting_product(b, sigma.y), -8.0))
+    first = MomentumAndIntegral(momentum, _scaled_matrix(commuting_product(b, sigma.y), -8.0))
     return jax.lax.fori_loop(0, 8, take_eighth, first)
 
 
@@ -375,21 +375,23 @@ def momentum_and_integral(
     return MomentumAndIntegral(tuple(p[0] for p in out), g)
 
 
-def _normalised(sigma: Scalar, t_matrix: SymmetricEntries, integral: SymmetricEntries) -> Sigma:
+def _normalised_sigma(
+    sigma: Scalar, t_matrix: SymmetricEntries, integral: SymmetricEntries
+) -> Sigma:
     """Return the sigma functions with σ and T divided by T₂₂, so that T₂₂ = 1 in value.
 
     The divisor is a constant in derivatives: a factor common to σ and T changes no result.
     """
     factor = barrier(1.0 / jax.lax.stop_gradient(t_matrix[1]))
-    sigma, t_matrix = barrier((sigma * factor, _scaled(t_matrix, factor)))
+    sigma, t_matrix = barrier((sigma * factor, _scaled_matrix(t_matrix, factor)))
     return Sigma(sigma, t_matrix, *barrier((adjugate(t_matrix), determinant(t_matrix))), integral)
 
 
-def _scaled(matrix: SymmetricEntries, factor: Scalar | float) -> SymmetricEntries:
+def _scaled_matrix(matrix: SymmetricEntries, factor: Scalar | float) -> SymmetricEntries:
     """Return the matrix times a number."""
     return tuple(c * factor for c in matrix)
 
 
-def _shifted(matrix: SymmetricEntries, summand: Scalar | float) -> SymmetricEntries:
+def _shifted_matrix(matrix: SymmetricEntries, summand: Scalar | float) -> SymmetricEntries:
     """Return the matrix plus `summand` times the unit matrix."""
     return (matrix[0] + summand, matrix[1] + summand, matrix[2] + summand, *matrix[3:])

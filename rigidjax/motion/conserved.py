@@ -46,7 +46,7 @@ def energy(
     if isinstance(law, AbstractSuspension):
         turn = _checks.require_unbatched_instance(state, Turn, "state")
         return law.energy(law.require_body(body), turn)
-    motion, parts, t = _checked(body, state, law, t)
+    motion, parts, t = _checked_arguments(body, state, law, t)
     for part in parts:
         if not hasattr(part, "energy"):
             words = f"energy: wanted torques with a potential, got {type(part).__name__}, which has"
@@ -95,7 +95,7 @@ def conserved(
     if isinstance(law, AbstractSuspension):
         lossless = cast(Any, law).friction is None and cast(Any, law).torque is None
         return {"energy": energy(body, state, law)} if lossless else {}
-    motion, parts, t = _checked(body, state, law, t)
+    motion, parts, t = _checked_arguments(body, state, law, t)
     dtype = motion.omega.dtype
     body = in_precision(body, dtype)
     quantities: dict[str, Float[Array, "..."]] = {}
@@ -183,7 +183,7 @@ def drift(
     kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(motion)
 
     def momentum_length(t: ScalarLike, y: PyTree) -> Scalar:
-        motion, parts, t = _checked(body, y, law, t)
+        motion, parts, t = _checked_arguments(body, y, law, t)
         own = in_precision(body, motion.omega.dtype)
         return length_or_zero(_momentum(own, motion, parts, t))
 
@@ -210,7 +210,7 @@ class _Checked(NamedTuple):
     t: Scalar
 
 
-def _checked(body: Body, state: PyTree, torque: Torque | None, t: ScalarLike) -> _Checked:
+def _checked_arguments(body: Body, state: PyTree, torque: Torque | None, t: ScalarLike) -> _Checked:
     """Return a state, a torque and a time after checks; the values of the torque's own states,
     which a `Coupled` holds, are inserted.
     """

@@ -53,7 +53,7 @@ def plus(state: PyTree, change: Float[Array, " n"]) -> PyTree:
     def multiply_by_exp(q: Array, rotation_vector: Array) -> Array:
         return quaternion.multiply(q, vector_to_quaternion(rotation_vector))
 
-    return _moved(state, change, multiply_by_exp, jnp.add)
+    return _moved_state(state, change, multiply_by_exp, jnp.add)
 
 
 def minus(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
@@ -83,7 +83,7 @@ def minus_small(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
 
 def vector_to_tangent(state: PyTree, change: Float[Array, " n"]) -> PyTree:
     """Return the tangent of `state`: the derivative of `plus(state, α * change)` at α = 0."""
-    return _moved(state, change, quaternion.rate, lambda _, part: part)
+    return _moved_state(state, change, quaternion.rate, lambda _, part: part)
 
 
 def tangent_to_vector(state: PyTree, tangent_vector: PyTree) -> Float[Array, " n"]:
@@ -114,7 +114,7 @@ def _slices(state: PyTree) -> list[slice]:
     return out
 
 
-def _moved(
+def _moved_state(
     state: PyTree,
     change: Array,
     of_quaternion: Callable[[Array, Array], Array],

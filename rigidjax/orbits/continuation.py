@@ -206,7 +206,7 @@ def follow(
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"count: wanted the number of members, an integer ≥ 1, got {count!r}")
     tolerance = correction.usual_tolerance(start)
-    numbers, residuals = _followed(scene, start, length, count, index, tolerance)
+    numbers, residuals = _followed_members(scene, start, length, count, index, tolerance)
     moved = jnp.diff(jnp.concatenate([start[None], numbers]), axis=0)
     far = jnp.sqrt(jnp.sum(moved * moved, axis=1)) > 2 * jnp.abs(length)
     lost = _is_lost(start, numbers, residuals) | far
@@ -215,7 +215,7 @@ def follow(
 
 
 @eqx.filter_jit
-def _followed(
+def _followed_members(
     scene: "AbstractReversible", start: Array, step: Array, count: int, index: int, tolerance: float
 ) -> Members:
     """Return the next members of a family at equal steps of arclength, by pseudo-arclength

@@ -83,7 +83,7 @@ def periodic_orbit(
     free = np.delete(np.arange(4), index)
     if tolerance is None:
         tolerance = usual_tolerance(numbers)
-    unknown, left = _corrected(scene, numbers[free], numbers[index], index, tolerance)
+    unknown, left = _corrected_orbit(scene, numbers[free], numbers[index], index, tolerance)
     bad = ~(left <= tolerance)
     said = ""
     if _checks.is_known(left):
@@ -237,7 +237,7 @@ class Corrected(NamedTuple):
 # linear in the tangents, so that it serves both `jax.jacfwd` and `jax.grad`, although the motions
 # inside the rule are differentiated in forward mode.
 @eqx.filter_jit
-def _corrected(
+def _corrected_orbit(
     scene: AbstractScene, unknown: Array, held_value: Array, index: int, tolerance: float
 ) -> Corrected:
     """Return the corrected orbit, by a compiled program."""

@@ -190,7 +190,7 @@ def manifold(
     """
     count, samples = _checks.integer(count, "count", 1), _checks.integer(samples, "samples", 2)
     dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
-    distance = _positive(distance, "distance", dtype)
+    distance = _positive_number(distance, "distance", dtype)
     phases = jnp.arange(count).astype(distance.dtype) / count
     starts, value = jax.vmap(lambda p: manifold_point(scene, orbit, p, branch, side, distance))(
         phases
@@ -198,7 +198,7 @@ def manifold(
     words = "manifold: the orbit has no multiplier that is real and of size above 1: it is stable "
     words += "to first order, or nearby motions spiral; take an orbit with an index |ν| > 1"
     value = _checks.error_if(value[0], jnp.isnan(value[0]), words)
-    length = 2 * orbit.period if time is None else _positive(time, "time", dtype)
+    length = 2 * orbit.period if time is None else _positive_number(time, "time", dtype)
     ts = jnp.linspace(jnp.zeros_like(length), length, samples)
     states = _trajectories(scene, starts, ts, branch)
     return Manifold(ts if branch == "unstable" else -ts, states, phases, value)
@@ -233,7 +233,7 @@ def manifold_start(
     return manifold_point(scene, orbit, where, branch, side, away)[0]
 
 
-def _positive(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
+def _positive_number(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
     """Return a positive number in the `dtype`, if given; errors begin with its `name`."""
     distance = _checks.array_of_shape(value, (), name)
     return _checks.require_positive(

@@ -140,7 +140,7 @@ def tumble(
     """
     seconds, pictures = _duration_and_count(ts, seconds, fps)
     body = validation.require_single_body(body, (Inertia, MassProperties), "body")
-    moments, q = resampled(ts, states, pictures)
+    moments, q = resampled_attitudes(ts, states, pictures)
     _warn_of_aliases(ts, states, moments, seconds)
     size = _checks.integer(size, "size", 64)
     solid = _solid(body, surface)
@@ -228,7 +228,7 @@ def player(
     `tumble`.
     """
     seconds, pictures = _duration_and_count(ts, seconds, fps)
-    moments, q = resampled(ts, states, pictures)
+    moments, q = resampled_attitudes(ts, states, pictures)
     _warn_of_aliases(ts, states, moments, seconds)
     solid = _solid(validation.require_single_body(body, (Inertia, MassProperties), "body"), surface)
     viser = _checks.import_library("viser", "view", "plot.player")
@@ -281,7 +281,9 @@ def _page(server: Any, solid: "_Solid", q: np.ndarray, seconds: float) -> str:
     return recording.as_html()
 
 
-def resampled(ts: NumbersLike, states: PyTree, count: int) -> tuple[np.ndarray, np.ndarray]:
+def resampled_attitudes(
+    ts: NumbersLike, states: PyTree, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return evenly spaced times, s, and attitudes there, along the shorter arcs."""
     q = host_attitudes(states)
     t = host_times(ts, q.shape[0])

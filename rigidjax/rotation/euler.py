@@ -114,9 +114,9 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     s, c = jnp.where(low, 0, s), jnp.where(high, 0, c)
     middle = 2 * jnp.arctan2(s, c) if symmetric else handed * 2 * jnp.arctan2(c - s, c + s)
     angles = [
-        _wrapped(half_sum + half_difference),
+        _wrapped_angle(half_sum + half_difference),
         middle,
-        _wrapped(half_sum - half_difference),
+        _wrapped_angle(half_sum - half_difference),
     ]
     return jnp.stack(angles[::-1] if reverse else angles)
 
@@ -245,7 +245,7 @@ def _turn(axis: int, angle: Scalar) -> Quat:
     return jnp.stack(parts)
 
 
-def _wrapped(angle: Scalar) -> Scalar:
+def _wrapped_angle(angle: Scalar) -> Scalar:
     """Return an angle between −2π and 2π, rad, shifted into the interval (−π, π]."""
     angle = jnp.where(angle > np.pi, angle - 2 * np.pi, angle)
     return jnp.where(angle <= -np.pi, angle + 2 * np.pi, angle)

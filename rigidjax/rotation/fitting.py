@@ -175,7 +175,7 @@ def _estimate(
     both = nearest_rotation(_outer_sum(weights, world, body)), limit
     costs = []
     for rotation in both:
-        _, ratio, apart = _turned(rotation, world, body)
+        _, ratio, apart = _turned_directions(rotation, world, body)
         costs.append((weights * (apart * apart).sum(-1) / jnp.where(ratio > 0, ratio, 1)).sum())
     return jnp.where(costs[1] < costs[0], *reversed(both))
 
@@ -188,7 +188,9 @@ class Turned(NamedTuple):
     apart: Float[Array, "n 3"]  # M bᵢ minus aᵢ times the ratio
 
 
-def _turned(rotation: Mat3, world: Float[Array, "n 3"], body: Float[Array, "n 3"]) -> Turned:
+def _turned_directions(
+    rotation: Mat3, world: Float[Array, "n 3"], body: Float[Array, "n 3"]
+) -> Turned:
     """Return turned directions; `apart` is small where M fits, and so is its round-off."""
     moved = (rotation[None] * body[:, None, :]).sum(-1)
     # The derivative of the ratio of the lengths makes the derivative of the difference small, too,
@@ -217,7 +219,7 @@ def _newton_turn(
     The cross product of aᵢ and M bᵢ is computed from the small difference of these two vectors:
     otherwise the rounding of a direction with a large weight would turn the body about it.
     """
-    moved, _, apart = _turned(rotation, world, body)
+    moved, _, apart = _turned_directions(rotation, world, body)
     moment = (weights[:, None] * jax.vmap(cross)(apart, world)).sum(0)
     one = jnp.eye(3, dtype=weights.dtype)
     outer = _outer_sum(weights, moved, world)

@@ -125,7 +125,7 @@ def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
     [-1.0, -2.0, 3.0]
     """
     w, *u = components(_checks.array_of_shape(q, (4,), "q", hint=_HINT))
-    return _rotated(w, u, components(_checks.array_of_shape(y, (3,), "y")))
+    return _rotated_vector(w, u, components(_checks.array_of_shape(y, (3,), "y")))
 
 
 def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
@@ -136,7 +136,7 @@ def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
     [-1.0, -2.0, 3.0]
     """
     w, *u = components(_checks.array_of_shape(q, (4,), "q", hint=_HINT))
-    return _rotated(-w, u, components(_checks.array_of_shape(y, (3,), "y")))
+    return _rotated_vector(-w, u, components(_checks.array_of_shape(y, (3,), "y")))
 
 
 def check(
@@ -323,7 +323,7 @@ def from_matrix(matrix: Mat3Like) -> Quat:
     return matrix_to_quaternion(_checks.check_if_known(require_rotation, matrix, "matrix"))
 
 
-def _rotated(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
+def _rotated_vector(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
     """Return a vector turned by a unit quaternion (w, u), y + 2 (w u × y + u × (u × y))."""
     across = cross_components(u, y)
     again = cross_components(u, across)

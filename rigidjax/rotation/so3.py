@@ -126,10 +126,10 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
     3.0
     """
     a, b = _checks.array_of_shape(a, (3, 3), "a"), _checks.array_of_shape(b, (3, 3), "b")
-    return quaternion.angle(matrix_to_quaternion(_between(a, b)))
+    return quaternion.angle(matrix_to_quaternion(_turn_between(a, b)))
 
 
-def _between(a: Mat3, b: Mat3) -> Mat3:
+def _turn_between(a: Mat3, b: Mat3) -> Mat3:
     """Return aᵀb; raise `ValueError` if it is known and not finite or far from a rotation."""
     between = product(a.T, b)
     if _checks.is_known(between):
@@ -244,7 +244,7 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     [0.540302, -0.841471, 0.0]
     """
     a, b = _checks.array_of_shape(a, (3, 3), "a"), _checks.array_of_shape(b, (3, 3), "b")
-    v = quaternion.log(matrix_to_quaternion(_between(a, b)))
+    v = quaternion.log(matrix_to_quaternion(_turn_between(a, b)))
     part = require_turn(_checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn")
     return product(a, vector_to_matrix(part))
 

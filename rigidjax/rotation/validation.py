@@ -27,10 +27,12 @@ def require_direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
     """
     if (
         _checks.is_known(v)
-        and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest(v) < np.inf
+        and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest_entry(v) < np.inf
     ):
         _checks.require_finite(v, name)
-        got = "zero" if _largest(v) == 0 else f"less than the least normal number, {least:.2g}"
+        got = (
+            "zero" if _largest_entry(v) == 0 else f"less than the least normal number, {least:.2g}"
+        )
         raise ValueError(f"{name}: wanted a direction, got {got}")
     return v
 
@@ -39,17 +41,19 @@ def require_turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
     """Return the rotation vector or angle `v`, rad, or raise a `ValueError` if it is known and so
     large that no digit of the rotation is correct.
     """
-    if _checks.is_known(v) and not _largest(v) <= (limit := 1 / float(jnp.finfo(v.dtype).eps)):
+    if _checks.is_known(v) and not _largest_entry(v) <= (
+        limit := 1 / float(jnp.finfo(v.dtype).eps)
+    ):
         _checks.require_finite(v, name)
         raise ValueError(
-            f"{name}: a turn by {_largest(v):.3g} rad; beyond {limit:.2g} rad "
+            f"{name}: a turn by {_largest_entry(v):.3g} rad; beyond {limit:.2g} rad "
             f"neighbouring {v.dtype} numbers are more than half a radian apart: the attitude is "
             "unknown; leave out whole turns before, or check the unit"
         )
     return v
 
 
-def _largest(v: Float[Array, "*n"]) -> float:
+def _largest_entry(v: Float[Array, "*n"]) -> float:
     """Return the largest absolute value of the entries of a known array."""
     # The result is NaN if an entry is NaN. The function makes one call of NumPy only, because it
     # runs before every conversion that is called outside of `jit`.

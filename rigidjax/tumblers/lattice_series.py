@@ -78,7 +78,7 @@ def _sums(
     return jax.lax.map(sums_at, frequencies, batch_size=BATCH)
 
 
-def _interpolated(
+def _interpolated_sums(
     table: Complex[Array, " entries"], frequencies: Float[Array, "*shape"]
 ) -> Complex[Array, "*shape"]:
     """Return the sums at the wanted frequencies, 1/span, by the polynomial (Lagrange) through the 8
@@ -116,7 +116,7 @@ def chi2_of_padded(pairs: Array, table: Sums, order: int) -> Float[Array, " pair
         # half of them are interpolated, since sums at opposite frequencies are complex conjugates.
         m, n = np.arange(first + 1.0), np.arange(-second, second + 1.0)
         f = jnp.asarray(m[:, None]) * pair[0] + jnp.asarray(n[None, :]) * pair[1]
-        half = _interpolated(sums, f)
+        half = _interpolated_sums(sums, f)
         return jnp.concatenate([jnp.conj(half[:0:-1, ::-1]), half])
 
     def chi2(pair: Array) -> Array:

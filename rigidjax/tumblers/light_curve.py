@@ -201,7 +201,7 @@ def fit_light_curve(
     say(f"{len(starts)} starts")
     whole = stacking.pad_to_few(model)
     ends = search_starts(whole, starts, noise_of(reading, flux, pairs.scatter), tolerance)
-    aliases = _distinct(whole, ends)
+    aliases = _distinct_aliases(whole, ends)
     say(f"{len(aliases)} motions, cost {aliases[0].cost:.6g}")
     best = fit(whole, starts=1, initial=aliases[0].x, tolerance=tolerance)
     result = _result(best, aliases, pairs, used >= count)
@@ -267,14 +267,14 @@ def _alias(model: Model, x: Array, cost: float) -> Alias:
     return Alias(x, cost, *motion, explains=False)
 
 
-def _distinct(model: Model, ends: list[Attempt]) -> list[Alias]:
+def _distinct_aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
     """Return the different motions among the results of searches, the smallest cost first."""
     out: list[Alias] = []
     for end in sorted(ends, key=lambda one: float(one.cost)):
         if not np.isfinite(float(end.cost)):
             continue
         alias = _alias(model, end.x, float(end.cost))
-        if not any(_same(alias, other, SAME) for other in out):
+        if not any(_same_motion(alias, other, SAME) for other in out):
             out.append(alias)
     if not out:
         raise ValueError(
@@ -284,7 +284,7 @@ def _distinct(model: Model, ends: list[Attempt]) -> list[Alias]:
     return out
 
 
-def _same(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
+def _same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
     """Return whether two motions have the same mode, and logarithms of the periods and ratios that
     differ by less than `tolerance` (4,).
     """
@@ -309,7 +309,7 @@ def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
     return jax.vmap(in_body)(t)
 
 
-def _widened(best: Fit) -> Fit:
+def _widened_fit(best: Fit) -> Fit:
     """Return the fit of a light curve with a larger covariance, which allows for a body that is not
     an ellipsoid (see `fit_light_curve`), and wider intervals.
     """
@@ -348,7 +348,7 @@ def _result(
     more pairs of frequencies may fit if `is_incomplete`.
     """
     slopes = np.asarray(_slopes(best.point.derivative_point, best.model))
-    wider = _widened(best)
+    wider = _widened_fit(best)
     own, deviations = (
         standard_deviations(
             slopes, np.asarray(one.determined_covariance), np.asarray(one.null_directions)
@@ -361,7 +361,7 @@ def _result(
     # The best motion keeps the cost that the search gave it, since the costs of the search all
     # belong to the same noise; the fit may have estimated another noise.
     first = _alias(best.model, best.x, aliases[0].cost)
-    others = [alias for alias in aliases if not _same(alias, first, near)]
+    others = [alias for alias in aliases if not _same_motion(alias, first, near)]
     # A motion whose cost exceeds that of the best motion by less than a margin explains the data
     # nearly as well. The margin is wider if the errors of the best motion are larger than the
     # noise, or autocorrelated.

@@ -143,7 +143,7 @@ def search_starts(
         chunk = [starts[first + k % len(starts[first:])] for k in range(FIRST)]
         stacked = _with_levels(jnp.stack(chunk), model)
         settings = Settings(tolerance, CAREFUL, STEPS)
-        ends = _searched(stacked, model, noise, settings, np.int32(FIRST))
+        ends = _searched_starts(stacked, model, noise, settings, np.int32(FIRST))
         points.append(ends.x)
         costs.append(np.asarray(ends.cost))
     all_points = jnp.concatenate(points)
@@ -156,12 +156,12 @@ def search_starts(
     best = best[:SECOND]
     rows = jnp.asarray(np.resize(best, FIRST))
     settings = Settings(tolerance, 1e-2, MORE)
-    last = _searched(all_points[rows], model, noise, settings, np.int32(len(best)))
+    last = _searched_starts(all_points[rows], model, noise, settings, np.int32(len(best)))
     return [jax.tree.map(lambda leaf, k=k: leaf[k], last) for k in range(len(best))]
 
 
 @eqx.filter_jit
-def _searched(
+def _searched_starts(
     starts: Array,
     model: Model,
     noise: Noise,

@@ -172,9 +172,9 @@ def two_frequencies(
     pairs = np.concatenate(rows)
     pairs = pairs[(pairs[:, 1] > 0.5) & (pairs[:, 1] < highest)]
     misfits = chi2_of_pairs(table, pairs, order)
-    pairs, misfits = lower_chi2(table, pairs[distinct(pairs, misfits, count * TRIED)], order)
+    pairs, misfits = lower_chi2(table, pairs[distinct_pairs(pairs, misfits, count * TRIED)], order)
     pairs, misfits = with_aliases(table, pairs, misfits, highest, order)
-    keep = distinct(pairs, misfits, count)
+    keep = distinct_pairs(pairs, misfits, count)
     dof = t.size - unknowns
     best = max(float(misfits[keep[0]]), 1e-300)
     scatter = float(np.sqrt(best / dof / np.mean(1.0 / sigma**2)))
@@ -257,12 +257,12 @@ def with_aliases(
     """
     peaks = highest_side_peaks(table, highest)
     for _ in range(ROUNDS):
-        seeds = pairs[distinct(pairs, misfits, SEEDS)]
+        seeds = pairs[distinct_pairs(pairs, misfits, SEEDS)]
         more = (aliases_of(seeds, peaks)[:, None] + 0.2 * AROUND).reshape(-1, 2)
         more = more[((more > 0.5) & (more < highest)).all(axis=1)]
         if not len(more):
             break
-        best = distinct(more, chi2_of_pairs(table, more, order), 2 * SEEDS)
+        best = distinct_pairs(more, chi2_of_pairs(table, more, order), 2 * SEEDS)
         more, new = lower_chi2(table, more[best], order)
         before = misfits.min()
         pairs, misfits = np.concatenate([pairs, more]), np.concatenate([misfits, new])
@@ -271,7 +271,7 @@ def with_aliases(
     return Pairs(pairs, misfits)
 
 
-def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
+def distinct_pairs(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
     """Return the indices of the best pairs whose first or second frequencies differ by more than
     `NEAR`, in the order of their χ².
     """

@@ -10,7 +10,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.search.stages import cost_of
-from rigidjax.identify.search.stochastic_gradient import chosen, cost_of_recordings
+from rigidjax.identify.search.stochastic_gradient import cost_of_recordings, with_recordings
 
 TS = jnp.linspace(0.0, 4.0, 25)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -57,7 +57,7 @@ def test_the_slope_is_that_of_differences(problem):
 
 def test_a_batch_holds_the_recordings_it_names(problem):
     rows = jnp.array([5, 2])
-    few = chosen(problem, rows)
+    few = with_recordings(problem, rows)
     assert few.count == 2
     # Times, readings and masks of both, in the order in which they are named.
     kept, whole = (jax.tree.leaves(eqx.filter(p.records, eqx.is_array)) for p in (few, problem))

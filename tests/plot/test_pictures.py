@@ -311,14 +311,14 @@ def test_the_box_of_a_box_is_itself():
 
 
 def test_between_saved_times_a_film_stays_on_the_group():
-    from rigidjax.plot.animation import resampled
+    from rigidjax.plot.animation import resampled_attitudes
 
     ts = jnp.linspace(0.0, 6.0, 40)
     turning = once(jax.vmap(lambda t: rj.quaternion.exp(jnp.array([0.0, 0.0, 1.0]) * t)))(ts)
     # The same attitudes with signs as they may come out of a logarithm.
     signs = jnp.where(jnp.arange(40) % 3 == 0, -1.0, 1.0)[:, None]
     states = rj.Attitude(turning * signs, jnp.zeros((40, 3)))
-    times, q = resampled(ts, states, 23)
+    times, q = resampled_attitudes(ts, states, 23)
     exact = np.stack([np.cos(times / 2), 0 * times, 0 * times, np.sin(times / 2)], axis=-1)
     apart = np.abs(np.einsum("ti,ti->t", q, exact))
     np.testing.assert_allclose(apart, 1.0, atol=1e-6)

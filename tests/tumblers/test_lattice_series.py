@@ -35,7 +35,7 @@ def test_the_table_is_the_sum_between_its_entries():
     turns = np.exp(2j * np.pi * f[:, None] * (T - 0.5))
     for values, weights in ((table.window, SIGMA**-2), (table.data, Y / SIGMA**2)):
         wanted = turns @ weights
-        found = np.asarray(lattice_series._interpolated(values, jnp.asarray(f)))
+        found = np.asarray(lattice_series._interpolated_sums(values, jnp.asarray(f)))
         np.testing.assert_allclose(found, wanted, atol=1e-8 * np.abs(weights).sum())
 
 

@@ -179,7 +179,9 @@ class Recording(eqx.Module):
         return tuple(reading.sensor for reading in self.readings)
 
 
-def unchecked(t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]) -> Recording:
+def unchecked_recording(
+    t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]
+) -> Recording:
     """Return a `Recording` without the checks of `Recording(…)`, perhaps with a leading axis."""
     record = object.__new__(Recording)
     parts = {"t": t, "readings": readings, "inputs": inputs, "dropped": 0}

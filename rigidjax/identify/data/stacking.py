@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from rigidjax import _checks
-from rigidjax.identify.data.recording import Reading, Recording, unchecked
+from rigidjax.identify.data.recording import Reading, Recording, unchecked_recording
 from rigidjax.motion.torques import Linear, Series
 
 
@@ -65,7 +65,7 @@ def pad_to_few(model: PyTree) -> PyTree:
         return model
 
     def longer(records: Recording) -> Recording:
-        count, rows = _padded(records.t.shape[1]), _padded(_table_rows(records, 1))
+        count, rows = _padded_length(records.t.shape[1]), _padded_length(_table_rows(records, 1))
         return pad_recording(records, count, rows, 1)
 
     return with_records(model, [longer(one.records) for one in kinds_of(model)])
@@ -108,7 +108,7 @@ def unite(kinds: Sequence[Recording]) -> Recording:
         for reading in pick(record.readings, np.clip(every - end + count, 0, count - 1)):
             mask = _apply("logical_and", reading.mask, mine[:, None])
             readings.append(eqx.tree_at(lambda r: r.mask, reading, mask))
-    return unchecked(_apply("concatenate", [r.t for r in kinds]), tuple(readings), {})
+    return unchecked_recording(_apply("concatenate", [r.t for r in kinds]), tuple(readings), {})
 
 
 def _apply(name: str, *arrays: Any) -> Array:
@@ -128,7 +128,7 @@ def _table_rows(recording: Recording, axis: int) -> int:
     return max((int(table.values.shape[axis]) for table in tables), default=0)
 
 
-def _padded(count: int) -> int:
+def _padded_length(count: int) -> int:
     """Return the least allowed length that is not below `count`, or 0 for 0.
 
     Allowed are the powers of 2^(1/4), rounded up to multiples of 16.

@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Numbers
-from rigidjax.identify.data.recording import Reading, Recording, unchecked
+from rigidjax.identify.data.recording import Reading, Recording, unchecked_recording
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.sensors.states import StateSensor
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -155,7 +155,7 @@ class Windows(eqx.Module):
             name: jnp.asarray(np.concatenate([rows, rows[:, -1:]], axis=1))
             for name, rows in inputs.items()
         }
-        return unchecked(jnp.asarray(t), (reading,), inputs)
+        return unchecked_recording(jnp.asarray(t), (reading,), inputs)
 
     def held_horizons(self) -> Horizons:
         """Return the errors of a prediction that the state stays constant in each window.

@@ -20,7 +20,7 @@ from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.filtering import roots
 from rigidjax.identify.model.build import TURN_OF_A_FILTER_STEP
 from rigidjax.identify.model.free import with_leaves
-from rigidjax.identify.model.predict import needed_body, shifted
+from rigidjax.identify.model.predict import needed_body, shifted_state
 from rigidjax.identify.model.scene import (
     Process,
     Scene,
@@ -268,7 +268,7 @@ def linearise_readings(dynamics: Dynamics, stop: Stops, x: ExtendedState) -> Lin
             motion, when = y.motion, t
             offset = extras(drifted).offset
             if offset is not None:
-                motion, when = shifted(field_with_torques, t, motion, offset), t + offset
+                motion, when = shifted_state(field_with_torques, t, motion, offset), t + offset
             return drifted.error(
                 SensorInput(when, motion, dynamics.scene.body, field_with_torques), value
             )

@@ -64,9 +64,9 @@ def fields_of_model(
     if process is not None:
         require_unknown_torque(process)
     if isinstance(recordings, Windows):
-        data = _windowed(recordings, charts, stretches, **parts)
+        data = _windowed_data(recordings, charts, stretches, **parts)
     else:
-        data = _recorded(recordings, charts, **parts)
+        data = _recorded_data(recordings, charts, **parts)
     indices = None
     if names[0]:
         order = list(dict.fromkeys(names))
@@ -185,7 +185,7 @@ class _Data(NamedTuple):
     clusters: Int[Array, " records"] | None = None
 
 
-def _recorded(
+def _recorded_data(
     recordings: list[Any], charts: Charts, torque: Torque | None, integrator: Any, **_: Any
 ) -> _Data:
     """Return those fields of a `Model` that come from recordings, after checks."""
@@ -216,7 +216,7 @@ def _recorded(
             )
     for number, one in enumerate(recordings):
         # Each sample is held over one step, and all steps are equal.
-        names, steps = _sampled(torque, one), np.diff(np.asarray(one.t, float))
+        names, steps = _sampled_inputs(torque, one), np.diff(np.asarray(one.t, float))
         if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
             raise ValueError(
                 f"inputs[{names[0]!r}]: samples are held through even steps, and the times of "
@@ -232,8 +232,8 @@ def _recorded(
     with jax.ensure_compile_time_eval():
         reference = references(recordings, state_kind)
     carried = isinstance(torque, Carried)
-    if _sampled(torque, recordings[0]):
-        integrator = _held(integrator)
+    if _sampled_inputs(torque, recordings[0]):
+        integrator = _held_steps(integrator)
     elif integrator is None and torque is not None and not carried:
         widest = max(float(np.diff(r.t).max()) for r in recordings)
         integrator = integrator_for(1.5 * widest * float(np.max(np.asarray(reference.rate))))
@@ -241,7 +241,7 @@ def _recorded(
     return _Data(records, counts, sensors, state_kind, reference, vectors, integrator)
 
 
-def _windowed(
+def _windowed_data(
     windows: Windows,
     charts: Charts,
     stretches: int,
@@ -269,11 +269,11 @@ def _windowed(
         )
     counts = np.full(windows.count, windows.length + 1, np.int32)
     vectors = 0 if weight is None else dimension(stacking.pick(reference.state, 0)) // 3
-    held = _held(integrator)
+    held = _held_steps(integrator)
     return _Data(records, counts, sensors, state_kind, reference, vectors, held, weight, clusters)
 
 
-def _held(integrator: AbstractIntegrator | None) -> HeldSteps:
+def _held_steps(integrator: AbstractIntegrator | None) -> HeldSteps:
     """Return `HeldSteps`, the only integrator for inputs given as samples; raise `ValueError` if
     `integrator` is neither `None` nor a `HeldSteps`.
     """
@@ -313,7 +313,7 @@ def require_inputs(torque: Torque | None, windows: Windows) -> None:
         raise ValueError("; ".join(wrong))
 
 
-def _sampled(torque: Torque | None, recording: Recording) -> list[str]:
+def _sampled_inputs(torque: Torque | None, recording: Recording) -> list[str]:
     """Return the names of the inputs that the `torque` reads as samples, not as functions."""
     return [name for name in input_names_of(torque) if not callable(recording.inputs[name])]
 

@@ -167,7 +167,7 @@ class PrincipalRatios(AbstractBodyChart):
         return jnp.log(i[:2] / i[2])
 
 
-def _typical(value: object) -> Array:
+def _checked_typical(value: object) -> Array:
     """Return `typical` of a chart as an array, after checks: it is easily taken for a body."""
     if isinstance(value, Inertia | MassProperties):
         raise TypeError(
@@ -194,7 +194,7 @@ class Tensor(AbstractBodyChart):
     Array(0.001, dtype=float64)
     """
 
-    typical: Float[Array, ""] = eqx.field(converter=_typical, default=1.0)
+    typical: Float[Array, ""] = eqx.field(converter=_checked_typical, default=1.0)
     size: ClassVar[int] = 6
     log_names: ClassVar[tuple[str, ...]] = ("I1", "I2", "I3")
     plain_names: ClassVar[tuple[str, ...]] = ("Ixx", "Iyy", "Izz", "Iyz", "Ixz", "Ixy")
@@ -230,7 +230,7 @@ class Principal(AbstractBodyChart):
     Array(2., dtype=float64)
     """
 
-    typical: Float[Array, ""] = eqx.field(converter=_typical, default=1.0)
+    typical: Float[Array, ""] = eqx.field(converter=_checked_typical, default=1.0)
     size: ClassVar[int] = 3
     log_names: ClassVar[tuple[str, ...]] = ("Ix", "Iy", "Iz")
     unit: ClassVar[str] = "kg m²"

@@ -405,7 +405,7 @@ def part_of_sensor(model: Model, index: int) -> Part:
     return next(part for part in parts_of(model) if index < part.sensors_slice.stop)
 
 
-def padded(model: Model, arrays: Sequence[Array | np.ndarray]) -> tuple[Any, ...]:
+def padded_arrays(model: Model, arrays: Sequence[Array | np.ndarray]) -> tuple[Any, ...]:
     """Return the arrays (R, T, k, …) of each sensor, zero in the places of other kinds."""
     if not model.parts:
         return tuple(arrays)
@@ -637,7 +637,7 @@ def all_errors(model: Model, x: Float[Array, " n"]) -> tuple[Array, ...]:
     """
     if model.parts:
         each = [all_errors(part.model, part.take(x)) for part in model.parts]
-        return padded(model, [error for errors in each for error in errors])
+        return padded_arrays(model, [error for errors in each for error in errors])
     return map_rows(model.index.rows(x), model, sensor_errors)
 
 
@@ -684,7 +684,7 @@ def error_jacobians(
         values, slopes = (
             [one for some in part for one in some] for part in zip(*each, strict=True)
         )
-        return FirstOrder(padded(model, values), padded(model, slopes))
+        return FirstOrder(padded_arrays(model, values), padded_arrays(model, slopes))
     out, slopes = _row_jacobians(model, model.index.rows(x), function)
     columns = jnp.asarray(model.index.columns, jnp.int32)
     if columns.size > model.index.width:

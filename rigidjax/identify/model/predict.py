@@ -247,7 +247,7 @@ class HeldSteps(AbstractIntegrator):
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, later)
 
 
-def shifted(field: Callable[..., Any], t: Array, state: PyTree, offset: Array) -> PyTree:
+def shifted_state(field: Callable[..., Any], t: Array, state: PyTree, offset: Array) -> PyTree:
     """Return the state at t + `offset`, s, by four equal steps of order 4 along `field`."""
     h = offset / 4.0
     for index in range(4):
@@ -298,7 +298,7 @@ def sensor_inputs(
         else:
             whole = CoupledEquations(field, turned) if isinstance(states, Coupled) else field
             axes = (0, 0, 0 if jnp.ndim(offset) else None)
-            states = jax.vmap(partial(shifted, whole), axes)(ts, states, offset)
+            states = jax.vmap(partial(shifted_state, whole), axes)(ts, states, offset)
 
     def input_at(t: Array, state: PyTree) -> SensorInput:
         if not isinstance(state, Coupled):

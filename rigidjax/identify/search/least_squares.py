@@ -152,12 +152,12 @@ def minimise(
 
     return lax.while_loop(
         lambda now: ~now.done & (now.taken <= settings.steps),
-        lambda now: _next(now, evaluate(now.trial), order_one, settings, gain_of_noise),
+        lambda now: _next_state(now, evaluate(now.trial), order_one, settings, gain_of_noise),
         begun,
     )
 
 
-def _next(
+def _next_state(
     state: LMState,
     evaluation: tuple[Any, Array, NormalMatrix, Array],
     order_one: Array,

@@ -19,7 +19,7 @@ from rigidjax.identify.data.recording import Reading, numbers_read
 from rigidjax.identify.model import terms
 from rigidjax.identify.model.charts import split_numbers
 from rigidjax.identify.model.first_order import value_and_jacfwd
-from rigidjax.identify.model.model import Model, error_jacobians, padded, parts_of
+from rigidjax.identify.model.model import Model, error_jacobians, padded_arrays, parts_of
 from rigidjax.identify.model.normal import NormalMatrix, normal_matrix
 from rigidjax.identify.model.predict import FixedSteps, HeldSteps
 from rigidjax.identify.model.several import Part
@@ -253,7 +253,7 @@ def first_weights(model: Model, part: float) -> Float[Array, "records times"]:
     return jnp.asarray((since <= part * length).astype(t.dtype))
 
 
-def _best(state: LMState, model: Model) -> Attempt:
+def _best_attempt(state: LMState, model: Model) -> Attempt:
     """Return the best point of a search, with its `blocks` if it was the last evaluated one."""
     blocks = _blocks(state, model) if bool(state.evaluated_at_best) else None
     return Attempt(state.point, state.cost, state.converged, blocks)
@@ -292,7 +292,7 @@ def _evaluate_all_readings(model: Model, x: Float[Array, " n"], noise: Noise) ->
 
 def _blocks(state: LMState, model: Model) -> Blocks:
     """Return the blocks of the last evaluation of a search."""
-    return Blocks(*(padded(model, some) for some in state.evaluation.blocks))
+    return Blocks(*(padded_arrays(model, some) for some in state.evaluation.blocks))
 
 
 def blocks_at(model: Model, x: Float[Array, " n"]) -> Blocks:
@@ -332,7 +332,7 @@ def search_whole(
             attempt = Attempt(attempt.x, cost_of(task.model, attempt.x, task.noise))
             watch(attempt)
             break
-        attempt = _best(end, task.model)
+        attempt = _best_attempt(end, task.model)
         # At the minimum every step may be refused because of round-off. The search therefore also
         # ends if the cost does not fall any more. This test needs a whole run: with a small
         # `max_steps`, one or two steps may all be refused only because they are too long.
@@ -378,7 +378,7 @@ def fit_in_stages(
             attempt = search_whole(Attempt(x), task, aim=aim, watch=watch)
         return attempt
     end = _take_steps(x, task, whole_weights(model), CAREFUL, aim)
-    at_once = _best(end, model)
+    at_once = _best_attempt(end, model)
     if bool(end.converged) and float(end.cost) <= accepted_cost(model):
         watch(at_once)
         return at_once

@@ -178,13 +178,13 @@ def cost_of_recordings(
 
     The mean over random batches is the cost of the whole model.
     """
-    few, sizes = chosen(model, recording_indices), stacking.pick(noise, recording_indices)
+    few, sizes = with_recordings(model, recording_indices), stacking.pick(noise, recording_indices)
     residuals = reading_residuals(few, all_errors(few, x), sizes, jnp.ones_like(few.records.t))
     scale = model.count / recording_indices.shape[0]
     return half_squares(residuals) * scale + half_squares(prior_residuals(model, x))
 
 
-def chosen(model: Model, recording_indices: Array) -> Model:
+def with_recordings(model: Model, recording_indices: Array) -> Model:
     """Return the model with all parameters and some recordings, at indices that may be traced."""
     parts = lambda m: (m.records, m.reference, m.body_indices, m.index.places, m.index.start)  # noqa: E731
     return eqx.tree_at(

@@ -50,14 +50,14 @@ class AttitudeSensor(ClockedSensor):
     mounting: Vec3 | None = eqx.field(converter=base.optional_array_field("mounting"), default=None)
 
     def error(self, motion: SensorInput, reading: Array) -> Vec3:
-        q = _mounted(motion.state.q, self.mounting)
+        q = _sensor_attitude(motion.state.q, self.mounting)
         return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
 
     def reading_of(self, motion: SensorInput, error: Vec3) -> Float[Array, "4"]:
         """Return the quaternion (4,) that this attitude sensor reads for a given `motion` if its
         error is the rotation vector `error` (3,), rad.
         """
-        q = _mounted(motion.state.q, self.mounting)
+        q = _sensor_attitude(motion.state.q, self.mounting)
         return quaternion.multiply(q, quaternion.exp(error))
 
     def readings(self, values: np.ndarray) -> np.ndarray:
@@ -88,7 +88,7 @@ class AttitudeSensor(ClockedSensor):
         return _not_unit(values), f"the quaternion at index {{index}} {words}"
 
 
-def _mounted(q: Array, mounting: Vec3 | None) -> Array:
+def _sensor_attitude(q: Array, mounting: Vec3 | None) -> Array:
     """Return the attitude of the axes of a sensor mounted on a body of attitude q."""
     return q if mounting is None else quaternion.multiply(q, quaternion.exp(mounting))
 
@@ -158,7 +158,9 @@ class Direction(ClockedSensor):
 
     def _predicted(self, motion: SensorInput) -> Vec3:
         """Return the direction in the axes of the sensor that it is predicted to read."""
-        return quaternion.rotate_inverse(_mounted(motion.state.q, self.mounting), self.world)
+        return quaternion.rotate_inverse(
+            _sensor_attitude(motion.state.q, self.mounting), self.world
+        )
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         """Return a mask (T,), true for each row of `values` that is not a unit vector, and the
@@ -289,7 +291,7 @@ class Velocity(ClockedSensor):
             arm = motion.lever(self.place)
             velocity = velocity + quaternion.rotate(state.q, cross(state.omega, arm))
         if self.mounting is not None:
-            velocity = quaternion.rotate_inverse(_mounted(state.q, self.mounting), velocity)
+            velocity = quaternion.rotate_inverse(_sensor_attitude(state.q, self.mounting), velocity)
         return reading - (velocity if self.bias is None else velocity + self.bias)
 
 

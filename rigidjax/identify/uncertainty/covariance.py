@@ -143,7 +143,7 @@ class Linearisation(eqx.Module):
 
 
 @eqx.filter_jit
-def _linearised(model: Model, x: Array, noise: Noise, blocks: Blocks) -> dict[str, Any]:
+def _linearised_fields(model: Model, x: Array, noise: Noise, blocks: Blocks) -> dict[str, Any]:
     """Compute those fields of a `Linearisation`, by name, that take one compiled program."""
     errors, slopes = blocks
     out, slopes = residual_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
@@ -173,7 +173,7 @@ def linearise(
     The `blocks` are those of x. If a body is flat (I1 + I2 = I3) at x, `thickened` holds the
     parameters of a slightly thicker body and the blocks there: the derivatives are taken there.
     """
-    parts = jax.tree.map(np.asarray, _linearised(model, x, noise, blocks))
+    parts = jax.tree.map(np.asarray, _linearised_fields(model, x, noise, blocks))
     raw, raw_slopes = (tuple(map(np.asarray, part)) for part in blocks)
     if thickened is not None:
         thick = linearise(model, thickened[0], noise, thickened[1])

@@ -99,7 +99,7 @@ def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     of its thickness with respect to x is zero at a flat body: derivatives are computed at a
     slightly thicker one. The information on the inertia tensor itself is hardly different there.
     """
-    thick = list(map(_thicker, model.charts, bodies_at(model, x)))
+    thick = list(map(_thicker_body, model.charts, bodies_at(model, x)))
     if all(one is None for one in thick):
         return None
     pairs = zip(split_numbers(model.charts, x[: model.index.bodies]), thick, strict=True)
@@ -112,7 +112,7 @@ def bodies_at(model: Model, x: Float[Array, " n"]) -> list[Any]:
     return body_list(model.unpack(x).body)
 
 
-def _thicker(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
+def _thicker_body(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
     """Return the parameters of a slightly thicker body, or `None` if `body` is not flat.
 
     The result is `None` as well for NaN, and for a `chart` without a limit at flat bodies.

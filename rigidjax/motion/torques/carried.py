@@ -120,7 +120,7 @@ class LoggedMotion(eqx.Module):
             words = f"got shapes {times.shape} and {rows.shape[:1]}"
             raise ValueError(f"from_poses: wanted t, x, q of 12 or more increasing times, {words}")
         grid = np.linspace(times[0], times[-1], times.size)
-        path, turning = _smoothed(times, rows[:, :3]), _smoothed(times, rows[:, 3:])
+        path, turning = _smoothing_spline(times, rows[:, :3]), _smoothing_spline(times, rows[:, 3:])
         length = np.linalg.norm(turning(grid), axis=1)[:, None]
         poses = path(grid), turning(grid) / length
         # The rates and accelerations are those of the smooth splines, not of the cubic ones.
@@ -192,7 +192,7 @@ def _spline(t: Any, rows: Any, name: str) -> Series:
         raise ValueError(f"LoggedMotion: {name}: {error}") from None
 
 
-def _smoothed(t: Float[np.ndarray, " n"], rows: Float[np.ndarray, "n k"]) -> Any:
+def _smoothing_spline(t: Float[np.ndarray, " n"], rows: Float[np.ndarray, "n k"]) -> Any:
     """Return the spline of degree 5 with the least generalised cross-validation."""
     from scipy.interpolate import make_lsq_spline
 

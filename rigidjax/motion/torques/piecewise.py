@@ -25,7 +25,7 @@ class _Table(eqx.Module):
     __repr__ = _show.fields_as_text
 
     def __init__(self, times: Times, values: Float[ArrayLike, "rows *k"] | Sequence[Any]):
-        self.times, self.values = _checked("times", times, "values", values)
+        self.times, self.values = _checked_table("times", times, "values", values)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -100,7 +100,7 @@ class Tabulated(AbstractTorque):
     torques: Float[Array, "n 3"]
 
     def __init__(self, times: Times, torques: Rows):
-        self.times, self.torques = _checked("times", times, "torques", torques, beyond=0)
+        self.times, self.torques = _checked_table("times", times, "torques", torques, beyond=0)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -138,7 +138,7 @@ class Pulses(AbstractTorque):
     torques: Float[Array, "n 3"]
 
     def __init__(self, edges: Times, torques: Rows):
-        self.edges, self.torques = _checked("edges", edges, "torques", torques, beyond=1)
+        self.edges, self.torques = _checked_table("edges", edges, "torques", torques, beyond=1)
 
     @property
     def jump_times(self) -> Float[Array, " edges"]:
@@ -179,7 +179,7 @@ def _interpolate(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scala
     return rows[i] + part * (rows[i + 1] - rows[i])
 
 
-def _checked(
+def _checked_table(
     times_name: str,
     times: NumbersLike,
     rows_name: str,

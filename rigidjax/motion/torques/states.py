@@ -77,7 +77,7 @@ def freeze_own_states(torque: Tree, own: tuple[PyTree, ...]) -> Tree:
             raise ValueError(f"own: {words}, got no states for {type(node).__name__}")
         return queue.pop(0)
 
-    frozen = _inserted(torque, next_states)
+    frozen = _with_frozen_laws(torque, next_states)
     if queue:
         count = len(own) - len(queue)
         words = f"wanted one tree of states for each of the {count} parts of the torque with states"
@@ -99,7 +99,7 @@ def initial_states(torque: PyTree, t: ScalarLike, state: PyTree, body: Body) -> 
         states.append(own)
         return own
 
-    _inserted(torque, initial_state_of)
+    _with_frozen_laws(torque, initial_state_of)
     return tuple(states)
 
 
@@ -121,11 +121,11 @@ def state_rates(
         rates.append(rate)
         return here
 
-    _inserted(torque, rate_of_node)
+    _with_frozen_laws(torque, rate_of_node)
     return tuple(rates)
 
 
-def _inserted(torque: PyTree, states_of: Callable[[PyTree], PyTree]) -> PyTree:
+def _with_frozen_laws(torque: PyTree, states_of: Callable[[PyTree], PyTree]) -> PyTree:
     """Return a torque with each part that has states of its own replaced by a `FrozenLaw` with the
     states from `states_of`, which is called for inner parts first.
     """
@@ -135,7 +135,7 @@ def _inserted(torque: PyTree, states_of: Callable[[PyTree], PyTree]) -> PyTree:
 
     def insert_in_node(node: PyTree) -> PyTree:
         inner = node is not torque and has_own_states(node)
-        return _inserted(node, states_of) if inner else node
+        return _with_frozen_laws(node, states_of) if inner else node
 
     inserted = jax.tree.map(insert_in_node, torque, is_leaf=is_leaf)
     return FrozenLaw(inserted, (states_of(inserted),)) if has_own_states(torque) else inserted

@@ -162,10 +162,10 @@ class ReactionWheels(base.AbstractTorque):
         self.feedback = (
             None if feedback is None else _checks.require_function(feedback, "feedback", words)
         )
-        self.max_torque = _checked(max_torque, count, "max_torque", "> 0")
-        self.max_speed = _checked(max_speed, count, "max_speed", "> 0")
-        self.viscous = _checked(viscous, count, "viscous", "≥ 0")
-        self.coulomb = _checked(coulomb, count, "coulomb", "≥ 0")
+        self.max_torque = _checked_property(max_torque, count, "max_torque", "> 0")
+        self.max_speed = _checked_property(max_speed, count, "max_speed", "> 0")
+        self.viscous = _checked_property(viscous, count, "viscous", "≥ 0")
+        self.coulomb = _checked_property(coulomb, count, "coulomb", "≥ 0")
         turn_over = _checks.finite_array(turn_over, (), "turn_over")
         self.turn_over = _checks.check_if_known(
             _checks.require_positive, turn_over, "turn_over", "> 0"
@@ -277,7 +277,9 @@ class ReactionWheels(base.AbstractTorque):
         return total
 
 
-def _checked(value: NumbersLike | None, count: int, name: str, requirement: str) -> Array | None:
+def _checked_property(
+    value: NumbersLike | None, count: int, name: str, requirement: str
+) -> Array | None:
     """Return a property of the wheels after checks, one number or one for each wheel."""
     if value is None:
         return None

@@ -138,10 +138,10 @@ def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
     end = _IntervalEnd(x, none, none)
     g = jnp.where(there, none, g)
     body = _SearchState(t0, y0, h, side, g, rate, zero, no, x, end, end, zero, zero, no, no)
-    on = lambda body: jnp.any(_searching(search, run, body))  # noqa: E731
+    on = lambda body: jnp.any(_is_searching(search, run, body))  # noqa: E731
 
     def next_zero(body: _SearchState) -> _SearchState:
-        body = lax.while_loop(on, partial(_next, motion, search, run), body)
+        body = lax.while_loop(on, partial(_next_state, motion, search, run), body)
         return body._replace(found=body.found & motion.counts(body.t, body.y, body.steps))
 
     def row(state: Any) -> Any:
@@ -165,7 +165,7 @@ def locate_zeros(motion: Motion, search: Search, run: Path) -> Located:
     return Located(times, states, jumps, count, body.t, body.h, body.steps)
 
 
-def _searching(search: Search, run: Path, body: _SearchState) -> Array:
+def _is_searching(search: Search, run: Path, body: _SearchState) -> Array:
     """Return for each body whether its search goes on.
 
     It ends at a zero, at the end of the run, after the last pass, and if no next step is possible:
@@ -175,9 +175,9 @@ def _searching(search: Search, run: Path, body: _SearchState) -> Array:
     return ahead & (body.h > 0) & ~body.found
 
 
-def _next(motion: Motion, search: Search, run: Path, body: _SearchState) -> _SearchState:
+def _next_state(motion: Motion, search: Search, run: Path, body: _SearchState) -> _SearchState:
     """Return the state of the search after one more pass; an ended search keeps its state."""
-    on = _searching(search, run, body)
+    on = _is_searching(search, run, body)
     t, h, y, side = body.t, body.h, body.y, body.side
     begin, end = rows_at(run.stops, body.stop), rows_at(step_ends(run.stops), body.stop)
     arrived = on & ~body.refining & (t >= begin)
@@ -366,7 +366,7 @@ def step_with_error(
 
 
 def result_of_search(h: Array, t: Array, end: Array, is_full: Array) -> dfx.RESULTS:
-    """Return the result of a search that ended at `t`, s, before a step `h` (see `_searching`)."""
+    """Return the result of a search that ended at `t`, s, before a step `h`, by `_is_searching`."""
     result = dfx.RESULTS.dt_min_reached
     for there, word in (
         (jnp.isnan(h), NONFINITE),

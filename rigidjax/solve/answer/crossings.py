@@ -68,7 +68,7 @@ from rigidjax.solve.answer.run import (
 )
 from rigidjax.solve.engine.adaptive import NO_METER, REPLAY
 from rigidjax.solve.engine.loop import Method, result_of_body, starting_step
-from rigidjax.solve.engine.momentum import Integrated, integrated
+from rigidjax.solve.engine.momentum import Integrated, integrated_form
 from rigidjax.solve.programs.batching import Arrays, Layout, bodies_last, lift
 from rigidjax.solve.programs.linear_map import nan_derivatives, with_derivatives
 from rigidjax.solve.programs.traced import extract_constants
@@ -337,7 +337,7 @@ def _crossings(
     state0 = project_to_group(state0)
     crossed, numbers = section_of_run(setup, event, state0, ts)
     found = locate(crossed, Search(event.direction, max_crossings, max_steps), numbers)
-    times, states = _differentiable(
+    times, states = _differentiable_crossings(
         found.times, found.states, found.jumps, setup, event, state0, ts
     )
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
@@ -351,7 +351,9 @@ def _crossings(
 
 
 @eqx.filter_custom_jvp
-def _differentiable(times: Array, states: Array, jumps: Array, *inputs: Any) -> tuple[Array, Array]:
+def _differentiable_crossings(
+    times: Array, states: Array, jumps: Array, *inputs: Any
+) -> tuple[Array, Array]:
     """Return the crossings (K,), (K, n) as they are; their derivatives come from a second run.
 
     The second run is made only if derivatives are taken. `inputs` are set-up, event, start and
@@ -360,7 +362,7 @@ def _differentiable(times: Array, states: Array, jumps: Array, *inputs: Any) -> 
     return times, states
 
 
-@_differentiable.def_jvp
+@_differentiable_crossings.def_jvp
 def _jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
     """Return the crossings, and the tangents of a `chebyshev_step` from their fixed times."""
     found, jumps = primals[:2], primals[2]
@@ -451,7 +453,7 @@ class Numbers(NamedTuple):
 
 def section_of_run(setup: AnyRun, event: Event, state0: Any, ts: Array) -> tuple[Section, Numbers]:
     """Return the `Section` of an event along a run, and the arrays with which it is searched."""
-    form = integrated(setup.body, state0, setup.torque)
+    form = integrated_form(setup.body, state0, setup.torque)
 
     def condition(t: Array, y: Any) -> Array:
         return condition_value(event, setup.body, t, form.to_state(t, y))

@@ -30,8 +30,8 @@ from rigidjax.motion.torques.composite import Sum
 from rigidjax.solve.answer import validation
 from rigidjax.solve.engine.adaptive import integrate
 from rigidjax.solve.engine.control import StandardController, Watched
-from rigidjax.solve.engine.loop import NONFINITE, finite, result_of_body
-from rigidjax.solve.engine.momentum import changing_inertia, equations_of, integrated
+from rigidjax.solve.engine.loop import NONFINITE, is_finite, result_of_body
+from rigidjax.solve.engine.momentum import changing_inertia, equations_of, integrated_form
 from rigidjax.solve.engine.projection import Projected
 from rigidjax.solve.engine.replay import ReplayAdjoint
 from rigidjax.solve.programs.linear_map import nan_derivatives
@@ -70,7 +70,7 @@ class ClosedFormRun(eqx.Module):
         """Return the motion at the times `ts` (T,), s."""
         ys: Any = self.moving(state0)(ts - ts[0])
         stats: dict[str, Any] = dict.fromkeys(_COUNTS, jnp.zeros((), int))
-        result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
+        result = dfx.RESULTS.where(is_finite(ys), dfx.RESULTS.successful, NONFINITE)
         return Trajectory(Solved(ys, stats, result), None)
 
     def raise_reason(self, ys: Any, result: dfx.RESULTS) -> Any:
@@ -124,7 +124,7 @@ class DiffraxRun(eqx.Module):
         scene: Any = scene_of_force(self.torque) if isinstance(state0, Point) else None
         law = self.torque if isinstance(state0, Turn) else scene
         watch = halt = Ends(law, self.body) if hasattr(law, "ends") else None
-        form = integrated(self.body, state0, self.torque)
+        form = integrated_form(self.body, state0, self.torque)
         field, y0 = form.field, form.from_state(ts[0], state0)
         control: Any = self.controller
         if control is None:
@@ -363,7 +363,7 @@ def warn_of_missed(setup: AnyRun, state0: Any, ts: Array, missed: Array) -> None
     if not _checks.is_known((missed, state0, ts)) or not np.any(np.asarray(missed)):
         return
     state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
-    field = integrated(setup.body, state0, setup.torque).field
+    field = integrated_form(setup.body, state0, setup.torque).field
     program = trace_program(lambda t, y: ravel_pytree(field(t, y, None))[0], ts[0], state0)
     lines = dict.fromkeys(s.line for s in find_switches(program.closed).switches)
     warnings.warn(

@@ -188,7 +188,7 @@ def simulate(
         rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
     else:
         rtol = getattr(stepsize_controller, "rtol", None)
-    how = _chosen(solver, adjoint, max_steps, rtol, event is not None)
+    how = _solver_and_adjoint(solver, adjoint, max_steps, rtol, event is not None)
     setup = DiffraxRun(
         body, torque, how.solver, rtol, atol, stepsize_controller,
         None if dt0 is None else validation.checked_first_step(dt0, times), max_step, how.adjoint,
@@ -210,7 +210,7 @@ class _Chosen(NamedTuple):
     adjoint: dfx.AbstractAdjoint
 
 
-def _chosen(
+def _solver_and_adjoint(
     solver: dfx.AbstractSolver | None, adjoint: dfx.AbstractAdjoint | None,
     max_steps: int | None, rtol: Any, has_event: bool,
 ) -> _Chosen:  # fmt: skip

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax.solve.engine.control import StandardController, Stopping, Watched
-from rigidjax.solve.engine.loop import NONFINITE, finite
+from rigidjax.solve.engine.loop import NONFINITE, is_finite
 from rigidjax.solve.engine.replay import ReplayAdjoint, can_run
 from rigidjax.solve.steps.explicit import AbstractExplicit
 from rigidjax.solve.times.stops import program_with_stops
@@ -108,7 +108,7 @@ def integrate(
     if not looks_at_error:
         # A controller of equal steps does not look at the error estimate. After a NaN it therefore
         # goes on to the end of the run and reports success.
-        ill = ill | ~finite(ys)
+        ill = ill | ~is_finite(ys)
     ill = ill & (out.result == dfx.RESULTS.successful)
     result = dfx.RESULTS.where(ill, NONFINITE, out.result)
     following = out.stats.get("next_step", jnp.full_like(last_time, jnp.nan))

@@ -15,7 +15,7 @@ from rigidjax._types import RealLike
 from rigidjax.solve.engine.loop import (
     NONFINITE,
     accept_and_adapt,
-    finite,
+    is_finite,
     previous_float,
     rows_at,
     starting_step,
@@ -27,7 +27,7 @@ NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
 _SLIVER = 16  # units of round-off: no step is left that is so short
 
 
-def _inner(attribute: str) -> Any:
+def _inner_attribute(attribute: str) -> Any:
     """Define a property that reads an attribute of the wrapped controller; 0 where it has none."""
     return property(lambda self: getattr(self.controller, attribute, 0.0))
 
@@ -102,9 +102,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     def __init__(self, controller: dfx.AbstractStepSizeController):
         self.controller = controller
 
-    rtol = _inner("rtol")
-    atol = _inner("atol")
-    norm = _inner("norm")
+    rtol = _inner_attribute("rtol")
+    atol = _inner_attribute("atol")
+    norm = _inner_attribute("norm")
 
     def wrap(self, direction: PyTree) -> "Watched":
         return Watched(self.controller.wrap(direction))
@@ -144,7 +144,7 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
             sound = h > 0
             dt0 = jnp.where(sound, h, jnp.ones_like(h))
         else:
-            sound = finite((y0, dt0, slope))
+            sound = is_finite((y0, dt0, slope))
         first, inner = self.controller.init(terms, begin, end, y0, dt0, args, func, error_order)
         # Near t = 0 the round-off of t vanishes. The size of t is therefore taken to be at least
         # `least`, the round-off of the length of the run.
@@ -174,7 +174,7 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         # A run that is stuck after a step to NaN or infinity ends with `NONFINITE`. If this step
         # was already the shortest possible one, a still shorter step might be finite: the result
         # then is `dt_min_reached`, which says that no step is short enough.
-        short = finite(y_error) | (t1 - t0 <= unit)
+        short = is_finite(y_error) | (t1 - t0 <= unit)
         why = dfx.RESULTS.where(short, dfx.RESULTS.dt_min_reached, NONFINITE)
         why = dfx.RESULTS.where(stuck & (result == dfx.RESULTS.successful), why, result)
         return keep, left, right, jumped, (inner, least), why
@@ -200,9 +200,9 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         still = lax.stop_gradient(stops)
         self.following = jnp.searchsorted(still, still, side="right").astype(jnp.int32)
 
-    rtol = _inner("rtol")
-    atol = _inner("atol")
-    norm = _inner("norm")
+    rtol = _inner_attribute("rtol")
+    atol = _inner_attribute("atol")
+    norm = _inner_attribute("norm")
 
     def wrap(self, direction: PyTree) -> "Stopping":
         way = jnp.asarray(direction).astype(self.stops.dtype)

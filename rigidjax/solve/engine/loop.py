@@ -220,7 +220,7 @@ def rows_at(rows: Array, index: Array) -> Array:
     return jnp.take_along_axis(rows, index[None], 0)[0]
 
 
-def finite(tree: PyTree) -> Bool[Array, ""]:
+def is_finite(tree: PyTree) -> Bool[Array, ""]:
     """Return whether every number in `tree` is finite."""
     good = jnp.asarray(True)
     for leaf in jax.tree.leaves(tree):
@@ -261,7 +261,7 @@ def result_of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
 
     In a batch an impossible inertia has become NaN, because no error can be raised for one body.
     """
-    return dfx.RESULTS.where(finite(body), result, dfx.RESULTS.nonfinite_input)  # pyright: ignore
+    return dfx.RESULTS.where(is_finite(body), result, dfx.RESULTS.nonfinite_input)  # pyright: ignore
 
 
 def over_bodies(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -325,13 +325,13 @@ def run_one(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopSta
     # The last number counts the saved times whose states are known. It begins at 0 even if the
     # first of these times is the start of the run: this time gets its state with the first accepted
     # step.
-    state = (loop_at_start(run), _unsaved(run), jnp.zeros((), jnp.int32))
+    state = (loop_at_start(run), _unsaved_states(run), jnp.zeros((), jnp.int32))
     more = lambda state: is_running(method, run, state[0], None)  # noqa: E731
     loop, ys, _ = lax.while_loop(more, one, state)
     return ys, loop
 
 
-def _unsaved(run: Run) -> Array:
+def _unsaved_states(run: Run) -> Array:
     """Return the array (K, n, *bodies) for saved states: NaN, or y0 if a run ends at its start."""
     ended = run.stops[-1] <= run.t0
     still = jnp.where(lift(ended, run.y0), run.y0, jnp.nan)
@@ -370,7 +370,7 @@ def record_run(method: Method, constants: Arrays, run: Run) -> Recorded:
     """Run one body or many, and record the steps, from which derivatives are computed later."""
     loop, (segment, spare, most) = loop_at_start(run), _segments(method, run)
     starts = [jnp.zeros((most + 1, *a.shape), a.dtype) for a in pack_loop(loop)]
-    ys = _unsaved(run)
+    ys = _unsaved_states(run)
     rows = jnp.zeros((segment + spare + _MOST, HEAD + run.y0.shape[0], *run.t0.shape), ys.dtype)
     zero = jnp.zeros((), jnp.int32)
 

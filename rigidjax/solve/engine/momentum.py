@@ -93,7 +93,7 @@ class Integrated(NamedTuple):
         return self.field.replace_rate(t, y, _to_rate) if isinstance(self.field, ByMomentum) else y
 
 
-def integrated(body: Any, state0: Any, torque: Any) -> Integrated:
+def integrated_form(body: Any, state0: Any, torque: Any) -> Integrated:
     """Return what a run integrates, for arguments that fit together."""
     law = changing_inertia(torque)
     if law is None or hasattr(law.inertia, "feels"):

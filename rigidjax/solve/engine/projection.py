@@ -10,7 +10,7 @@ from jaxtyping import ArrayLike, Bool, PyTree
 from rigidjax import _checks
 from rigidjax._types import RealLike
 from rigidjax.motion.equations import project_to_group
-from rigidjax.solve.engine.loop import NONFINITE, finite
+from rigidjax.solve.engine.loop import NONFINITE, is_finite
 
 
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
@@ -107,7 +107,7 @@ class Projected(dfx.AbstractWrappedSolver):
         y1, error, dense, state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, True
         )
-        ill = (result == dfx.RESULTS.successful) & ~finite(y1)
+        ill = (result == dfx.RESULTS.successful) & ~is_finite(y1)
         result = dfx.RESULTS.where(ill, NONFINITE, result)
         return project_to_group(y1), error, dense, state, result
 

@@ -27,7 +27,7 @@ from rigidjax.solve.engine.loop import (
     run_one,
     unpack_loop,
 )
-from rigidjax.solve.programs.batching import Arrays, Layout, bodies_last, replaced
+from rigidjax.solve.programs.batching import Arrays, Layout, bodies_last, with_replacements
 from rigidjax.solve.programs.linear_map import linear_map, no_transpose
 
 SMOOTH = len(Smooth._fields)
@@ -170,7 +170,7 @@ class _RunAndTangents(NamedTuple):
     along: Arrays  # the tangents of the inputs, or the cotangents of the results
 
 
-def _recorded(
+def _recorded_run(
     has_tangent: HasTangent, method: Method, trees: tuple[Any, Any], layout: Layout,
     constants: Arrays, arrays_of_bodies: Arrays,
 ) -> _RunAndTangents:  # fmt: skip
@@ -191,7 +191,7 @@ def _recorded(
     field = layout.vmap(one)
 
     def of_moving(chosen: Arrays, t: Array, y: Array) -> Array:
-        return field(replaced(constants, there, chosen), t, y)
+        return field(with_replacements(constants, there, chosen), t, y)
 
     chosen = [c for c, m in zip(constants, there, strict=True) if m]
     return _RunAndTangents(
@@ -201,10 +201,10 @@ def _recorded(
 
 def _push(has_tangent: HasTangent, *bodies: Any) -> Arrays:
     """Return the tangents of the states of a recorded run (see `Replayed`), in forward mode."""
-    method, chosen, run, record, along = _recorded(has_tangent, *bodies)
+    method, chosen, run, record, along = _recorded_run(has_tangent, *bodies)
     smooth = Smooth(run.t0, run.stops, run.between, run.y0)
     zeros = [jnp.zeros_like(a) for a in smooth]
-    of_run = Smooth(*replaced(zeros, has_tangent[1][:SMOOTH], along[len(chosen) :]))
+    of_run = Smooth(*with_replacements(zeros, has_tangent[1][:SMOOTH], along[len(chosen) :]))
 
     def again(chosen: Arrays, smooth: Smooth) -> Any:
         return adjoint.replay(method, chosen, run._replace(**smooth._asdict()), record)
@@ -215,5 +215,5 @@ def _push(has_tangent: HasTangent, *bodies: Any) -> Arrays:
 def _pull(has_tangent: HasTangent, *bodies: Any) -> Arrays:
     """Return the cotangents of the inputs of a recorded run, in reverse mode."""
     _, moving = has_tangent
-    total, of_run = adjoint.pull_run(*_recorded(has_tangent, *bodies), any(moving[:3]))
+    total, of_run = adjoint.pull_run(*_recorded_run(has_tangent, *bodies), any(moving[:3]))
     return [*total, *(a for a, moves in zip(of_run, moving, strict=False) if moves)]

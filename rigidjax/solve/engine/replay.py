@@ -114,7 +114,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         arrays, arrays_tree = jax.tree.flatten(lax.stop_gradient(arrays))
         given = lambda constants: arrays_tree.unflatten(constants[len(constants) - len(arrays) :])  # noqa: E731
         constants = constants + arrays
-        controlled_by = _nested(stepsize_controller)
+        controlled_by = _nested_controllers(stepsize_controller)
         # If all step controllers have the default norm, they get the state as one vector of its
         # numbers; else they get it in its own type.
         rows = all(getattr(c, "norm", NORM) is NORM for c in controlled_by)
@@ -129,7 +129,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             sizes=[leaf.size for leaf in jax.tree.leaves(init_state.y)],
             max_steps=max_steps,
         )
-        between = next((s.ts for s in _subs(saveat) if s.ts is not None), t0[None][:0])
+        between = next((s.ts for s in _sub_saveats(saveat) if s.ts is not None), t0[None][:0])
         state = (init_state.controller_state, init_state.progress_meter_state)
         state = lax.stop_gradient(jax.tree.map(jnp.asarray, state))
         jumps = [c.stops for c in controlled_by if type(c) is Stopping]
@@ -194,25 +194,25 @@ def can_run(
     kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(state)}
     plain = isinstance(solver, AbstractExplicit) and max_steps is not None and len(kinds) == 1
     plain = plain and jnp.issubdtype(min(kinds, key=str), jnp.floating)
-    plain = plain and all(type(c) in _CONTROLLERS for c in _nested(controller))
+    plain = plain and all(type(c) in _CONTROLLERS for c in _nested_controllers(controller))
     if event is not None:
         kind = jnp.result_type(jax.tree.leaves(event_values)[0])
         plain = plain and event.root_finder is None and callable(event.cond_fn)
         plain = plain and jnp.issubdtype(kind, jnp.bool_)
     if saveat is None:
         return plain
-    subs = _subs(saveat)
+    subs = _sub_saveats(saveat)
     few = sum(sub.ts is not None for sub in subs) <= 1 and not any(sub.steps for sub in subs)
     return plain and few and not saveat.dense
 
 
-def _nested(controller: Any) -> list[Any]:
+def _nested_controllers(controller: Any) -> list[Any]:
     """Return a step controller and those inside it, the outermost first."""
     inner = getattr(controller, "controller", None)
-    return [controller, *(_nested(inner) if inner is not None else ())]
+    return [controller, *(_nested_controllers(inner) if inner is not None else ())]
 
 
-def _subs(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
+def _sub_saveats(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
     """Return the `diffrax.SubSaveAt`s of a `diffrax.SaveAt`."""
     is_sub = lambda s: isinstance(s, dfx.SubSaveAt)  # noqa: E731
     return [s for s in jax.tree.leaves(saveat.subs, is_leaf=is_sub) if is_sub(s)]

@@ -143,7 +143,7 @@ def _with_tangent(
     def with_tangents(layout: Layout, constants: Arrays, rest: Arrays) -> Arrays:
         layout, constants = layout.broadcast(constants, moving[:num_constants], rest[0])
         args = [*constants, *rest[: len(each)]]
-        moved = replaced([zero_from_primal(a) for a in args], moving, rest[len(each) :])
+        moved = with_replacements([zero_from_primal(a) for a in args], moving, rest[len(each) :])
         one = lambda *args: program(layout, list(args[:num_constants]), list(args[num_constants:]))  # noqa: E731
         pairs = zip(*jax.jvp(one, args, moved), strict=True)
         return [a for o, m in pairs for a in ([o, m] if eqx.is_inexact_array(o) else [o])]
@@ -195,7 +195,7 @@ def lift(array: Array, like: Array) -> Array:
     return array.reshape((1,) * (like.ndim - array.ndim) + array.shape)
 
 
-def replaced(
+def with_replacements(
     arrays: Sequence[Any], selected: Sequence[bool], replacements: Sequence[Any]
 ) -> list[Any]:
     """Return the list `arrays` with its `selected` items replaced, in order."""

@@ -21,7 +21,7 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from rigidjax.solve.programs.batching import Arrays, replaced
+from rigidjax.solve.programs.batching import Arrays, with_replacements
 from rigidjax.solve.programs.linear_map import linear_map
 from rigidjax.solve.programs.traced import trace_program
 
@@ -116,7 +116,9 @@ class _Pieces:
         chosen = [c for c, m in zip(constants, has_derivative, strict=True) if m]
 
         def step_of(i: Array) -> Callable[[Arrays, Arrays], Arrays]:
-            return lambda some, y: self.call(replaced(constants, has_derivative, some), y, i)
+            return lambda some, y: self.call(
+                with_replacements(constants, has_derivative, some), y, i
+            )
 
         def one(sums: tuple[Arrays, Arrays], at: tuple[Arrays, Array]) -> tuple[Any, None]:
             (total, bar), (y, i) = sums, at
@@ -180,7 +182,7 @@ def march_on_gpu(step: Callable[[Any, Array], Any], first_step: Array, count: in
 
         def push(*args: Array) -> Arrays:
             given = list(args[:size])
-            of = lambda *some: end(replaced(given, moving, some))  # noqa: E731
+            of = lambda *some: end(with_replacements(given, moving, some))  # noqa: E731
             at = [g for g, m in zip(given, moving, strict=True) if m]
             return jax.jvp(of, at, list(args[size + len(rows) :]))[1]
 

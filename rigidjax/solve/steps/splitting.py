@@ -54,7 +54,9 @@ class Composition(NamedTuple):
     kicks: tuple[float, ...]
 
 
-def _symmetric(order: int, flows: tuple[float, ...], kicks: tuple[float, ...]) -> Composition:
+def _symmetric_composition(
+    order: int, flows: tuple[float, ...], kicks: tuple[float, ...]
+) -> Composition:
     """Return a symmetric splitting from the first of its weights.
 
     The middle weights follow because the weights of each kind sum up to 1.
@@ -73,12 +75,12 @@ STRANG = Composition(2, (1.0,), (0.5, 0.5))
 # Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, methods SRKN6b and SRKN11b. These methods
 # are for kicks B that commute with [B, [B, A]], where [·, ·] is the commutator. This holds here,
 # because B and [B, [B, A]] both change only the momentum, by a function of the attitude.
-SRKN6 = _symmetric(
+SRKN6 = _symmetric_composition(
     4,
     parse_numbers("0.245298957184271 0.604872665711080"),
     parse_numbers("0.0829844064174052 0.396309801498368 -0.0390563049223486"),
 )
-SRKN11 = _symmetric(
+SRKN11 = _symmetric_composition(
     6,
     parse_numbers("""
     0.123229775946271 0.290553797799558 -0.127049212625417 -0.246331761062075 0.357208872795928

@@ -124,9 +124,13 @@ def _stepper(solver: Any, field: Any, y0: Any) -> Stepper:
     solver = cheapest_method(field) if solver is None else solver
     if isinstance(solver, Magnus4) and isinstance(y0, Attitude) and turning is not None:
         refuse_attitude(turning.torque)
-        return _free(turning.inertia, y0) if turning.torque is None else _magnus(turning, y0)
+        return (
+            _free_stepper(turning.inertia, y0)
+            if turning.torque is None
+            else _magnus_stepper(turning, y0)
+        )
     if isinstance(solver, AbstractSplitting):
-        return _splitting(solver, field, y0)
+        return _splitting_stepper(solver, field, y0)
     if not isinstance(solver, AbstractExplicit | StepWithLoopedStages):
         raise TypeError(
             f"no fixed steps of {type(solver).__name__} on {type(y0).__name__}; wanted "
@@ -135,13 +139,13 @@ def _stepper(solver: Any, field: Any, y0: Any) -> Stepper:
             "stepsize_controller=diffrax.ConstantStepSize() under jax.vmap"
         )
     if turning is not None:
-        return _explicit(solver, turning, y0)
+        return _explicit_stepper(solver, turning, y0)
 
     def slope_under(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
         return lambda t, y: split_scalars(bind(field, inputs)(t, join_scalars(y, y0), None))
 
     start = split_scalars(y0)
-    return _of_slope(solver, slope_under, start, lambda y: join_scalars(y, y0), y0)
+    return _stepper_of_slope(solver, slope_under, start, lambda y: join_scalars(y, y0), y0)
 
 
 class _Turning(NamedTuple):
@@ -152,7 +156,7 @@ class _Turning(NamedTuple):
     torque: Any  # the torque law, or `None` for a free body
 
 
-def _free(body: Inertia, state0: Attitude) -> Stepper:
+def _free_stepper(body: Inertia, state0: Attitude) -> Stepper:
     """Return the steps of a free body by Magnus' method of order 4.
 
     The numbers are the quaternion of the turn since the start, and the momentum Π, both along the
@@ -205,7 +209,7 @@ def _entries(a: Array) -> SymmetricEntries:
     return a[0, 0], a[1, 1], a[2, 2], *off
 
 
-def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
+def _magnus_stepper(turning: _Turning, state0: Attitude) -> Stepper:
     """Return steps by Magnus' method under a torque that reads the time and the body rate.
 
     The numbers are the quaternion and the angular momentum in body axes.
@@ -232,7 +236,7 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
     return Stepper((*start[:4], *matvec(_entries(body.tensor), start[4:])), change, state)
 
 
-def _explicit(
+def _explicit_stepper(
     solver: AbstractExplicit | StepWithLoopedStages, turning: _Turning, state0: Any
 ) -> Stepper:
     """Return steps of an explicit method for a body that only turns, a `Spin` or an `Attitude`.
@@ -263,10 +267,10 @@ def _explicit(
         return join_scalars((*y[:many], *matvec(weights, y[many:])), state0)
 
     momentum = matvec(_entries(body.tensor), start[many:])
-    return _of_slope(solver, slope_for_inputs, (*start[:many], *momentum), state, state0)
+    return _stepper_of_slope(solver, slope_for_inputs, (*start[:many], *momentum), state, state0)
 
 
-def _of_slope(
+def _stepper_of_slope(
     solver: AbstractExplicit | StepWithLoopedStages,
     slope_for_inputs: Callable[[Any], Callable[[Any, Atoms], Atoms]],
     start: Atoms,
@@ -306,7 +310,7 @@ def _of_slope(
     return Stepper(start, change, state)
 
 
-def _splitting(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
+def _splitting_stepper(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
     """Return steps of a splitting: free motions and kicks in turn.
 
     The numbers are the quaternion, and the angular momentum along the principal axes.

@@ -60,14 +60,16 @@ def round_weights(tableau: Tableau, dtype: Any) -> Tableau:
 
     def rounded(row: Row) -> Row:
         times = tuple(nodes[stage] for stage in row)
-        return dict(zip(row, _rounded(tuple(row.values()), times, dtype), strict=True))
+        return dict(zip(row, _rounded_weights(tuple(row.values()), times, dtype), strict=True))
 
     a, extra_a = (tuple(map(rounded, rows)) for rows in (tableau.a, tableau.extra_a))
     return tableau._replace(a=a, b=rounded(tableau.b), extra_a=extra_a)
 
 
 @functools.cache
-def _rounded(weights: tuple[float, ...], times: tuple[float, ...], dtype: Any) -> tuple[float, ...]:
+def _rounded_weights(
+    weights: tuple[float, ...], times: tuple[float, ...], dtype: Any
+) -> tuple[float, ...]:
     """Return the weights of one row, each rounded up or down to a number of `dtype`.
 
     Of all such choices, the result changes least the sum of the weights wᵢ and that of wᵢcᵢ, where
