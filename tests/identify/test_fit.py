@@ -327,9 +327,9 @@ def test_a_record_of_another_length_is_the_same_program(caplog):
     # `simulate` is another one, with what it does beside.
     programs = set(re.findall(r"Compiling jit\((\w+)\)", caplog.text))
     named = {
-        "least_squares_from",
+        "marquardt",
         "all_errors",
-        "_linearised",
+        "_linearised_fields",
         "_quantities_at",
     }
     assert not programs & named
