@@ -4,7 +4,7 @@ between recordings.
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax._names import suggest_arguments
 from rigidjax.identify.answer.assess import assess
+from rigidjax.identify.answer.held_out import choose_part, with_body, with_held_out
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.reference_states import rates, require_turning
@@ -69,6 +70,8 @@ def fit(
     *,
     starts: int = 8,
     initial: Float[Array, " n"] | None = None,
+    held_out: bool | float | Sequence[int] = True,
+    before: Any = None,
     key: PRNGKeyArray | None = None,
     tolerance: float = 1e-4,
     max_steps: int = 200,
@@ -86,6 +89,12 @@ def fit(
       explain the readings, the search fits a quarter, a half and then the whole of the record. A
       model of windows (short parts of a record) is fitted to longer and longer beginnings of them.
     - `initial`: (n,) a starting point of your own, which is tried first.
+    - `held_out`: the part of the readings that a second fit, of the rest, has to predict: a
+      fraction at the end of each record, or the indices of recordings or windows. `True` chooses
+      every fourth recording or stretch of windows, or the last quarter of fewer than four records;
+      `False` holds out nothing.
+    - `before`: the body that one had before, or several by name, whose prediction of the same part
+      is compared.
     - `key`: the random key of the scattered starting points; without a key these points are the
       same at each call.
     - `tolerance`: the search has converged if the next Levenberg–Marquardt step changes each
@@ -149,8 +158,8 @@ def fit(
     if (cpu := _cpu_if_faster(model)) is not None:
         with jax.default_device(cpu):
             result = fit(
-                model, starts=starts, initial=initial, key=key, tolerance=tolerance,
-                max_steps=max_steps, checkpoint=checkpoint, progress=progress,
+                model, starts=starts, initial=initial, held_out=held_out, before=before, key=key,
+                tolerance=tolerance, max_steps=max_steps, checkpoint=checkpoint, progress=progress,
             )  # fmt: skip
         return dataclasses.replace(result, place=_ON_CPU)
     if model.index.bodies:
@@ -162,6 +171,11 @@ def fit(
         for number, recording in enumerate(recordings, 1):
             require_turning(rates(recording)[1], f"fit: the rates of recording {number}")
     padded = stacking.pad_to_few(model)
+    part = choose_part(padded, held_out)
+    if before is not None:
+        if part is None:
+            raise ValueError("before: wanted readings to predict, but held_out leaves none")
+        with_body(padded, model.start(), before)
     task = Task(padded, initial_noise(padded), tolerance, max_steps)
     points = [] if initial is None else [initial]
     if starts > len(points):
@@ -198,7 +212,8 @@ def fit(
                 records = eqx.tree_at(lambda a, i=index: a.readings[i], records, one)
         kinds = [part.model.records for part in model.parts] or [records]
         shown = stacking.with_records(task.model, kinds)
-    return assess(task.model, best, task.noise, attempts, lowest, shown, interrupts, rough)
+    found = assess(task.model, best, task.noise, attempts, lowest, shown, interrupts, rough)
+    return found if part is None else with_held_out(found, task, part, before)
 
 
 _ON_CPU = "computed on the CPU, which is faster than a GPU for so few readings"

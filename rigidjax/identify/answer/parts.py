@@ -94,3 +94,49 @@ class Assessment(eqx.Module):
     chi2: float
     dof: int
     correlation: float
+
+
+class Pair(eqx.Module):
+    """Hold the errors of a sensor's readings that were fitted, and of those held out.
+
+    **Fields:**
+
+    - `sensor`: the class of the sensor.
+    - `unit`: the unit of the errors.
+    - `fitted`: the root mean square length of the errors of the fitted readings.
+    - `held_out`: that of the errors with which the fit of the rest predicts the held-out readings.
+    - `before`: the same for the body that one had before, or `None`.
+    """
+
+    sensor: str
+    unit: str
+    fitted: float
+    held_out: float
+    before: float | None = None
+
+    def __str__(self) -> str:
+        before = "" if self.before is None else f", before {self.before:.3g}"
+        size = f"{self.sensor} {self.held_out:.3g} {self.unit}".rstrip()
+        return f"{size} (fitted {self.fitted:.3g}{before})"
+
+
+class HeldOut(eqx.Module):
+    """Hold how well a fit of a part of the readings predicts the rest, the part held out.
+
+    **Fields:**
+
+    - `part`: the part held out, in words.
+    - `pairs`: a `Pair` for each sensor that reads something in this part.
+    - `ratio`: the errors of the prediction divided by those that the noise and the uncertainty of
+      the fit make: about 1 if the model is right.
+    - `chance`: the probability of such errors if the model is right.
+    """
+
+    part: str
+    pairs: tuple[Pair, ...]
+    ratio: float
+    chance: float
+
+    def __str__(self) -> str:
+        pairs = ", ".join(map(str, self.pairs))
+        return f"{self.part}: {pairs}, {self.ratio:.3g} times what noise and uncertainty make"

@@ -15,7 +15,7 @@ from rigidjax import _checks, _show
 from rigidjax.identify.answer import answers, undetermined
 from rigidjax.identify.answer.answers import Answer, Cause
 from rigidjax.identify.answer.causes import causes
-from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
+from rigidjax.identify.answer.parts import Assessment, BestPoint, HeldOut, Uncertainty
 from rigidjax.identify.answer.table import Row, html_rows, interval_text, numbers, table
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
 from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jacobian
@@ -63,6 +63,8 @@ class Fit(eqx.Module):
     - `linear`: the residuals and their derivatives at the best point, from which the covariance and
       the answers are computed.
     - `place`: where the fit was computed, in words, if that is not JAX's default device.
+    - `held_out`: how well a fit of a part of the readings predicts the rest, a `HeldOut`, or
+      `None` if nothing was held out.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> [quantity.name for quantity in result.quantities[:2]], result.covariance.shape
@@ -76,6 +78,7 @@ class Fit(eqx.Module):
     starts: tuple[Start, ...]
     linear: Linearisation | None = None
     place: str = ""
+    held_out: HeldOut | None = None
 
     @property
     def model(self) -> Model:
@@ -431,6 +434,7 @@ def verdict(fit: Fit) -> str:
         f"starts: {len(good)} of {len(fit.starts)} reached a motion that fits as well as the best"
         + (", all the same one" if fit.ok and len(good) > 1 else "")
     )
+    lines += [f"held out: {fit.held_out}"] if fit.held_out is not None else []
     for name, off in measured_residuals(fit.model, fit.linear) if fit.linear is not None else ():
         lines.append(f"measured {name}: {off:+.2g} standard deviations from the fit")
     lines += [f"- {line}" for line in fit.identifiability]

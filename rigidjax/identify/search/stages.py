@@ -313,6 +313,7 @@ def search_whole(
     *,
     damping: float = BOLD,
     aim: float = 0.0,
+    weights: Float[Array, "records times"] | None = None,
     watch: Callable[[Attempt], None] = lambda attempt: None,
 ) -> Attempt:
     """Return the result of a search over the whole of the records, in runs of `STRIDE` steps.
@@ -322,7 +323,7 @@ def search_whole(
     can look like convergence: each run after the first begins with little damping. `watch` is
     called after each run.
     """
-    attempt, weights = begin, whole_weights(task.model)
+    attempt, weights = begin, whole_weights(task.model) if weights is None else weights
     for first in range(0, task.max_steps, STRIDE):
         before = float(attempt.cost)
         end = _take_steps(attempt.x, task, weights, BOLD if first else damping, aim)
