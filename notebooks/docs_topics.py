@@ -97,7 +97,7 @@ TOPICS = {
         "The fit and its result": "fit Fit Unpacked",
         "How it searches": "SoftL1 Huber AbstractLoss FixedSteps Adaptive Descent descend Entropic "
         "Measured",
-        "Uncertainty, comparison": "compare cross_validate",
+        "Uncertainty, comparison": "compare",
         "Before the experiment": "simulate_readings expected_quantities fisher",
         "Short windows of driven bodies": "windows Windows predict_windows",
         "Unknown torques: filter and smoother": "Walk first_belief filter smooth step",

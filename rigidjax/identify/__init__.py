@@ -22,7 +22,7 @@ from rigidjax.identify.filtering.filter import (
 )
 from rigidjax.identify.filtering.smoother import smooth as smooth
 from rigidjax.identify.filtering.steps import sample as sample
-from rigidjax.identify.inference.compare import compare as compare, cross_validate as cross_validate
+from rigidjax.identify.inference.compare import compare as compare
 from rigidjax.identify.inference.density import LogDensity as LogDensity
 from rigidjax.identify.inference.design import (
     expected_quantities as expected_quantities,
@@ -85,7 +85,7 @@ __all__ = [
     "Model",
     "Nuts", "Position", "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios", "Recording",
     "Refit", "Scene", "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity",
-    "Walk", "Windows", "compare", "cross_validate", "descend", "expected_quantities", "filter",
+    "Walk", "Windows", "compare", "descend", "expected_quantities", "filter",
     "first_belief", "fisher", "fit", "log_likelihood", "posterior", "predict_windows", "read_table",
     "refit", "report", "sample", "simulate_readings", "smooth", "step", "windows",
 ]  # fmt: skip

@@ -70,6 +70,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
             np.where(np.isfinite(noise), noise, None).tolist()  # pyright: ignore
             for noise in map(np.asarray, fit.noise)
         ],
+        "held_out": None if fit.held_out is None else dataclasses.asdict(fit.held_out),
         "chi2": plain(fit.chi2),
         "degrees_of_freedom": fit.dof,
         "correlation_samples": plain(fit.correlation),

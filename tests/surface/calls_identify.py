@@ -145,17 +145,6 @@ row(
     **HOST,
 )  # fmt: skip
 row("identify.compare", lambda: dict(fits={"a": s.found(), "b": s.found()}), transforms=())
-row(
-    "identify.cross_validate",
-    lambda: dict(
-        build=lambda records: rj.identify.Model(records, rj.identify.PrincipalRatios()),
-        recordings=[s.recording(), s.recording()],
-    ),
-    run=lambda build, recordings: rj.identify.cross_validate(build, recordings, starts=1),
-    groups=("stranger",),
-    dear=True,
-    transforms=(),
-)
 row("identify.Fit.interval", lambda: dict(self=s.found(), level=0.9), arguments=("level",), **HOST)
 row(
     "identify.Fit.interval_of",
@@ -175,6 +164,8 @@ records = (
     "BestPoint",
     "Uncertainty",
     "Assessment",
+    "HeldOut",
+    "Pair",
     "Linearisation",
     "Scene",
     "Unpacked",

@@ -47,6 +47,8 @@ WITHOUT_EXAMPLE = {
             "identify.BestPoint",
             "identify.Uncertainty",
             "identify.Assessment",
+            "identify.HeldOut",
+            "identify.Pair",
         ),
         "is given by a function or is part of what is given, whose example is it",
     ),

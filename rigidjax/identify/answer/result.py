@@ -427,13 +427,17 @@ def verdict(fit: Fit) -> str:
     'status: ok'
     """
     require_one_fit(fit)
-    good = [start for start in fit.starts if start.converged and start.fits]
+    good = [start for start in fit.starts if start.fits]
     lines = ["status: ok"] if fit.ok else [f"search: {fit.search}", f"model: {fit.explanation}"]
     lines += [str(cause) for cause in fit.causes] + [fit.advice]
-    lines.append(
-        f"starts: {len(good)} of {len(fit.starts)} reached a motion that fits as well as the best"
-        + (", all the same one" if fit.ok and len(good) > 1 else "")
-    )
+    words = "reached a motion that fits as well as the best"
+    if not fit.explanation.word == answers.FAILS:
+        words += ", all the same one" if fit.ok and len(good) > 1 else ""
+    else:
+        lowest = min(start.cost for start in fit.starts)
+        good = [start for start in fit.starts if start.cost <= 1.01 * lowest]
+        words = "ended within 1 % of the least misfit, which does not explain the readings"
+    lines.append(f"starts: {len(good)} of {len(fit.starts)} {words}")
     lines += [f"held out: {fit.held_out}"] if fit.held_out is not None else []
     for name, off in measured_residuals(fit.model, fit.linear) if fit.linear is not None else ():
         lines.append(f"measured {name}: {off:+.2g} standard deviations from the fit")

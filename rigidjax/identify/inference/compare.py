@@ -1,27 +1,15 @@
-"""Compare models by an information criterion, and by predicting recordings that were left out."""
+"""Compare models by an information criterion."""
 
-import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from rigidjax import _checks
-from rigidjax.identify.answer.fit import fit
 from rigidjax.identify.answer.result import Fit
-from rigidjax.identify.data import stacking
-from rigidjax.identify.data.recording import Recording, numbers_read
-from rigidjax.identify.model.charts import Known, body_places
-from rigidjax.identify.model.free import with_steps
-from rigidjax.identify.model.index import build_index
-from rigidjax.identify.model.model import Model, require_one_kind, starting_scene
-from rigidjax.identify.model.terms import (
-    decorrelate,
-    whiten,
-)
+from rigidjax.identify.data.recording import numbers_read
+from rigidjax.identify.model.terms import decorrelate, whiten
 from rigidjax.identify.search.stages import blocks_at
 
 
@@ -107,71 +95,3 @@ def _log_mean_squares(fit: Fit) -> Float[np.ndarray, " sensors"]:
             squares = np.sum(np.asarray(e * sigma[:, None])[reading.host_mask] ** 2, axis=-1)
             out[index] = np.log(squares.mean()) + wider.mean()
     return out
-
-
-def cross_validate(
-    build: Callable[[Sequence[Recording]], Model], recordings: Sequence[Recording], **options: Any
-) -> tuple[tuple[float, ...], ...]:
-    """Return the errors with which the fit of all other recordings predicts each recording.
-
-    Each recording is left out once. The body, and all numbers that recordings share, are fitted to
-    the other recordings and then held fixed. A second fit, to the recording that was left out,
-    changes only its initial state and the `Free`s with a value for each recording.
-
-    **Arguments:**
-
-    - `build`: a function that is given a sequence of recordings and returns a `Model`.
-    - `recordings`: a sequence of two or more recordings.
-    - `options`: keyword arguments of `fit`.
-
-    **Returns** for each recording the root mean square error of each sensor. The model with the
-    smallest errors predicts best. **Raises** `ValueError` for fewer than two recordings.
-
-    >>> cross_validate(lambda records: None, [])
-    Traceback (most recent call last):
-    ValueError: cross_validate: wanted at least two recordings, got 0
-    """
-    _checks.require_function(build, "build", "of a sequence of recordings → Model")
-    _checks.require_instance(
-        recordings, Sequence, "recordings", requirement="a sequence of Recording"
-    )
-    for item in recordings:
-        _checks.require_instance(item, Recording, "recordings")
-    if len(recordings) < 2:
-        raise ValueError(f"cross_validate: wanted at least two recordings, got {len(recordings)}")
-    out = []
-    for index, left_out in enumerate(recordings):
-        others = [r for k, r in enumerate(recordings) if k != index]
-        fit_of_others = fit(build(others), **options)
-        test_model = _with_shared_fixed(build([left_out]), fit_of_others)
-        out.append(fit(test_model, **{**options, "starts": 1}).rms)
-    return tuple(out)
-
-
-def _with_shared_fixed(model: Model, fit_of_others: Fit) -> Model:
-    """Return a `model` of one recording whose body and shared parameters are those of a fit.
-
-    Only its initial state is free, and each `Free` with a value for each recording.
-    """
-    require_one_kind(model, "cross_validate")
-    x = model.start()
-    for slot, fitted in zip(model.slots, fit_of_others.model.slots, strict=True):
-        if slot.shared is not None and fitted.shared is not None:
-            x = x.at[slot.shared].set(fit_of_others.x[fitted.shared])
-    record = stacking.pick(model.records, 0)
-    scene = with_steps(starting_scene(model, record), model.slots, model.index.rows(x)[0])
-    sensors = jax.tree.map(lambda leaf: leaf[None] if eqx.is_array(leaf) else leaf, scene.sensors)
-    own = [
-        slot if slot.each else dataclasses.replace(slot, each=True, prior=slot.spread, spread=None)
-        for slot in model.slots
-        if slot.own is not None
-    ]
-    charts = (Known(fit_of_others.body),)
-    kinds = model.index.start.shape[1] // 3
-    index, slots = build_index(body_places(charts, None, model.count), own, kinds)
-    records = eqx.tree_at(
-        lambda r: [reading.sensor for reading in r.readings], model.records, list(sensors)
-    )
-    parts: Any = dict(measured=())  # they are in the fit of the others
-    parts |= dict(charts=charts, torque=scene.torque, records=records, slots=slots, index=index)
-    return dataclasses.replace(model, **parts)
