@@ -106,10 +106,11 @@ def with_held_out(fit: Fit, task: Task, part: Part, before: Any = None) -> Fit:
 
 def _fit_of_rest(begin: Attempt, task: Task, held: np.ndarray) -> Linearisation:
     """Return the linearisation of all readings at the fit of those that are not held out."""
-    model, weights = task.model, np.where(held, LITTLE, 1.0).astype(task.model.records.t.dtype)
+    model = task.model
+    weights = np.where(held, LITTLE, 1.0).astype(model.records.t.dtype)
     if model.start_weight is not None:
         # The start of a window that is held out stays as close to its measurement as any other.
-        starts = model.start_weight * np.where(held.all(axis=1), LITTLE, 1.0)[:, None]
+        starts = model.start_weight * weights.max(axis=1, keepdims=True)
         model = eqx.tree_at(lambda m: m.start_weight, model, starts)
     rest = search_whole(Attempt(begin.x), task._replace(model=model), weights=jnp.asarray(weights))
     near = flat_limit.thicken(model, rest.x)
@@ -188,11 +189,10 @@ def _test_prediction(model: Model, linear: Linearisation, held: np.ndarray) -> _
         np.add.at(pull, places, (e[:, None] @ rows)[:, 0])
         np.add.at(information, (places[:, :, None], places[:, None]), rows.swapaxes(1, 2) @ rows)
         total, many = total + float(np.sum(e**2)), many + int(out.sum())
-    if model.clusters is not None:
-        out = held.any(axis=1)
+    if model.clusters is not None and 0 < seen.sum() < seen.size:
         stretches = np.asarray(model.clusters)
         mean = np.bincount(stretches, squares) / np.maximum(np.bincount(stretches, counts), 1)
-        both = inside, outside = [mean[np.unique(stretches[one])] for one in (~out, out)]
+        both = inside, outside = [mean[np.unique(stretches[one])] for one in (seen, ~seen)]
         degrees = sum(map(len, both)) - 2
         spread = sum(np.sum((one - one.mean()) ** 2) for one in both) / max(degrees, 1)
         wide = np.sqrt(spread * sum(1.0 / len(one) for one in both))
