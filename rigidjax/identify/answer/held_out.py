@@ -149,8 +149,8 @@ class _Test(NamedTuple):
 
 
 def _test_prediction(model: Model, linear: Linearisation, held: np.ndarray) -> _Test | None:
-    """Return a test of the errors e of held-out readings at the fit of the rest, `None` if there are
-    too few.
+    """Return the test of the errors e of held-out readings at the fit of the rest, `None` if these
+    are too few.
 
     The covariance of e is S = 1 + J Σ Jᵀ, with the covariance Σ of that fit: eᵀ S⁻¹ e is χ² (Chow
     1960, doi:10.2307/1910133), and so is its part in the range of J, which shows parameters that
