@@ -105,6 +105,8 @@ def main(many=10):
                         times[index] = process_time() - begin
                 both, plain = fits[:2]
                 ok += [both.ok, plain.ok]
+                if both.held_out is None:  # its search did not end
+                    continue
                 pair = both.held_out.pairs[0]
                 rows.append([pair.held_out / pair.fitted, both.held_out.ratio, times[0] / times[1]])
             raw, ratio, time = np.array(rows).T
