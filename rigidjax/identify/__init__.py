@@ -36,6 +36,12 @@ from rigidjax.identify.inference.draws import (
     refit as refit,
 )
 from rigidjax.identify.inference.horizons import predict_windows as predict_windows
+from rigidjax.identify.inference.selection import (
+    Candidates as Candidates,
+    Selection as Selection,
+    select as select,
+    usual_terms as usual_terms,
+)
 from rigidjax.identify.model.charts import (
     AbstractBodyChart as AbstractBodyChart,
     Known as Known,
@@ -80,14 +86,14 @@ from rigidjax.identify.sensors import (
 
 __all__ = [
     "AbstractBodyChart", "AbstractLoss", "AbstractSensor", "Accelerometer", "Adaptive",
-    "AttitudeSensor", "Descent", "Direction", "Entropic", "Fit", "FixedSteps", "ForceTorque",
-    "Free", "Gyro", "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass", "Measured",
-    "Model",
-    "Nuts", "Position", "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios", "Recording",
-    "Refit", "Scene", "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity",
-    "Walk", "Windows", "compare", "descend", "expected_quantities", "filter",
-    "first_belief", "fisher", "fit", "log_likelihood", "posterior", "predict_windows", "read_table",
-    "refit", "report", "sample", "simulate_readings", "smooth", "step", "windows",
+    "AttitudeSensor", "Candidates", "Descent", "Direction", "Entropic", "Fit", "FixedSteps",
+    "ForceTorque", "Free", "Gyro", "Huber", "Known", "LogDensity", "Magnetometer", "Marker",
+    "Mass", "Measured", "Model", "Nuts", "Position", "Posterior", "Principal",
+    "PrincipalRatios", "Range", "Ratios", "Recording", "Refit", "Scene", "Selection",
+    "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity", "Walk", "Windows",
+    "compare", "descend", "expected_quantities", "filter", "first_belief", "fisher", "fit",
+    "log_likelihood", "posterior", "predict_windows", "read_table", "refit", "report", "sample",
+    "select", "simulate_readings", "smooth", "step", "usual_terms", "windows",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

@@ -61,18 +61,21 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     if len(set(counts.values())) > 1:
         raise ValueError(f"compare: wanted fits of the same readings, got {counts}")
     shortest = max(min(one.correlation for one in fits.values()), 1.0)
-    rows = []
-    for name, one in fits.items():
-        independent_readings = np.array(counts[name]) / shortest
-        deviance = independent_readings @ _log_mean_squares(one)
-        penalty = one.x.size * np.log(max(independent_readings.sum(), 2.0))
-        rows.append((deviance + penalty, name, one))
+    rows = [(criterion(one, one.x.size, shortest), name, one) for name, one in fits.items()]
     rows.sort(key=lambda row: row[0])
     best = rows[0][0]
     return tuple(
         Comparison(name, one.x.size, one.rms, one.correlation, float(total - best))
         for total, name, one in rows
     )
+
+
+def criterion(fit: Fit, free: int, correlation: float) -> float:
+    """Return Schwarz's criterion of a fit with `free` parameters, if one in `correlation` readings
+    is independent.
+    """
+    many = np.array(list(map(numbers_read, fit.model.records.readings))) / correlation
+    return float(many @ _log_mean_squares(fit) + free * np.log(max(many.sum(), 2.0)))
 
 
 def _log_mean_squares(fit: Fit) -> Float[np.ndarray, " sensors"]:

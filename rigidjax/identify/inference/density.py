@@ -9,17 +9,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.filtering.terms import recording_terms
-from rigidjax.identify.model.build import interval_steps
-from rigidjax.identify.model.charts import body_places
+from rigidjax.identify.model.build import Extended, extended, interval_steps
 from rigidjax.identify.model.free import Slot
-from rigidjax.identify.model.index import build_index
 from rigidjax.identify.model.model import (
     Model,
     Unpacked,
@@ -243,26 +241,9 @@ def _slot(
     return Slot(path, name, unit, False, True, shape, labels, groups, one, prior, None)
 
 
-class _Extended(NamedTuple):
-    model: Model
-    places: Int[np.ndarray, " n"]  # of the old parameters among the new ones
-
-
-def _extended(model: Model, noises: Noise, process: Process | None, slots: list[Slot]) -> _Extended:
-    """Return a model with the parameters of further `slots`, with known `noises` and a process.
-
-    They come before the parameters of one recording alone, which get other indices.
-    """
-    bodies = body_places(model.charts, model.body_indices, model.count)
-    kinds = model.index.start.shape[1] // 3
-    every = [*model.slots, *slots]
-    index, placed = build_index(bodies, every, kinds)
-    places = np.arange(model.size)
-    places[np.asarray(model.index.start)] = np.asarray(index.start)
-    for old, new in zip(model.slots, placed, strict=False):
-        for before, after in ((old.shared, new.shared), (old.own, new.own)):
-            if before is not None:
-                places[np.asarray(before)] = np.asarray(after)
+def _extended(model: Model, noises: Noise, process: Process | None, slots: list[Slot]) -> Extended:
+    """Return a model with the parameters of further `slots`, with known `noises` and a process."""
+    wider, places = extended(model, slots)
     records = eqx.tree_at(
         lambda r: [reading.sensor.noise for reading in r.readings],
         model.records,
@@ -270,10 +251,8 @@ def _extended(model: Model, noises: Noise, process: Process | None, slots: list[
         is_leaf=lambda node: node is None,
     )
     steps = model.filter_steps if process is None else interval_steps(records, model.reference)
-    new_model = dataclasses.replace(
-        model, records=records, process=process, slots=placed, index=index, filter_steps=steps
-    )
-    return _Extended(new_model, places)
+    wider = dataclasses.replace(wider, records=records, process=process, filter_steps=steps)
+    return Extended(wider, places)
 
 
 def _white_covariance(fit: Fit, has_deterministic_motion: bool) -> Float[np.ndarray, "n n"]:

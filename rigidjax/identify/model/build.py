@@ -1,5 +1,6 @@
 """Check the arguments of a `Model`, and build its fields."""
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -23,7 +24,7 @@ from rigidjax.identify.data.windows import (
     window_starts,
 )
 from rigidjax.identify.model.charts import AbstractBodyChart, Charts, body_places, has_mass
-from rigidjax.identify.model.free import checked_labels, find_slots, group_recordings
+from rigidjax.identify.model.free import Slot, checked_labels, find_slots, group_recordings
 from rigidjax.identify.model.index import build_index
 from rigidjax.identify.model.predict import AbstractIntegrator, HeldSteps, integrator_for
 from rigidjax.identify.model.priors import AbstractLoss, Entropic
@@ -107,6 +108,29 @@ def fields_of_model(
         "filter_steps": interval_steps(data.records, data.reference) if filtered else 1,
         "reference": data.reference,
     }
+
+
+class Extended(NamedTuple):
+    """Hold a model with further slots, and where the parameters of the model before are in it."""
+
+    model: Any
+    places: Int[np.ndarray, " n"]
+
+
+def extended(model: Any, slots: Sequence[Slot]) -> Extended:
+    """Return the `model` with the parameters of further `slots`.
+
+    They come before the parameters of one recording alone, which get other indices.
+    """
+    bodies = body_places(model.charts, model.body_indices, model.count)
+    index, placed = build_index(bodies, [*model.slots, *slots], model.index.start.shape[1] // 3)
+    places = np.arange(model.size)
+    places[np.asarray(model.index.start)] = np.asarray(index.start)
+    for old, new in zip(model.slots, placed, strict=False):
+        for before, after in ((old.shared, new.shared), (old.own, new.own)):
+            if before is not None:
+                places[np.asarray(before)] = np.asarray(after)
+    return Extended(dataclasses.replace(model, index=index, slots=placed), places)
 
 
 class _Members(NamedTuple):

@@ -186,12 +186,14 @@ _UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place"
 TOLERANCES = {"scale": "scale", "skew": "cross_axis", "bias": "bias", "offset": "clock"}
 
 
-def find_slots(free: Sequence[Free], scene: Scene, body_names: Sequence[str]) -> list[Slot]:
-    """Return a `Slot` for each `Free`, without places among the parameters.
+def find_slots(
+    free: Sequence[Free], scene: Scene, body_names: Sequence[str], taken: Sequence[Slot] = ()
+) -> list[Slot]:
+    """Return the slots in `taken`, and a `Slot` without places in x for each `Free`.
 
     An error is raised if a `Free` picks no numbers, or the numbers or the name of another one.
     """
-    slots: list[Slot] = []
+    slots = list(taken)
     for item in free:
         _checks.require_instance(item, Free, "free", requirement="Free(where, name)")
         here = f"Free {item.name!r}"

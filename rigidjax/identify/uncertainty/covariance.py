@@ -290,7 +290,7 @@ def white_covariance(linear: Linearisation) -> Covariance:
         return Covariance(lost, lost, kind, np.zeros((0, n)), None)
     # The residuals are a last column, number n + 1, so that each elimination applies to them, too.
     # Column n is that of places that stand for no parameter.
-    owner = _owners(linear)
+    owner = owners(linear)
     triangles = np.linalg.qr(np.dstack([dense, linear.weighted_residuals]), mode="r")
     places = np.pad(linear.places, ((0, 0), (0, 1)), constant_values=n + 1)
     shared = np.flatnonzero(owner < 0)
@@ -358,7 +358,7 @@ def white_covariance(linear: Linearisation) -> Covariance:
     )
 
 
-def _owners(linear: Linearisation) -> Int[np.ndarray, " n"]:
+def owners(linear: Linearisation) -> Int[np.ndarray, " n"]:
     """Return for each parameter the only recording that depends on it, −1 for none or several."""
     records, n = len(linear.places), linear.free_count
     owner, used = np.full(n + 1, -1), np.zeros((records, n + 1), bool)
