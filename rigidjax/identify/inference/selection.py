@@ -1,9 +1,9 @@
 """Select the terms of a model that its recordings ask for."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from math import log
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -43,6 +43,8 @@ from rigidjax.motion.torques.composite import parts_of
 HELD = 1e-9
 # In each round so many of the changes that promise most to first order are fitted.
 TRIED = 3
+# A larger set of terms may not predict held-out readings with errors larger by this factor.
+WORSE = 1.05
 # Terms are named as alternatives if their criteria differ by less: the odds are below e³.
 ALIKE = 6.0
 
@@ -55,14 +57,17 @@ class Step(eqx.Module):
     - `terms`: the names of the terms after this step.
     - `gain`: the fall of the criterion by this step; 10 and more is strong evidence.
     - `rms`: the root mean square error of each sensor, in its unit.
+    - `held_out`: that of the readings which a fit of the rest predicts, as in `Fit.held_out`; empty
+      if the search did not end.
 
-    >>> Step(("drag",), 25.0, (0.1,)).terms
+    >>> Step(("drag",), 25.0, (0.1,), (0.11,)).terms
     ('drag',)
     """
 
     terms: tuple[str, ...]
     gain: float
     rms: tuple[float, ...]
+    held_out: tuple[float, ...]
 
 
 class Selection(eqx.Module):
@@ -75,7 +80,7 @@ class Selection(eqx.Module):
     - `path`: a `Step` for each round, the first one without terms.
     - `alternatives`: for each selected term the names of terms that do as well in its place.
 
-    >>> Selection(("drag",), None, (Step((), 0.0, (0.2,)),), {"drag": ()}).terms
+    >>> Selection(("drag",), None, (Step((), 0.0, (0.2,), ()),), {"drag": ()}).terms
     ('drag',)
     """
 
@@ -85,12 +90,12 @@ class Selection(eqx.Module):
     alternatives: dict[str, tuple[str, ...]]
 
     def __str__(self) -> str:
-        rows = [("terms", "criterion", "rms errors")]
+        rows: list[tuple[str, ...]] = [("terms", "criterion", "errors", "held out")]
         for step in self.path:
-            rms = ", ".join(f"{one:.4g}" for one in step.rms)
-            rows.append((" + ".join(step.terms) or "none", f"{-step.gain:+.4g}", rms))
+            sizes = (", ".join(f"{x:.4g}" for x in some) for some in (step.rms, step.held_out))
+            rows.append((" + ".join(step.terms) or "none", f"{-step.gain:+.4g}", *sizes))
         wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = [f"{a:{wide[0]}}  {b:>{wide[1]}}  {c}" for a, b, c in rows]
+        lines = ["  ".join(map(str.ljust, row, wide)).rstrip() for row in rows]
         for name, others in self.alternatives.items():
             if others:
                 lines.append(f"The data do not tell {name} from {' or '.join(others)}.")
@@ -180,7 +185,8 @@ def usual_terms(model: Model) -> Candidates:
 
 
 def _part(place: int, field: str, scene: Scene) -> Any:
-    return getattr(scene.torque.parts[place], field)
+    torque: Any = scene.torque
+    return getattr(torque.parts[place], field)
 
 
 def _sensor_field(index: int, field: str, scene: Scene) -> Any:
@@ -200,7 +206,9 @@ def select(
     first order (a score test: Rao 1948, doi:10.1017/S0305004100023987), and the three best ones are
     fitted. The best fit is kept if it lowers the extended Bayesian information criterion
     `Σ Nₛ log s² + p log N + 2 k log K` for k of K candidates with p parameters (Chen and Chen
-    2008, doi:10.1093/biomet/asn034; Nₛ, s and N as for `compare`); otherwise the selection ends.
+    2008, doi:10.1093/biomet/asn034; Nₛ, s and N as for `compare`) and, if it has more terms,
+    predicts the readings that a fit of the rest has not seen no worse; otherwise the selection
+    ends.
 
     **Arguments:**
 
@@ -214,18 +222,10 @@ def select(
     `ValueError`
     for no candidates and for a model of several kinds of recordings.
 
-    >>> ts = jnp.linspace(0.0, 4.0, 100)
-    >>> law, body = rj.torques.Damping([0.3] * 3), rj.Inertia.from_principal(1.0, 1.6, 2.2)
-    >>> gyro = rj.identify.Gyro(noise=0.02, bias=[0.0] * 3)
-    >>> read = rj.identify.simulate_readings(
-    ...     gyro, body, rj.Spin([1.5, 0.8, 3.0]), ts, law, key=jax.random.key(0))
-    >>> model = rj.identify.Model(rj.identify.Recording(ts, (gyro, read)), rj.identify.Ratios(),
-    ...                           torque=rj.torques.Damping([0.0] * 3))
-    >>> found = select(model, {
-    ...     "drag": rj.identify.Free(lambda s: s.torque.coefficient, "drag", scale=0.1),
-    ...     "bias": rj.identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.01)})
-    >>> found.terms
-    ('drag',)
+    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
+    >>> select(rj.identify.Model(record, rj.identify.Ratios()), {})
+    Traceback (most recent call last):
+    ValueError: candidates: wanted one or more terms, got none
     """
     _checks.require_instance(model, Model, "select", requirement="a Model")
     require_one_kind(model, "select")
@@ -242,18 +242,24 @@ def select(
     terms = _Terms(model, extended(model, slots), of_term)
     none, every = frozenset[str](), frozenset(groups)
     trials = {one: fit(terms.held(one), starts=starts, key=key) for one in (none, every)}
-    best, path = none, [Step((), 0.0, trials[none].rms)]
+    best, path = none, [Step((), 0.0, trials[none].rms, _held_out(trials[none]))]
     while True:
         correlation = max(min(trial.correlation for trial in trials.values()), 1.0)
         found = {one: terms.criterion(trial, one, correlation) for one, trial in trials.items()}
+        before = _held_out(trials[best])
+        for one, trial in trials.items():
+            after = _held_out(trial)
+            if before and after and len(one) > len(best) and _mean_ratio(after, before) > WORSE:
+                found[one] = math.inf
         least = min(found, key=lambda one: found[one])
         if least != best:
-            path.append(Step(terms.names(least), found[best] - found[least], trials[least].rms))
+            sizes = trials[least].rms, _held_out(trials[least])
+            path.append(Step(terms.names(least), found[best] - found[least], *sizes))
         best = least
         first_order = terms.first_order(trials[best], correlation)
-        goal, ahead = None, best
-        while ahead != goal:
-            goal, ahead = ahead, min([ahead, *terms.neighbours(ahead)], key=first_order)
+        goal = best
+        while (ahead := min([goal, *terms.neighbours(goal)], key=first_order)) != goal:
+            goal = ahead
         near = sorted(terms.neighbours(best), key=first_order)[:TRIED]
         new = {one for one in (goal, *near) if first_order(one) < first_order(best)}
         # First order fails where terms are hard to tell apart, so that a term less is always tried.
@@ -264,15 +270,26 @@ def select(
         trials |= {one: fit(terms.held(one), starts=2, initial=trials[best].x) for one in new}
     alternatives = {
         name: terms.names(
-            other
-            for other in set(groups) - best
-            if first_order(best - {name} | {other}) < first_order(best) + ALIKE
+            {
+                other
+                for other in set(groups) - best
+                if first_order(best - {name} | {other}) < first_order(best) + ALIKE
+            }
         )
         for name in terms.names(best)
     }
     last = terms.only(best, trials[best].x)
     result = fit(last.model, starts=starts, initial=last.x, key=key)
     return Selection(terms.names(best), result, tuple(path), alternatives)
+
+
+def _held_out(trial: Fit) -> tuple[float, ...]:
+    pairs = () if trial.held_out is None else trial.held_out.pairs
+    return tuple(pair.held_out for pair in pairs)
+
+
+def _mean_ratio(after: Sequence[float], before: Sequence[float]) -> float:
+    return float(np.exp(np.mean(np.log(np.array(after) / before))))
 
 
 class _Point(NamedTuple):
@@ -343,7 +360,7 @@ class _Terms(NamedTuple):
         """
         inside = self.inside(terms)
         held = sum(where.size for name, where in self.places.items() if name not in inside)
-        choices = 2.0 * len(terms) * log(len(self.of_term))
+        choices = 2.0 * len(terms) * math.log(len(self.of_term))
         return criterion(trial, trial.x.size - held, correlation) + choices
 
     def first_order(self, trial: Fit, correlation: float) -> Callable[[frozenset[str]], float]:
@@ -372,9 +389,9 @@ class _Terms(NamedTuple):
             part = rows[:, :-1][:, use[kept]]
             size = np.maximum(np.linalg.norm(part, axis=0), 1e-300)
             rest = left - part @ (np.linalg.lstsq(part / size, left, rcond=1e-10)[0] / size)
-            cost = sum(where.size for where in inside) * log(many)
-            cost += 2.0 * len(terms) * log(len(self.of_term))
-            return many * log(rest @ rest + 1e-300) + cost
+            cost = sum(where.size for where in inside) * math.log(many)
+            cost += 2.0 * len(terms) * math.log(len(self.of_term))
+            return many * math.log(rest @ rest + 1e-300) + cost
 
         return value
 

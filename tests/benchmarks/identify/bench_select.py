@@ -83,7 +83,15 @@ def main(count):
         extra, lost = set(found.terms) - names, names - set(found.terms)
         right, false, missed = right + (not extra | lost), false + bool(extra), missed + bool(lost)
         if extra | lost:
-            print(seed, took[-1], sorted(map(str, names)), "found", found.terms, found.alternatives, flush=True)
+            print(
+                seed,
+                took[-1],
+                sorted(map(str, names)),
+                "found",
+                found.terms,
+                found.alternatives,
+                flush=True,
+            )
             print(found)
     print(f"{count} records: right {right}, a false term {false}, a missed one {missed}")
     print(f"CPU s of a selection, median {np.median(took):.2f}")
