@@ -145,6 +145,9 @@ row(
     **HOST,
 )  # fmt: skip
 row("identify.compare", lambda: dict(fits={"a": s.found(), "b": s.found()}), transforms=())
+leave_out("select makes it", "identify.Candidates", "identify.Selection", "identify.Step")
+leave_out("a search of many fits: tests/identify/inference/test_selection.py", "identify.select")
+row("identify.usual_terms", lambda: dict(model=s.model()), transforms=())
 row("identify.Fit.interval", lambda: dict(self=s.found(), level=0.9), arguments=("level",), **HOST)
 row(
     "identify.Fit.interval_of",

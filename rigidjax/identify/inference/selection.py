@@ -103,9 +103,13 @@ class Selection(eqx.Module):
 
 
 class Candidates(NamedTuple):
-    """Hold a model with terms that are switched off, and by name the `Free` that sets one free."""
+    """Hold a model with terms that are switched off, and by name the `Free` that sets one free.
 
-    model: Model
+    >>> Candidates(None, {}).terms
+    {}
+    """
+
+    model: Any
     terms: dict[str, Free]
 
 
@@ -396,7 +400,7 @@ class _Terms(NamedTuple):
         return value
 
 
-def _reduced(linear: Linearisation, kept: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "q k+1"]:
+def _reduced(linear: Linearisation, kept: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "q _"]:
     """Return the derivatives of all residuals with respect to the `kept` parameters, and in a last
     column the residuals, after the elimination of the other parameters, each of one recording.
     """
