@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from once import filter_once
+from once import filter_once, once
 from scipy.spatial.transform import Rotation
 
 import rigidjax as rj
@@ -17,7 +17,6 @@ from rigidjax.motion.torques import Carried, LoggedMotion
 G = np.array([0.0, 0.0, -9.81])
 NOISE = np.array([0.05, 0.05, 0.05, 0.0025, 0.0025, 0.0025])
 T = np.linspace(0.0, 6.0, 301)
-GUESS = rj.shapes.box(1.0, [0.1, 0.1, 0.1])
 
 
 def path(t):
@@ -36,11 +35,17 @@ def path(t):
 X, ACC, Q, OMEGA, ALPHA = path(T)
 TURN = Rotation.from_quat(Q, scalar_first=True)
 LOG = LoggedMotion(T, X, Q, OMEGA, TURN.inv().apply(ACC), ALPHA)
-TOOL = rj.MassProperties(
-    0.7, [0.02, -0.03, 0.11], rj.rotation.so3.exp(jnp.array([0.3, 0.2, -0.5]))
-    @ jnp.diag(jnp.array([3e-4, 1.1e-3, 4e-5]))
-    @ rj.rotation.so3.exp(jnp.array([0.3, 0.2, -0.5])).T,
-)  # fmt: skip
+
+
+@once
+def bodies():
+    turn = rj.so3.exp(jnp.array([0.3, 0.2, -0.5]))
+    tensor = turn @ jnp.diag(jnp.array([3e-4, 1.1e-3, 4e-5])) @ turn.T
+    tool = rj.MassProperties(0.7, [0.02, -0.03, 0.11], tensor)
+    return tool, rj.shapes.box(1.0, [0.1, 0.1, 0.1])
+
+
+TOOL, GUESS = bodies()
 
 
 def wrench_of(body, place=(0.0, 0.0, 0.0), gravity=G):

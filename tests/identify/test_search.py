@@ -2,12 +2,12 @@
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array
+from once import filter_once
 
 import rigidjax as rj
 from rigidjax import identify
@@ -119,7 +119,7 @@ def pushed():
     return problem
 
 
-@eqx.filter_jit
+@filter_once
 def searched(problem, weights, settings):
     noise = (jnp.full((1, 3), 0.01),)
     start = problem.start(rj.Inertia.from_principal(1.3, 1.9, 2.5))

@@ -103,8 +103,8 @@ def test_what_a_fit_of_two_kinds_says(both):
     assert (both.residuals[0][2] == 0).all() and (both.residuals[1][:2] == 0).all()
     assert both.rms[0] == pytest.approx(GYRO * np.sqrt(3), rel=0.15)
     assert [len(record.t) for record in both.model.recordings] == [40, 55, 70]
-    assert both.model.motion(both.x)["driven"].q.shape == (70, 4)
-    scenes = both.model.scenes(both.x)
+    motion, scenes = once(lambda x: (both.model.motion(x), both.model.scenes(x)))(both.x)
+    assert motion["driven"].q.shape == (70, 4)
     np.testing.assert_allclose(scenes["driven"].torque.torque[0], both.values["push"])
     rows = identify.expected_quantities(both.model, both.x)
     assert [row.name for row in rows] == names
@@ -117,15 +117,29 @@ def test_each_recording_of_a_fit_is_drawn(both, index):
     assert rj.plot.residuals(both, index=index) is not None
 
 
-def test_two_kinds_alike_are_one_kind():
-    one, other = gyro([0.4, 1.2, -0.3], 1), gyro([1.0, 0.2, 0.5], 2, LONG)
+@pytest.fixture(scope="module")
+def alike():
+    """Two recordings of one kind, and of two kinds."""
+    records = {"a": gyro([0.4, 1.2, -0.3], 1), "b": gyro([1.0, 0.2, 0.5], 2, LONG)}
     bias = [identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.01, prior=0.02)]
-    single = identify.Model([one, other], identify.Ratios(), free=bias)
-    parts = {
-        n: identify.Model(r, identify.Ratios(), free=bias) for n, r in (("a", one), ("b", other))
-    }
-    joint = identify.Model(parts)
+    single = identify.Model(list(records.values()), identify.Ratios(), free=bias)
+    parts = {n: identify.Model(r, identify.Ratios(), free=bias) for n, r in records.items()}
+    return single, identify.Model(parts)
+
+
+def test_two_kinds_alike_have_the_errors_of_one_kind(alike):
+    single, joint = alike
     assert joint.size == single.size  # the bias, by its name, is one number of both
+    (wanted,), found = (
+        once(lambda omega, m=m: m.errors(m.start(BODY, omega)))(jnp.array([0.9, 0.5, 0.2]))
+        for m in alike
+    )
+    np.testing.assert_allclose(found[0][0], wanted[0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found[1][1], wanted[1], rtol=0, atol=1e-13)
+
+
+def test_two_kinds_alike_are_one_kind(alike):
+    single, joint = alike
     alone, found = identify.fit(single, starts=1), identify.fit(joint, starts=1)
     # A search ends within a ten-thousandth of a standard deviation of the minimum.
     np.testing.assert_allclose(found.body.tensor, alone.body.tensor, rtol=0, atol=1e-6)
@@ -170,11 +184,11 @@ def test_a_hand_and_a_throw_weigh_one_body():
 
 
 def test_a_measured_number_far_from_the_readings_is_said():
-    weight = identify.Measured(lambda p: p.body.mass, 0.75, 0.001, "weight")
-    held = dataclasses.replace(model_of(wrench_of(TOOL)), measured=(weight,))
+    weight = lambda p: p.body.mass  # the same function is the same program
+    far, near = (identify.Measured(weight, kg, 0.001, "weight") for kg in (0.75, 0.7002))
+    held = dataclasses.replace(model_of(wrench_of(TOOL)), measured=(far,))
     found = identify.fit(held)
     assert "the measured weight is" in str(found.explanation)
-    near = identify.Measured(lambda p: p.body.mass, 0.7002, 0.001, "weight")
     found = identify.fit(dataclasses.replace(held, measured=(near,)))
     assert found.ok and "measured weight: +0.18 standard deviations" in str(found)
 
