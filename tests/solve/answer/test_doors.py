@@ -115,7 +115,14 @@ def test_newton_finds_the_largest_of_many_numbers(solver):
         np.testing.assert_allclose(found.ys[-1].max(), 1.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("solver", [solvers.Tsitouras5(), solvers.Magnus4(), solvers.FreeSolver()])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        solvers.Tsitouras5(),
+        solvers.Magnus4(),
+        pytest.param(solvers.FreeSolver(), marks=pytest.mark.long),
+    ],
+)
 def test_a_run_goes_on_from_its_solver_state(solver):
     term = dfx.ODETerm(rj.equations_of_motion(BODY, START))
     saved = dfx.SaveAt(t1=True, solver_state=True)
