@@ -197,6 +197,7 @@ def derivative_of_wahba(body, world, weights, change):
         return np.array(((best(h) - best(-h)) / (2 * h)).tolist(), float)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ratio", [1e5, 1e8, 1e11])
 def test_a_heavy_direction_beside_a_light_one(ratio):
     # SciPy's infinite weight is the limit: off by the residual over the ratio.
