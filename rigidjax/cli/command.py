@@ -21,8 +21,10 @@ import numpy as np
 import rigidjax as rj
 from rigidjax import _checks, _show
 from rigidjax.cli import spec, swing
-from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.layouts import imu_columns
+from rigidjax.cli.logs.errors import LogError, LogWarning, warn
+from rigidjax.cli.logs.layouts import USUAL, imu_columns, time_column
+from rigidjax.cli.logs.log import Log
+from rigidjax.cli.logs.table import full_names, open_log
 from rigidjax.cli.logs.units import TIME_UNITS, unit_in_name
 from rigidjax.workprecision import command as workprecision
 
@@ -222,6 +224,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
         choices=TIME_UNITS,
         help="of the time column (default: as its name says, such as 't [ms]', else s; Blackbox, "
         "PX4 and Crazyflie us)"),
+    "--rate": dict(
+        type=float, metavar="HZ",
+        help="readings a second, of a log without times: --time COLUMN then counts readings "
+        "(default: as a line above the columns says)"),
     "--window": dict(
         nargs=2, type=float, metavar=("FROM", "TO"),
         help="use these seconds only, from the first time in the log"),
@@ -322,10 +328,23 @@ def _run_demo(options: argparse.Namespace) -> int:
     return _write_outputs(fit, options, title, [toutatis.CITATION], [title], units, more)
 
 
-def _channels(options: argparse.Namespace, rate_columns: Sequence[str]) -> list[spec.Channel]:
-    """Return the sensors of a log: those of `--sensor`, else one gyro, which `--unit`, `--noise`
-    and `--limit` describe; raise `LogError` for both together, or one that is not positive.
+def _columns(
+    path: str, log: Log, options: argparse.Namespace
+) -> tuple[list[spec.Channel], str, float | None]:
+    """Return the sensors of a log, the column of its times, and the rate of its readings if that
+    column counts them: the sensors of `--sensor`, else one gyro, which `--unit`, `--noise` and
+    `--limit` describe; raise `LogError` for both together, or one that is not positive.
     """
+    time, *rates = options.columns or ("", "", "", "")
+    time, rate = options.time or time, options.rate
+    if not options.columns and not options.sensor:
+        found = imu_columns(path, log, rate, time)
+        (first, *rates), rate = found.columns, found.rate
+        time = time or first
+        if found.columns != USUAL.columns:
+            _print_line(f"{path}: times {time or 'by the rate'}, rates {', '.join(rates)}")
+            if not (found.unit or options.unit):
+                warn(f"{path}: no unit of the rates is said: read in rad/s; or give --unit deg/s")
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
         if alone:
@@ -333,11 +352,18 @@ def _channels(options: argparse.Namespace, rate_columns: Sequence[str]) -> list[
                 f"--{alone[0]}: not together with --sensor, whose text holds unit and noise, as in "
                 "--sensor gyro=wx,wy,wz:deg/s:0.1"
             )
-        return [spec.parse_channel(text) for text in options.sensor]
-    noise = None if options.noise is None else spec.noise_of_axes(options.noise, "--noise")
-    if options.limit is not None and not options.limit > 0:
-        raise LogError(f"--limit: wanted a positive number, got {options.limit}")
-    return [spec.Channel("gyro", tuple(rate_columns), options.unit, noise, options.limit)]
+        channels = [spec.parse_channel(text) for text in options.sensor]
+        if not time:
+            first = full_names(Path(path), log, channels[0].columns)[0]
+            time, rate = time_column(path, log, first, rate)
+    else:
+        noise = None if options.noise is None else spec.noise_of_axes(options.noise, "--noise")
+        if options.limit is not None and not options.limit > 0:
+            raise LogError(f"--limit: wanted a positive number, got {options.limit}")
+        channels = [spec.Channel("gyro", tuple(rates), options.unit, noise, options.limit)]
+    units = [spec.unit_of_channel(path, log, one) for one in channels]
+    channels = [dataclasses.replace(c, unit=u) for c, u in zip(channels, units, strict=True)]
+    return channels, time, rate
 
 
 def _read_logs(
@@ -376,21 +402,15 @@ def _read_logs(
     how: dict[str, Any] = dict(window=options.window, wheels=wheels, free=options.free)
     records, of_first = [], None
     for path in options.logs:
-        time, *rates = options.columns or imu_columns(path).columns
-        time = options.time or time
-        time_unit = spec.unit_of_time(path, time, options.time_unit)
-        channels = [
-            dataclasses.replace(one, unit=spec.unit_of_channel(path, one))
-            for one in _channels(options, rates)
-        ]
-        named = [("time", [time], time_unit), *((c.kind, c.columns, c.unit) for c in channels)]
-        words = [
-            f"{what} in {unit}" for what, names, unit in named if unit_in_name(names[0], [unit])
-        ]
-        if words:
-            _print_line(f"{path}: {', '.join(words)}, as the names of its columns say")
-        how |= dict(time=time, time_unit=time_unit, flight=options.flight)
+        log = open_log(Path(path), options.flight)
+        channels, time, rate = _columns(path, log, options)
+        how |= dict(time=time, rate=rate, time_unit=options.time_unit, log=log)
         records.append(spec.read_log(path, channels, **how))
+        said = [("time", time, TIME_UNITS), *((c.kind, c.columns[0], (c.unit,)) for c in channels)]
+        units = [(what, unit_in_name(name, allowed)) for what, name, allowed in said]
+        words = [f"{what} in {unit}" for what, unit in units if unit]
+        if words and not rate:
+            _print_line(f"{path}: {', '.join(words)}, as the names of its columns say")
         of_first = of_first or channels
     how = dict(typical_moment=options.typical, wheels=wheels, free=options.free, loss=options.loss)
     return of_first or [], records, spec.model_of(records, options.model, **how)
@@ -435,7 +455,7 @@ def _run_logs(options: argparse.Namespace) -> int:
     fit = _fit(model, options, 8)
     if fit is None:
         return 2
-    of_gyros = (c.unit for c in channels if c.kind == "gyro" and c.unit != "rpm")
+    of_gyros = (c.unit for c in channels if c.kind == "gyro" and c.unit in ("rad/s", "deg/s"))
     rate_unit = next(of_gyros, None) or "rad/s"
     print()
     print(rj.identify.report.table(rj.identify.report.rows(fit, rate_unit)))

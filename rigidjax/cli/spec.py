@@ -1,7 +1,7 @@
 """Make the recordings and the model that the options of the command line describe."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, cast
@@ -13,10 +13,16 @@ import numpy as np
 
 from rigidjax.body.inertia import MassProperties
 from rigidjax.cli.logs.errors import LogError, warn
-from rigidjax.cli.logs.layouts import known_unit
-from rigidjax.cli.logs.table import read_table
-from rigidjax.cli.logs.times import increasing, increasing_rows, warn_of_steps
-from rigidjax.cli.logs.units import TIME_UNITS, UNITS, common_unit
+from rigidjax.cli.logs.log import Log
+from rigidjax.cli.logs.table import full_names, open_log, read_columns
+from rigidjax.cli.logs.times import (
+    increasing,
+    increasing_rows,
+    since_first,
+    unwrapped,
+    warn_of_steps,
+)
+from rigidjax.cli.logs.units import RATE_UNITS, TIME_UNITS, UNITS, common_unit
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.data.reference_states import require_turning
 from rigidjax.identify.model import charts
@@ -56,8 +62,8 @@ LOSSES = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}
 # These are the allowed units of each kind of sensor, the default unit first; "euler" stands for
 # Euler angles of any sequence.
 SENSOR_UNITS = {
-    "gyro": ("rad/s", "deg/s", "rpm"),
-    "accelerometer": ("m/s2", "g"),
+    "gyro": (*RATE_UNITS, "rpm"),
+    "accelerometer": ("m/s2", "g", "mg"),
     "quaternion": ("1",),
     "euler": ("rad", "deg"),
 }
@@ -170,7 +176,8 @@ def read_log(
     window: tuple[float, float] | None = None,
     wheels: Sequence[WheelColumn] = (),
     free: Sequence[str] = (),
-    flight: int | None = None,
+    rate: float | None = None,
+    log: Log | None = None,
 ) -> Recording:
     """Return the recording in a log, with the sensors that `channels` describe; its times count
     from the first time stamp of the log.
@@ -178,20 +185,21 @@ def read_log(
     A sensor has no reading in a row in which one of its cells is empty. The window (from, to) is in
     s from the first time stamp. The speeds of the wheels become inputs, `wheel`, or `wheel 1`,
     `wheel 2`, … Of the words in `free`, `bias` gives each sensor a bias; the others have no effect
-    here.
+    here. At a `rate`, readings a second, the column `time` counts readings, as the rows do if it is
+    an empty name.
 
     It **warns** as `read_table` does, of rows that are left out because their times do not
     increase, of a long gap, of times that are plainly in another unit or no times, of rates that no
     gyro reads, and of an unknown unit in the name of a column. **Raises** `LogError` as
     `read_table` does, and for rates that are all zero.
     """
-    unit = unit_of_time(path, time, time_unit)
+    log = open_log(Path(path)) if log is None else log
     # The dict has each column once: two wheels may have their speeds in the same column, and
-    # `read_table` refuses a column that is wanted twice.
+    # `read_columns` refuses a column that is wanted twice.
     turning = dict.fromkeys(w.column for w in wheels)
-    names = [time, *(c for one in channels for c in one.columns), *turning]
-    table = read_table(path, names, flight=flight)
-    t = _since_first(table[time]) * UNITS[unit]
+    names = [*(c for one in channels for c in one.columns), *turning]
+    table = read_columns(Path(path), log, [time, *names] if time else names)
+    t, unit = _times(path, log, table, time, time_unit, rate)
     kept = increasing_rows(path, t, time, window)
     # A slice is used if all rows are kept, since indexing with a slice makes no copy of a large
     # log.
@@ -199,7 +207,7 @@ def read_log(
     readings, rate = [], 0.0
     for one in channels:
         values = np.stack([table[name] for name in one.columns], axis=1)
-        factor = UNITS[unit_of_channel(path, one)]
+        factor = UNITS[unit_of_channel(path, log, one)]
         values *= factor
         mask = np.isfinite(values).all(axis=1)
         if one.kind == "gyro":
@@ -216,29 +224,46 @@ def read_log(
         raise LogError(f"{path}: {error}") from None
 
 
-def _since_first(t: np.ndarray) -> np.ndarray:
-    """Return the times counted from the first time stamp."""
-    # Times since 1970, in seconds or nanoseconds, are so large that float64 has few digits left for
-    # the steps between them.
-    finite = np.flatnonzero(np.isfinite(t))
-    return t - (t[finite[0]] if finite.size else 0.0)
-
-
-def unit_of_channel(path: str | Path, channel: Channel) -> str:
-    """Return the stated unit of a sensor, else that in the names of its columns, else the usual one
-    of such a log; raise `LogError` as `common_unit`.
+def _times(
+    path: str | Path,
+    log: Log,
+    table: Mapping[str, np.ndarray],
+    column: str,
+    stated_unit: str | None,
+    rate: float | None = None,
+) -> tuple[np.ndarray, str]:
+    """Return the times, s since the first time stamp, and the unit of their column: the stated one,
+    else that of the log or its name, else that in which they may be since 1970, else s.
     """
-    allowed = _units(channel.kind)
-    usual = known_unit(path, channel.columns[0]) or allowed[0]
-    return common_unit(channel.columns, channel.unit, usual, allowed, str(path))
+    if rate is not None:
+        if not rate > 0:
+            raise LogError(f"--rate: wanted a positive number of readings a second, got {rate}")
+        count = table[column] if column else np.arange(len(next(iter(table.values()))))
+        return since_first(unwrapped(path, count)) / rate, "s"
+    t = unwrapped(path, table[column])
+    by_log = _units_of_log(path, log, [column])
+    unit = common_unit([column], stated_unit, TIME_UNITS, str(path), by_log)
+    if stated_unit is None and not by_log and unit == "s" and np.isfinite(t).any():
+        # No other clock has such times: 1e9 s after 1970 are in 2001, 4e9 s in 2096.
+        since = float(np.nanmedian(t))
+        unit = next((u for u in TIME_UNITS[1:] if 1e9 < since * UNITS[u] < 4e9), unit)
+    return since_first(t) * UNITS[unit], unit
 
 
-def unit_of_time(path: str | Path, column: str, stated_unit: str | None) -> str:
-    """Return the stated unit of the times, else that in the name of their column, else the usual
-    one of such a log; raise `LogError` as `common_unit`.
+def unit_of_channel(path: str | Path, log: Log, channel: Channel) -> str:
+    """Return the stated unit of a sensor, else that of the log or in the names of its columns, else
+    the usual one; raise `LogError` as `common_unit`.
     """
-    usual = known_unit(path, column) or "s"
-    return common_unit([column], stated_unit, usual, TIME_UNITS, str(path))
+    by_log = _units_of_log(path, log, channel.columns)
+    return common_unit(channel.columns, channel.unit, _units(channel.kind), str(path), by_log)
+
+
+def _units_of_log(path: str | Path, log: Log, columns: Sequence[str]) -> dict[str, str]:
+    """Return the units that a log itself says, of some columns."""
+    if log.is_nameless:
+        return {}
+    full = zip(columns, full_names(Path(path), log, columns), strict=True)
+    return {name: log.units[long] for name, long in full if long in log.units}
 
 
 def _median_rate(path: str | Path, channel: Channel, factor: float, rates: np.ndarray) -> float:
@@ -311,9 +336,9 @@ def read_held(
     `LogError` as `read_table`, and for a motion through which no spline goes.
     """
     names = [*pose, *wrench, *motion]
-    table = read_table(path, [time, *dict.fromkeys(names)])
-    unit = unit_of_time(path, time, time_unit)
-    t = _since_first(table[time]) * UNITS[unit]
+    log = open_log(Path(path))
+    table = read_columns(Path(path), log, [time, *dict.fromkeys(names)])
+    t, unit = _times(path, log, table, time, time_unit)
     kept = increasing_rows(path, t, time, window)
     t, rows = t[kept], np.stack([table[name] for name in names], axis=1)[kept]
     posed = np.isfinite(np.delete(rows, np.s_[7:13], axis=1)).all(axis=1)
@@ -392,7 +417,7 @@ def _wheel_speeds(
     # is from a time before that of the reading.
     kept = increasing(t) if wheels else slice(None)
     for name, one in zip(wheel_names(wheels), wheels, strict=True):
-        unit = common_unit([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
+        unit = common_unit([one.column], one.unit, _WHEEL_UNITS, str(path))
         try:
             samples = table[one.column][kept] * UNITS[unit]
             speeds[name] = Series(*_fill_gaps(t[kept], samples))

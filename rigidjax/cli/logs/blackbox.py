@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax.cli.logs.columns import Columns
 from rigidjax.cli.logs.errors import LogError, warn
+from rigidjax.cli.logs.log import Log
 
 # The first two numbers are bounds of the flight controllers' own decoder: the largest jumps of the
 # iteration and of the time, µs, between two frames. The counters of iteration and time have 32
@@ -34,6 +34,7 @@ _RESUME, _ADJUSTMENT, _LOG_END = 14, 13, 255
 _END_MARK = b"End of log\0"
 _ERASED = re.compile(rb"[\xff\0]*\Z")
 _HEADER = re.compile(rb"(?:H [^\n]*\n)*")
+_FIELDS = re.compile(rb"^H Field [ISG] name:(.*)$", re.MULTILINE)
 # A flight with frames: behind the lines of its header somewhere is the letter of an I frame.
 _WITH_FRAMES = re.compile(rb"(?:H [^\n]*\n)+(?!H ).*?I", re.DOTALL)
 # Fields of rates and of accelerations, by their names in old and new logs of several firmwares.
@@ -48,56 +49,63 @@ _LIKE_A_SCALE = re.compile(
 )
 
 
-def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
-    """Return the wanted fields of one flight of a Blackbox log: rates in deg/s and accelerations in
-    g, by the scales in the header, as in the flight controllers' own viewer; other fields as
-    logged.
+def read_blackbox(path: Path, flight: int | None = None) -> Log:
+    """Return one flight of a Blackbox log: rates in deg/s and accelerations in g, by the scales in
+    the header, as in the flight controllers' own viewer; other fields as logged.
 
     P frames before the first I frame, and all frames from a damaged frame to the next I frame, are
     left out with a warning. A log without its end mark is read to the end of the file. It **warns**
-    of a scale that is missing or not known. **Raises** `LogError` if no flight has frames, if
-    several have and `flight` (from 1) is `None`, and for a flight that is not there or without
-    frames.
+    of a scale that is missing or not known. **Raises** `LogError` if no flight has frames, and when
+    it is read if several have and `flight` (from 1) is `None`, and for a flight that is not there
+    or without frames.
     """
     library = _checks.import_library("orangebox.reader", "blackbox", str(path))
     begins, whole = library.Reader(str(path)).log_pointers, path.read_bytes()
-    if flight is not None and not 1 <= flight <= len(begins):
-        raise LogError(f"{path}: wanted a flight from 1 to {len(begins)}, got {flight}")
     flights = dict(enumerate(map(slice, begins, [*begins[1:], len(whole)]), 1))
     full = [n for n, at in flights.items() if _WITH_FRAMES.match(whole, at.start, at.stop)]
     some = ", ".join(map(str, full))
     if not full:
         raise LogError(f"{path}: no frames in this log; is it whole, and a Blackbox log?")
-    if flight is None and len(full) > 1:
-        sizes = ", ".join(f"{(flights[n].stop - flights[n].start) / 1e3:.3g}" for n in full)
-        rest = len(flights) - len(full)
-        raise LogError(
-            f"{path}: {len(full)} flights are in this log, of {sizes} kB"
-            + (f" ({rest} more have a header only)" if rest else "")
-            + f"; choose one: --flight {some if rest else f'1 to {len(full)}'} (flight= in Python)"
-        )
-    index = flight or full[0]
-    if index not in full:
-        raise LogError(f"{path}: flight {index} has a header only; flights with frames: {some}")
-    data = whole[flights[index]]
-    log = _Flight(library.Reader(str(path), index), data)
-    rows = {name: array("d") for name in columns if name in log.names}
-    factors, groups = _factors(path, log.headers, list(rows)), array("q")
-    for group, frame in log.frames():
-        groups.append(group)
-        for name, numbers in rows.items():
-            numbers.append(frame[name])
-    keep = ~np.isin(np.frombuffer(groups, np.int64), log.order.lossy_groups())
-    log.left_out += int((~keep).sum())
-    if log.left_out:
-        warn(
-            f"{path}: {log.left_out} of {log.count} frames are left out: they depend on an I frame "
-            "that is missing, or on a frame that is damaged"
-        )
-    values = {name: np.frombuffer(numbers, float)[keep] for name, numbers in rows.items()}
-    return Columns(
-        log.names, {name: log.wrapped(name, x) * factors[name] for name, x in values.items()}
-    )
+
+    def read(columns: Sequence[str]) -> dict[str, np.ndarray]:
+        if flight is not None and flight not in flights:
+            raise LogError(f"{path}: wanted a flight from 1 to {len(begins)}, got {flight}")
+        if flight is None and len(full) > 1:
+            sizes = ", ".join(f"{(flights[n].stop - flights[n].start) / 1e3:.3g}" for n in full)
+            rest = len(flights) - len(full)
+            raise LogError(
+                f"{path}: {len(full)} flights are in this log, of {sizes} kB"
+                + (f" ({rest} more have a header only)" if rest else "")
+                + f"; choose one: --flight {some if rest else f'1 to {len(full)}'} (flight= in "
+                "Python)"
+            )
+        index = flight or full[0]
+        if index not in full:
+            raise LogError(f"{path}: flight {index} has a header only; flights with frames: {some}")
+        log = _Flight(library.Reader(str(path), index), whole[flights[index]])
+        groups = array("q")
+        rows = {name: array("d") for name in columns if name in log.names}
+        factors = _factors(path, log.headers, list(rows))
+        for group, frame in log.frames():
+            groups.append(group)
+            for name, numbers in rows.items():
+                numbers.append(frame[name])
+        keep = ~np.isin(np.frombuffer(groups, np.int64), log.order.lossy_groups())
+        log.left_out += int((~keep).sum())
+        if log.left_out:
+            warn(
+                f"{path}: {log.left_out} of {log.count} frames are left out: they depend on an I "
+                "frame that is missing, or on a frame that is damaged"
+            )
+        values = {name: np.frombuffer(numbers, float)[keep] for name, numbers in rows.items()}
+        return {name: log.wrapped(name, x) * factors[name] for name, x in values.items()}
+
+    at = flights[flight if flight in full else full[0]]
+    fields = _FIELDS.findall(whole, at.start, _HEADER.match(whole, at.start).end())  # pyright: ignore
+    names = list(dict.fromkeys(name for line in fields for name in line.decode().split(",")))
+    units = {"time": "us"} | dict.fromkeys(RATES, "deg/s") | dict.fromkeys(ACCELERATIONS, "g")
+    stems = {name: name.partition("[")[0] for name in names}
+    return Log(names, read, {name: units[stem] for name, stem in stems.items() if stem in units})
 
 
 class _Bytes:

@@ -9,14 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidjax.cli.logs.columns import Columns
+from rigidjax.cli.logs.log import Log
 
 FIRST_BYTE = 0xBC
+UNITS = {"timestamp": "us", "gyro": "deg/s", "acc": "g"}
 
 
-def read_crazyflie(path: Path, columns: Sequence[str]) -> Columns:
-    """Return the wanted variables of a Crazyflie's µSD log, such as `gyro.x`; the times are the
-    variable `timestamp`, µs.
+def read_crazyflie(path: Path) -> Log:
+    """Return the variables of a Crazyflie's µSD log, such as `gyro.x`; the times are the variable
+    `timestamp`, µs.
 
     A log holds several events, each with its own variables and times. The event that has most of
     the wanted variables is read, and of two events with equally many the one with more data.
@@ -49,10 +50,14 @@ def read_crazyflie(path: Path, columns: Sequence[str]) -> Columns:
         _, form, rows = events[struct.unpack_from("<H", data, at)[0]]
         rows.extend(form.unpack_from(data, at + 2))
         at += 2 + form.size
-    names, _, rows = max(events.values(), key=lambda e: (len({*columns} & {*e[0]}), len(e[2])))
-    table = np.frombuffer(rows, float).reshape(-1, len(names)).T
-    arrays = dict(zip(names, table, strict=True))
-    arrays["timestamp"] = arrays["timestamp"] * (1e3 if version == 1 else 1.0)
-    every = [name for names, *_ in events.values() for name in names]
-    wanted = {name: arrays[name] for name in columns if name in arrays}
-    return Columns(list(dict.fromkeys(every)), wanted)
+
+    def read(columns: Sequence[str]) -> dict[str, np.ndarray]:
+        names, _, rows = max(events.values(), key=lambda e: (len({*columns} & {*e[0]}), len(e[2])))
+        table = np.frombuffer(rows, float).reshape(-1, len(names)).T
+        arrays = dict(zip(names, table, strict=True))
+        arrays["timestamp"] = arrays["timestamp"] * (1e3 if version == 1 else 1.0)
+        return arrays
+
+    names = list(dict.fromkeys(name for names, *_ in events.values() for name in names))
+    units = {n: u for n in names for part, u in UNITS.items() if n.partition(".")[0] == part}
+    return Log(names, read, units)

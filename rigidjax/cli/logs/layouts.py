@@ -1,95 +1,139 @@
-"""Find the columns of time and rates in a log, from its format or from the units in its names."""
+"""Find the columns of time and rates in a log, by their names and units."""
 
-import contextlib
 import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from rigidjax.cli.logs.blackbox import ACCELERATIONS, RATES
-from rigidjax.cli.logs.errors import LogError
-from rigidjax.cli.logs.table import BINARY, file_ending
-from rigidjax.cli.logs.text import open_text, read_header
-from rigidjax.cli.logs.units import TIME_UNITS, unit_in_name
+from rigidjax.cli.logs.errors import LogError, list_names
+from rigidjax.cli.logs.log import Log
+from rigidjax.cli.logs.table import open_log
+from rigidjax.cli.logs.units import RATE_UNITS, TIME_UNITS, unit_in_name
 
 
 class ImuColumns(NamedTuple):
     """Hold the names and units of the columns of a log with the times and the body rates."""
 
-    # The times, and the rates about x, y and z.
+    # The times, and the rates about x, y and z; an empty name of the times means that the rows are
+    # counted.
     columns: tuple[str, str, str, str]
-    unit: str
-    time_unit: str
+    # A unit is `None` if the log does not say it.
+    unit: str | None
+    time_unit: str | None
+    # Readings a second, if the column of the times counts readings.
+    rate: float | None = None
 
 
 USUAL = ImuColumns(("t", "wx", "wy", "wz"), "rad/s", "s")
 
-
-# For each ending of the file name of a binary log, this table has the units of fields whose names
-# do not contain a unit.
-_UNITS = {
-    ".bbl": {"time": "us"} | dict.fromkeys(RATES, "deg/s") | dict.fromkeys(ACCELERATIONS, "g"),
-    ".ulg": {"timestamp": "us"},
-    ".usd": {"timestamp": "us", "gyro": "deg/s", "acc": "g"},
-}
-_UNITS[".bfl"] = _UNITS[".bbl"]
-
-
-def known_unit(path: str | Path, column: str) -> str | None:
-    """Return the unit that a column has in every log of the format of `path`, or `None`; the ending
-    of the name tells the format.
-    """
-    units = _UNITS.get(file_ending(Path(path)), {})
-    return next((units[part] for part in re.split(r"[.\[]", column) if part in units), None)
+# The words of names, in small letters.
+_WORD = re.compile(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]*|[^\W\d_]+|\d+")
+_TIMES = frozenset(
+    "t time timestamp stamp us ms millis micros seconds elapsed date datetime clock uptime zeit "
+    "temps tiempo tempo".split()
+)
+_COUNTERS = frozenset("frame packetcounter counter sample samples index row".split())
+_GYRO = re.compile(r"gyr|angular_?vel|rotation_?rate|omega|ω|^w\W*$|[. _]w\W*$", re.IGNORECASE)
+# What else belongs to a gyro, but is not its rates.
+_NO_RATES = re.compile(r"cov|bias|offset|deriv|fifo|temp|std|var|noise|clip", re.IGNORECASE)
+_SECOND_CHOICE = re.compile(r"raw|unfilt|uncal|#\d", re.IGNORECASE)
 
 
-def imu_columns(path: str | Path) -> ImuColumns:
+def imu_columns(
+    path: str | Path, log: Log | None = None, rate: float | None = None, time: str = ""
+) -> ImuColumns:
     """Return the columns of the times and the body rates of a log; the usual columns t, wx, wy, wz
     if those of this log are not known.
 
-    Those of a text log are found by the units in their names: the app phyphox, for example, writes
-    the same units in all languages, but not the same words.
+    The column of the times may be given. At a `rate`, readings a second, the times are a column
+    that counts them, or else the rows. The app phyphox, for example, writes the same units in all
+    languages, but not the same words. **Raises** `LogError` for a log that cannot be read, or
+    without a header.
     """
     path = Path(path)
-    # Errors of a log that cannot be read are suppressed here, since the function that reads the log
-    # raises them later with better messages.
-    with contextlib.suppress(Exception):
-        if file_ending(path) in BINARY:
-            columns = _binary_columns(path)
-            unit = known_unit(path, columns[1]) or "rad/s"
-            return ImuColumns(columns, unit, known_unit(path, columns[0]) or "s")
-        with open_text(path) as file:
-            units = {name: unit_in_name(name, ()) for name in read_header(file).names}
-        # There must be one column with a unit of time, and for each axis one with a unit of rates:
-        # unpacking raises an error, which is suppressed, if there are none or several.
-        (time,) = (name for name, unit in units.items() if unit in TIME_UNITS)
-        rates = [name for name, unit in units.items() if unit in ("rad/s", "deg/s")]
-        (x,), (y,), (z,) = (
-            [name for name in rates if re.search(rf"\b{axis}\W*[(\[]", name)] for axis in "xyz"
+    log = open_log(path) if log is None else log
+    if log.is_nameless:
+        raise LogError(
+            f"{path}: line 1: no header, but {len(log.names)} columns of numbers; name them by "
+            "their places, as in --columns 1 2 3 4 (time, then rates), or write a header above them"
         )
-        return ImuColumns((time, x, y, z), str(units[x]), str(units[time]))
-    return USUAL
+    found = sorted(
+        (bool(_SECOND_CHOICE.search(stem)), place, names)
+        for place, (stem, names) in enumerate(_triples(log, path.stem))
+    )
+    if not found:
+        return USUAL
+    names = found[0][-1]
+    if not time:
+        time, rate = time_column(path, log, names[0], rate)
+    unit = _unit(log, names[0], RATE_UNITS)
+    if unit is None and (names[0].endswith("wx") or time.endswith("seconds_elapsed")):
+        # The usual names, and those of a logger of phones.
+        unit = "rad/s"
+    return ImuColumns((time, *names), unit, _unit(log, time, TIME_UNITS), rate)
 
 
-def _binary_columns(path: Path) -> tuple[str, str, str, str]:
-    """Return the fields of a binary log with the times and the rates about x, y and z; raise
-    `LogError` if it has no rates.
+def _unit(log: Log, name: str, allowed: Sequence[str]) -> str | None:
+    """Return the unit of a column by the log or by its name, or `None`."""
+    return log.units.get(name) or unit_in_name(name, allowed)
+
+
+def _triples(log: Log, title: str) -> Iterator[tuple[str, tuple[str, str, str]]]:
+    """Yield the columns of each gyro, in the order x, y, z, and their name without the axis; the
+    rates of a log whose `title` names a gyro may be x, y, z.
     """
-    kind = file_ending(path)
-    if kind in (".bbl", ".bfl"):
-        return "time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]"
-    if kind == ".usd":
-        return "timestamp", "gyro.x", "gyro.y", "gyro.z"
-    names, _ = BINARY[kind](path, [])
-    for stem, parts in (
-        ("gyro_rad", ("[0]", "[1]", "[2]")),
-        ("xyz", ("[0]", "[1]", "[2]")),
-        ("angular_velocity", (".x", ".y", ".z")),
-    ):
-        for name in names:
-            topic, _, field = name.rpartition(f".{stem}{parts[0]}")
-            if topic and not field and (stem != "xyz" or topic == "vehicle_angular_velocity"):
-                times = ("timestamp",) if kind == ".ulg" else ("stamp", "log_time")
-                time = next(f"{topic}.{t}" for t in times if f"{topic}.{t}" in names)
-                x, y, z = (f"{topic}.{stem}{part}" for part in parts)
-                return time, x, y, z
-    raise LogError(f"{path}: no body rates are in this log")
+    every, weak = dict.fromkeys(log.names), []
+    for name in every:
+        for match in re.finditer(r"[xX]|\[0\]", name):
+            before, after = name[: match.start()], name[match.end() :]
+            axes = {"x": "xyz", "X": "XYZ"}.get(match[0], ("[0]", "[1]", "[2]"))
+            x, y, z = (f"{before}{axis}{after}" for axis in axes)
+            if y not in every or z not in every:
+                continue
+            stem = before + after
+            unit = _unit(log, name, RATE_UNITS)
+            plain = not re.search(r"\w", stem.rpartition(".")[2])
+            is_gyro = _GYRO.search(before) or _GYRO.search(after) or (plain and _GYRO.search(title))
+            if _NO_RATES.search(stem) or unit not in (None, *RATE_UNITS):
+                continue
+            if is_gyro or unit:
+                yield stem, (x, y, z)
+            elif re.fullmatch(r"(.*[. _])?[gG][. _]?", before):
+                weak.append((stem, (x, y, z)))
+    yield from weak
+    if {"p", "q", "r"} <= {*every}:
+        yield "", ("p", "q", "r")
+
+
+def time_column(
+    path: str | Path, log: Log, other: str, rate: float | None = None
+) -> tuple[str, float | None]:
+    """Return the column of the times of another column, and `None`; or the column that counts the
+    readings, an empty name if the rows do, and the rate, which is that of the log if none is given.
+
+    **Raises** `LogError` if there is neither.
+    """
+    counter, parts = "", other.split(".")
+    for size in reversed(range(len(parts))):
+        group, times = "".join(f"{part}." for part in parts[:size]), []
+        for name in log.names:
+            last = name.removeprefix(group)
+            if not name.startswith(group) or (group and "." in last):
+                continue
+            bare, in_brackets, _ = re.split(r"([(\[]|$)", last, maxsplit=1)
+            words = [word.lower() for word in _WORD.findall(bare)]
+            if "".join(words) in _COUNTERS:
+                counter = counter or name
+            elif _TIMES & {*words} or (in_brackets and unit_in_name(last, ()) in TIME_UNITS):
+                unknown = _unit(log, name, TIME_UNITS) is None
+                by_logger = any(word.startswith("log") for word in words)
+                times.append((unknown, by_logger, len(name), name))
+        # A counter and a rate that the log says are better than times in an unknown unit.
+        if times and not rate and not (min(times)[0] and counter and log.rate):
+            return min(times)[-1], None
+    if rate or log.rate:
+        return counter, rate or log.rate
+    raise LogError(
+        f"{path}: no column of times is known; the columns are {list_names(log.names)}; name it "
+        "with --time, or give the readings a second, as in --rate 100"
+    )

@@ -23,6 +23,35 @@ _SLOW = 0.1
 _GAP = 1e5
 
 
+def since_first(t: np.ndarray) -> np.ndarray:
+    """Return the times counted from the first time stamp."""
+    # Times since 1970, in seconds or nanoseconds, are so large that float64 has few digits left for
+    # the steps between them.
+    finite = np.flatnonzero(np.isfinite(t))
+    return t - (t[finite[0]] if finite.size else 0.0)
+
+
+def unwrapped(path: str | Path, t: np.ndarray) -> np.ndarray:
+    """Return the counts of a clock that go on where its 16 or 32 bits begin again at zero; it
+    **warns** of it.
+    """
+    finite = t[np.isfinite(t)]
+    steps = np.diff(finite)
+    for bits in (16, 32):
+        wraps = steps < -(2.0 ** (bits - 1))
+        if not wraps.any() or not ((finite >= 0) & (finite < 2.0**bits) & (finite % 1 == 0)).all():
+            continue
+        # The step over zero must be one of the usual ones, or the clock was set back.
+        if (steps[wraps] + 2.0**bits <= 10 * np.median(steps)).all():
+            warn(
+                f"{path}: the clock begins again at 2^{bits}, {wraps.sum()} times: it is counted on"
+            )
+            t = t.copy()
+            t[np.isfinite(t)] += 2.0**bits * np.concatenate([[0], np.cumsum(wraps)])
+            return t
+    return t
+
+
 def increasing(t: np.ndarray) -> np.ndarray:
     """Return a mask that keeps as many of the times `t` as possible, such that the kept times
     increase.

@@ -2,7 +2,8 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 from rigidjax.cli.logs.errors import LogError, warn
 
@@ -11,18 +12,21 @@ from rigidjax.cli.logs.errors import LogError, warn
 UNITS = {
     "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "mm": 1e-3, "m/s2": 1.0, "g": 9.80665,
     "1": 1.0, "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180,
-    "rpm": math.pi / 30,
+    "mdeg/s": 1e-3 * math.pi / 180, "mg": 9.80665e-3, "rpm": math.pi / 30,
 }  # fmt: skip
+RATE_UNITS = ("rad/s", "deg/s", "mdeg/s")
 TIME_UNITS = ("s", "ms", "us", "ns")
 # Each unit has the spellings in this table, in small letters; powers are without `^`, `**` or
 # raised digits.
 _SPELLINGS = {
     "s": "s sec secs second seconds",
-    "ms": "ms msec millisecond milliseconds",
-    "us": "us usec microsecond microseconds",
-    "ns": "ns nsec nanosecond nanoseconds",
+    "ms": "ms msec millis millisecond milliseconds",
+    "us": "us usec micros microsecond microseconds",
+    "ns": "ns nsec nanos nanosecond nanoseconds",
     "rad/s": "rad/s rad/sec rads/s radian/s radians/s rads-1 rad_s",
     "deg/s": "deg/s deg/sec degs/s degree/s degrees/s °/s °/sec dps degs-1 °s-1 deg_s",
+    "mdeg/s": "mdeg/s mdps millidps",
+    "mg": "mg",
     "rpm": "rpm rev/min r/min 1/min u/min min-1",
     "m/s2": "m/s2 m/sec2 m/s/s ms-2 m_s2",
     "g": "g g0",
@@ -50,10 +54,20 @@ def unit_in_name(column: str, allowed: Sequence[str]) -> str | None:
     """
     brackets = _IN_BRACKETS.search(column)
     if brackets:
-        return _UNIT_OF.get(_plain(brackets[1]))
-    endings = (column[match.end() :] for match in re.finditer(r"[\s,_]+", column))
-    units = (_UNIT_OF.get(_plain(ending)) for ending in endings)
-    return next((unit for unit in units if unit in allowed), None)
+        return spelled_unit(brackets[1])
+    endings = [
+        column[match.end() :] for match in re.finditer(r"[\s,_]+|(?<=[a-z])(?=[A-Z])", column)
+    ]
+    if "ms" in allowed:
+        # Of a time the unit alone may be the name, and a long word may stand at the beginning.
+        last = column.rpartition(".")[2]
+        endings += [last, *(word for word in re.split("[ _]", last) if len(word) > 3)]
+    return next((unit for unit in map(spelled_unit, endings) if unit in allowed), None)
+
+
+def spelled_unit(text: str) -> str | None:
+    """Return the unit that a text is, perhaps in brackets, or `None`."""
+    return _UNIT_OF.get(_plain(text.strip("()[] ")))
 
 
 def _plain(unit: str) -> str:
@@ -66,25 +80,26 @@ def _plain(unit: str) -> str:
 def common_unit(
     columns: Sequence[str],
     stated_unit: str | None,
-    usual_unit: str,
     allowed: Sequence[str],
     message_start: str,
+    by_log: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Return the unit of columns of one quantity: the stated one, else that in their names, else
-    the usual one.
+    """Return the unit of columns of one quantity: the stated one, else that which the log has for
+    them or their names say, else the first of the allowed ones.
 
     It **warns** of an unknown unit in brackets, if none is stated. **Raises** `LogError` for names
     that contradict one another or the stated unit, and for a unit that is not allowed.
     """
-    in_names = {name: unit for name in columns if (unit := unit_in_name(name, allowed))}
+    in_names = {n: u for n in columns if (u := by_log.get(n) or unit_in_name(n, allowed))}
     for name, unit in in_names.items():
         if unit not in allowed:
             wanted = " or ".join(allowed)
             raise LogError(f"{message_start}: column {name!r} is in {unit}; wanted {wanted}")
         if stated_unit is not None and unit != stated_unit:
             raise LogError(
-                f"{message_start}: column {name!r} is in {unit} by its name, and {stated_unit} is "
-                "stated: which one? state the same unit, or none"
+                f"{message_start}: column {name!r} is in {unit} by "
+                f"{'the log' if name in by_log else 'its name'}, and {stated_unit} is stated: "
+                "which one? state the same unit, or none"
             )
     # For each unit in the names the dict has one column with this unit, so that a message about
     # different units can name two columns.
@@ -94,7 +109,7 @@ def common_unit(
         raise LogError(
             f"{message_start}: column {first!r} is in {one}, column {second!r} in {other}"
         )
-    unit = stated_unit or next(iter(in_names.values()), usual_unit)
+    unit = stated_unit or next(iter(in_names.values()), allowed[0])
     for name in columns:
         brackets = _IN_BRACKETS.search(name)
         if (

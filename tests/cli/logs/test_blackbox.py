@@ -10,7 +10,8 @@ import pytest
 
 from rigidjax.cli.command import main
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.layouts import imu_columns, known_unit
+from rigidjax.cli.logs.layouts import imu_columns
+from rigidjax.cli.logs.table import open_log
 from rigidjax.identify import read_table
 
 
@@ -98,7 +99,7 @@ def test_of_a_high_resolution_rates_and_commands_are_ten_times_finer(tmp_path):
         table = read_table(path, list(scale))
     for k, (name, factor) in enumerate(scale.items(), 3):
         np.testing.assert_allclose(table[name], factor * k * np.arange(40), 1e-12, err_msg=name)
-        assert known_unit(path, name) == {"g": "deg/s", "a": "g"}.get(name[0])
+        assert open_log(path).units.get(name) == {"g": "deg/s", "a": "g"}.get(name[0])
 
 
 @pytest.mark.parametrize(
@@ -142,7 +143,9 @@ def test_what_is_no_blackbox_log_gets_one_line(tmp_path, capsys, content):
 def test_a_field_that_is_not_there_is_named(tmp_path):
     path = tmp_path / "flight.bbl"
     path.write_bytes(blackbox_log(ROWS))
-    with pytest.raises(LogError, match=r"no array 'motor.0.'; the arrays are loopIteration, time"):
+    with pytest.raises(
+        LogError, match=r"no column 'motor.0.'; the columns are loopIteration, time"
+    ):
         read_table(path, ["motor[0]"])
 
 
@@ -394,4 +397,5 @@ def test_only_blackbox_has_flights(tmp_path):
 def test_fields_have_their_units(tmp_path):
     path = tmp_path / "flight.bbl"
     units = {"time": "us", "gyroADC[1]": "deg/s", "accSmooth[2]": "g", "motor[0]": None}
-    assert {name: known_unit(path, name) for name in units} == units
+    path.write_bytes(blackbox_log(ROWS, *SCALES, fields=",".join(list(units)[1:])))
+    assert open_log(path).units == {name: unit for name, unit in units.items() if unit}

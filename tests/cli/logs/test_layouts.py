@@ -23,9 +23,8 @@ def test_phyphox_is_known_by_its_header(tmp_path, words, separator):
     np.testing.assert_array_equal(table[f"{words[0]} z (rad/s)"], [3, 8, 13, 18])
 
 
-@pytest.mark.parametrize("text", ["t,wx,wy,wz\n", "", '"unclosed (s),x (rad/s)'])
+@pytest.mark.parametrize("text", ["t,wx,wy,wz\n", "a,b\n1,2\n", '"unclosed (s),x (rad/s)'])
 def test_other_texts_have_the_usual_columns(tmp_path, text):
     path = tmp_path / "log.csv"
     path.write_text(text)
-    assert imu_columns(path) == USUAL
-    assert imu_columns(tmp_path / "none.csv") == imu_columns(tmp_path) == USUAL
+    assert imu_columns(path).columns == USUAL.columns

@@ -152,7 +152,7 @@ def test_a_name_that_is_not_there_or_a_cut_file_is_one_line(tmp_path, capsys, ki
     name, write, _ = FILES[kind]
     path = tmp_path / name
     write(path)
-    with pytest.raises(LogError, match=r"no array 'other'; the arrays are .*(gyro|angular)"):
+    with pytest.raises(LogError, match=r"no column 'other'; the columns are .*(gyro|angular)"):
         read_table(path, ["other"])
     path.write_bytes(path.read_bytes()[:9])
     assert main(["identify", str(path)]) == 2
@@ -162,7 +162,7 @@ def test_a_name_that_is_not_there_or_a_cut_file_is_one_line(tmp_path, capsys, ki
 
 def test_a_text_file_without_ending_is_text(tmp_path):
     (tmp_path / "log").write_text("t,wx,wy,wz\n0,1,2,3\n")
-    assert imu_columns(tmp_path / "log") == USUAL
+    assert imu_columns(tmp_path / "log").columns == USUAL.columns
     assert read_table(tmp_path / "log", ["wy"])["wy"].tolist() == [2.0]
 
 

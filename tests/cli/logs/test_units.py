@@ -39,29 +39,27 @@ def test_units_of_other_columns(name, allowed, unit):
 
 def test_the_name_decides_where_nothing_is_stated():
     names = ["x (deg/s)", "y (deg/s)", "z"]
-    assert common_unit(names, None, "rad/s", RATES, "log") == "deg/s"
-    assert common_unit(names, "deg/s", "rad/s", RATES, "log") == "deg/s"
-    assert common_unit(["x", "y"], None, "rad/s", RATES, "log") == "rad/s"
-    assert common_unit(["x", "y"], "rpm", "rad/s", RATES, "log") == "rpm"
+    assert common_unit(names, None, RATES, "log") == "deg/s"
+    assert common_unit(names, "deg/s", RATES, "log") == "deg/s"
+    assert common_unit(["x", "y"], None, RATES, "log") == "rad/s"
+    assert common_unit(["x", "y"], "rpm", RATES, "log") == "rpm"
 
 
 def test_units_that_disagree_are_refused():
     with pytest.raises(
         LogError, match=r"log: column 'x \(deg/s\)' is in deg/s by its name, and rad/s"
     ):
-        common_unit(["x (deg/s)"], "rad/s", "rad/s", RATES, "log")
+        common_unit(["x (deg/s)"], "rad/s", RATES, "log")
     with pytest.raises(LogError, match=r"'x \(deg/s\)' is in deg/s, column 'y \(rad/s\)' in rad/s"):
-        common_unit(["x (deg/s)", "y (rad/s)"], None, "rad/s", RATES, "log")
+        common_unit(["x (deg/s)", "y (rad/s)"], None, RATES, "log")
     with pytest.raises(LogError, match=r"'x \(m/s\^2\)' is in m/s2; wanted rad/s or deg/s or rpm"):
-        common_unit(["x (m/s^2)"], None, "rad/s", RATES, "log")
+        common_unit(["x (m/s^2)"], None, RATES, "log")
 
 
 def test_a_unit_that_is_not_known_is_told_unless_one_is_stated():
-    with pytest.warns(
-        LogWarning, match=r"'x \(mdps\)': its unit is not known; it is read in rad/s"
-    ):
-        assert common_unit(["x (mdps)"], None, "rad/s", RATES, "log") == "rad/s"
+    with pytest.warns(LogWarning, match=r"'x \(LSB\)': its unit is not known; it is read in rad/s"):
+        assert common_unit(["x (LSB)"], None, RATES, "log") == "rad/s"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert common_unit(["x (mdps)"], "deg/s", "rad/s", RATES, "log") == "deg/s"
-        assert common_unit(["gyro[0]", "w (x)"], None, "rad/s", RATES, "log") == "rad/s"
+        assert common_unit(["x (LSB)"], "deg/s", RATES, "log") == "deg/s"
+        assert common_unit(["gyro[0]", "w (x)"], None, RATES, "log") == "rad/s"
