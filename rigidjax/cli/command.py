@@ -198,7 +198,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--demo": _FLAG | dict(help="the tumbling of 4179 Toutatis"),
     "--columns": dict(
         nargs=4, metavar=("T", "WX", "WY", "WZ"), help="names of the time column and of the three "
-        "body rates (default: t wx wy wz; those of phyphox and of binary logs are known)"),
+        "body rates (default: as their names and units say)"),
     "--time": dict(
         metavar="COLUMN", help="name of the time column, if --columns is not given (default: t)"),
     "--unit": dict(
@@ -291,10 +291,9 @@ def _parser() -> argparse.ArgumentParser:
     identify = commands.add_parser(
         "identify",
         help="fit a body and its motion to recordings",
-        description="Fit a body's inertia and motion to logs (.csv or .csv.gz with a header line, "
-        ".npz, .mat, Blackbox's .bbl and .bfl, PX4's .ulg, .mcap, a Crazyflie's), several together "
-        "if several are given; or, with --demo, to the radar observations of asteroid "
-        "4179 Toutatis.",
+        description="Fit a body's inertia and motion to logs (text, zip files and sheets of "
+        "phones, arrays, logs of flight controllers, ROS), several together if several are given; or, with "
+        "--demo, to the radar observations of asteroid 4179 Toutatis.",
         epilog="A throw with a gyro and a flywheel whose inertia is known: identify throw1.csv "
         "throw2.csv --wheel flywheel:1.2e-6:z --model tensor --typical 3e-4 --free drag bias "
         "--report throws.html",

@@ -49,6 +49,7 @@ row(
     says=("reading",),
     **HOST,
 )
+leave_out("a table of another library, by names", "identify.Recording.from_frame")
 row(
     "identify.simulate_readings",
     lambda: dict(

@@ -318,11 +318,13 @@ def our_table(t, w):
         ts, *rates = identify.read_table(path, ["t", "wx", "wy", "wz"]).values()
         read = identify.Recording(ts, (identify.Gyro(), np.stack(rates, 1)))
         columns = identify.read_table(path, ["wy", "t"])
+        frame = identify.read_table(path, ["t", "wx", "wy", "wz"])
+        read = identify.Recording.from_frame(frame, t="t", gyro=["wx", "wy", "wz"])
         return [read.t, read.readings[0].values, columns["wy"], columns["t"]]
 
 
 way(
-    "identify.read_table identify.Recording", our_table,
+    "identify.read_table identify.Recording identify.Recording.from_frame", our_table,
     (lambda rng, i: np.cumsum(rng.uniform(0.1, 1.0, 4)), v.normal(4, 3, low=-20, high=20)),
     lambda t, w: [t, w, w[:, 1], t], batched=False,
 )  # fmt: skip

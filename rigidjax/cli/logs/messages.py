@@ -33,7 +33,9 @@ def _messages_log(
         first = None
         for topic, time, content in messages():
             first = time if first is None else first
-            of_message = {} if time is None or first is None else {"log_time": 1e-9 * (time - first)}
+            of_message = (
+                {} if time is None or first is None else {"log_time": 1e-9 * (time - first)}
+            )
             of_message |= dict(_numbers(content))
             sec, nano = (of_message.get(f"header.stamp.{part}") for part in ("sec", "nanosec"))
             if first is not None and sec is not None and nano is not None:

@@ -120,7 +120,7 @@ def text_log(path: str, open_file: Callable[[], io.TextIOBase]) -> Log:
 
 
 class _Dialect(NamedTuple):
-    """Say how lines become cells."""
+    """Hold the separator, or the names of the pairs, by which lines become cells."""
 
     # A blank stands for any blanks.
     separator: str

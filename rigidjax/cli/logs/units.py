@@ -90,6 +90,8 @@ def common_unit(
     It **warns** of an unknown unit in brackets, if none is stated. **Raises** `LogError` for names
     that contradict one another or the stated unit, and for a unit that is not allowed.
     """
+    if stated_unit not in (None, *allowed):
+        raise LogError(f"{message_start}: wanted {' or '.join(allowed)}, got {stated_unit!r}")
     in_names = {n: u for n in columns if (u := by_log.get(n) or unit_in_name(n, allowed))}
     for name, unit in in_names.items():
         if unit not in allowed:

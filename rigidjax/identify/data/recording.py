@@ -1,7 +1,7 @@
 """Hold a recording: times, the readings of each sensor, and logged inputs."""
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks, _show
 from rigidjax._types import NumbersLike
-from rigidjax.identify.sensors import AbstractSensor
+from rigidjax.cli.logs.units import RATE_UNITS, TIME_UNITS, UNITS, common_unit
+from rigidjax.identify.sensors import AbstractSensor, Gyro
 from rigidjax.identify.sensors.base import extras
 from rigidjax.motion.torques import Held
 
@@ -149,6 +150,45 @@ class Recording(eqx.Module):
             Reading(row.sensor, jnp.asarray(row.values[kept]), jnp.asarray(row.mask[kept]))
             for row in rows
         )
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: Any,
+        *,
+        t: str,
+        gyro: Sequence[str],
+        unit: str | None = None,
+        noise: NumbersLike | None = None,
+    ) -> "Recording":
+        """Return the recording of a gyro in a table of pandas, polars or xarray, or in a dictionary
+        of columns.
+
+        **Arguments:**
+
+        - `frame`: what gives a column by its name, `frame["wx"]`. NaN marks a gap.
+        - `t`: the name of the column of the times: dates, or numbers in s if the name does not say
+          another unit, as `time (ms)` does.
+        - `gyro`: the names of the columns of the rates about x, y and z, body frame.
+        - `unit`: rad/s, deg/s, mdeg/s or rpm; `None` for the unit that the names say, as in
+          `x (deg/s)`, else rad/s.
+        - `noise`: the standard deviation of a reading as of `identify.Gyro`, rad/s.
+
+        **Raises:** `ValueError` for a unit that contradicts the names, and as `Recording`.
+
+        >>> rates = {"t": [0.0, 0.5], "x": [90, 0], "y": [0, 90], "z": [0, 0]}
+        >>> Recording.from_frame(rates, t="t", gyro=["x", "y", "z"], unit="deg/s").t.shape
+        (2,)
+        """
+        times, *rates = (np.asarray(frame[name]) for name in (t, *gyro))
+        if times.dtype.kind in "mM":
+            times = (times - times[0]) / np.timedelta64(1, "s")
+        else:
+            times = times * UNITS[common_unit([t], None, TIME_UNITS, "Recording.from_frame")]
+        allowed = (*RATE_UNITS, "rpm")
+        factor = UNITS[common_unit(gyro, unit, allowed, "Recording.from_frame")]
+        values = factor * np.stack(rates, axis=1)
+        return cls(times, (Gyro(noise), values, np.isfinite(values).all(axis=1)))
 
     def __repr__(self) -> str:
         if not _checks.is_known(self) or np.ndim(self.t) != 1:
