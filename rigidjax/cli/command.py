@@ -292,8 +292,8 @@ def _parser() -> argparse.ArgumentParser:
         "identify",
         help="fit a body and its motion to recordings",
         description="Fit a body's inertia and motion to logs (text, zip files and sheets of "
-        "phones, arrays, logs of flight controllers, ROS), several together if several are given; or, with "
-        "--demo, to the radar observations of asteroid 4179 Toutatis.",
+        "phones, arrays, logs of flight controllers, ROS), several together if several are given; "
+        "or, with --demo, to the radar observations of asteroid 4179 Toutatis.",
         epilog="A throw with a gyro and a flywheel whose inertia is known: identify throw1.csv "
         "throw2.csv --wheel flywheel:1.2e-6:z --model tensor --typical 3e-4 --free drag bias "
         "--report throws.html",

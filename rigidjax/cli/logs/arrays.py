@@ -1,6 +1,7 @@
 """Read files of arrays: those of NumPy and MATLAB, HDF5, and the tables of Arrow."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,57 +19,35 @@ def arrays_log(path: Path, arrays: Mapping[str, Any]) -> Log:
     """Return the log of named arrays: a matrix is a column for each of its columns, `gyro[0]`, a
     struct one for each of its parts, `imu.t`.
     """
-    leaves = dict(_leaves(arrays))
-    if not leaves:
+    columns = dict(_columns(arrays))
+    if not columns:
         raise LogError(f"{path}: holds no columns of numbers")
-
-    def read(columns: Sequence[str]) -> dict[str, Any]:
-        return {name: np.asarray(leaves[name][0])[leaves[name][1]] for name in columns}
-
-    dates = {name: "s" for name, (value, _) in leaves.items() if value.dtype.kind in "mM"}
-    return Log(list(leaves), read, dates)
+    dates = {name: "s" for name, column in columns.items() if column.dtype.kind in "mM"}
+    return Log(list(columns), lambda names: {name: columns[name] for name in names}, dates)
 
 
-def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
-    """Yield the name of each column of numbers in `value` with the array that holds it and the
-    index of the column there.
-    """
+def _columns(value: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the name and the numbers of each column in `value`."""
+    if isinstance(value, np.ndarray) and value.dtype.names:
+        value = {part: value[part] for part in value.dtype.names}
     if isinstance(value, Mapping):
         for part, inside in value.items():
-            if part[:1] != "#" and part[:2] != "__":
-                yield from _leaves(inside, f"{name}.{part}" if name else part)
+            # MATLAB's own parts begin with these signs.
+            if not part.startswith(("#", "__")):
+                yield from _columns(inside, f"{name}.{part}" if name else part)
         return
-    if isinstance(value, list | tuple):
-        try:
-            value = np.asarray(value)
-        except ValueError:
-            return
-    if isinstance(value, np.ndarray) and value.dtype == object and value.size == 1:
-        yield from _leaves(value.item(), name)
+    try:
+        array = np.squeeze(value)
+    except ValueError:
+        # Rows of different lengths are no matrix.
         return
-    shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", None)
-    if dtype is None or not shape:
-        return
-    if dtype.names:
-        for part in dtype.names:
-            yield from _leaves(value[part], f"{name}.{part}" if name else part)
-        return
-    wide = [axis for axis, size in enumerate(shape) if size > 1]
-    if len(wide) < 2:
-        yield name, (value, np.s_[...] if len(shape) == 1 else _column(shape, wide[:1], 0, 0))
-    elif len(wide) == 2 and (least := min(shape[axis] for axis in wide)) <= _WIDEST:
-        across = next(axis for axis in reversed(wide) if shape[axis] == least)
-        for i in range(least):
-            yield f"{name}[{i}]", (value, _column(shape, wide, across, i))
-
-
-def _column(shape: Sequence[int], wide: Sequence[int], across: int, i: int) -> tuple[Any, ...]:
-    """Return the index of the column `i` along the axis `across`; axes of length 1 vanish."""
-    long = [axis for axis in wide if len(wide) == 1 or axis != across] or [0]
-    return tuple(
-        np.s_[:] if axis in long else (i if axis == across and len(wide) > 1 else 0)
-        for axis in range(len(shape))
-    )
+    if array.dtype == object and array.ndim == 0 and isinstance(array.item(), Mapping | np.ndarray):
+        yield from _columns(array.item(), name)
+    elif array.ndim == 1:
+        yield name, array
+    elif array.ndim == 2 and min(array.shape) <= _WIDEST:
+        across = array.T if array.shape[0] >= array.shape[1] else array
+        yield from ((f"{name}[{i}]", column) for i, column in enumerate(across))
 
 
 def read_numpy(path: Path) -> Log:
@@ -78,19 +57,12 @@ def read_numpy(path: Path) -> Log:
         file = np.load(raw)
         if isinstance(file, np.ndarray):
             return arrays_log(path, {"": file})
-        with file:
-            return arrays_log(
-                path, {name: file[name] for name in file.files if _is_readable(file, name)}
-            )
-
-
-def _is_readable(file: Any, name: str) -> bool:
-    """Return whether an array of a `.npz` file can be read without running its code."""
-    try:
-        file[name]
-    except ValueError:
-        return False
-    return True
+        arrays = {}
+        for name in file.files:
+            # An array of objects may run code: it is left out.
+            with contextlib.suppress(ValueError):
+                arrays[name] = file[name]
+        return arrays_log(path, arrays)
 
 
 def read_mat(path: Path) -> Log:
