@@ -329,20 +329,24 @@ def _run_demo(options: argparse.Namespace) -> int:
 
 def _columns(
     path: str, log: Log, options: argparse.Namespace
-) -> tuple[list[spec.Channel], str, float | None]:
-    """Return the sensors of a log, the column of its times, and the rate of its readings if that
-    column counts them: the sensors of `--sensor`, else one gyro, which `--unit`, `--noise` and
-    `--limit` describe; raise `LogError` for both together, or one that is not positive.
+) -> tuple[list[spec.Channel], dict[str, Any]]:
+    """Return the sensors of a log, and the column of its times, their unit, and the rate of its
+    readings if that column counts them.
+
+    The sensors are those of `--sensor`, else one gyro, which `--unit`, `--noise` and `--limit`
+    describe; **raises** `LogError` for both together, or one that is not positive.
     """
     time, *rates = options.columns or ("", "", "", "")
     time, rate = options.time or time, options.rate
+    unit, time_unit = options.unit, options.time_unit
     if not options.columns and not options.sensor:
         found = imu_columns(path, log, rate, time)
         (first, *rates), rate = found.columns, found.rate
         time = time or first
         if found.columns != USUAL.columns:
             _print_line(f"{path}: times {time or 'by the rate'}, rates {', '.join(rates)}")
-            if not (found.unit or options.unit):
+            unit, time_unit = unit or found.unit, time_unit or found.time_unit
+            if not unit:
                 warn(f"{path}: no unit of the rates is said: read in rad/s; or give --unit deg/s")
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
@@ -359,10 +363,10 @@ def _columns(
         noise = None if options.noise is None else spec.noise_of_axes(options.noise, "--noise")
         if options.limit is not None and not options.limit > 0:
             raise LogError(f"--limit: wanted a positive number, got {options.limit}")
-        channels = [spec.Channel("gyro", tuple(rates), options.unit, noise, options.limit)]
+        channels = [spec.Channel("gyro", tuple(rates), unit, noise, options.limit)]
     units = [spec.unit_of_channel(path, log, one) for one in channels]
     channels = [dataclasses.replace(c, unit=u) for c, u in zip(channels, units, strict=True)]
-    return channels, time, rate
+    return channels, dict(time=time, rate=rate, time_unit=time_unit)
 
 
 def _read_logs(
@@ -402,13 +406,15 @@ def _read_logs(
     records, of_first = [], None
     for path in options.logs:
         log = open_log(Path(path), options.flight)
-        channels, time, rate = _columns(path, log, options)
-        how |= dict(time=time, rate=rate, time_unit=options.time_unit, log=log)
-        records.append(spec.read_log(path, channels, **how))
-        said = [("time", time, TIME_UNITS), *((c.kind, c.columns[0], (c.unit,)) for c in channels)]
+        channels, times = _columns(path, log, options)
+        records.append(spec.read_log(path, channels, log=log, **times, **how))
+        said = [
+            ("time", times["time"], TIME_UNITS),
+            *((c.kind, c.columns[0], (c.unit,)) for c in channels),
+        ]
         units = [(what, unit_in_name(name, allowed)) for what, name, allowed in said]
         words = [f"{what} in {unit}" for what, unit in units if unit]
-        if words and not rate:
+        if words and not times["rate"]:
             _print_line(f"{path}: {', '.join(words)}, as the names of its columns say")
         of_first = of_first or channels
     how = dict(typical_moment=options.typical, wheels=wheels, free=options.free, loss=options.loss)

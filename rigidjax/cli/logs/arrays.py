@@ -21,7 +21,7 @@ def arrays_log(path: Path, arrays: Mapping[str, Any]) -> Log:
     """
     columns = dict(_columns(arrays))
     if not columns:
-        raise LogError(f"{path}: holds no columns of numbers")
+        raise LogError(f"{path}: no columns of numbers; save arrays, not objects, or export CSV")
     dates = {name: "s" for name, column in columns.items() if column.dtype.kind in "mM"}
     return Log(list(columns), lambda names: {name: columns[name] for name in names}, dates)
 
@@ -67,10 +67,15 @@ def read_numpy(path: Path) -> Log:
 
 def read_mat(path: Path) -> Log:
     """Return the log of a `.mat` file (MATLAB up to v7)."""
-    from scipy.io import loadmat
+    from scipy.io import loadmat, whosmat
 
+    arrays = {}
     with path.open("rb") as raw:
-        return arrays_log(path, loadmat(raw, simplify_cells=True))
+        for name, *_ in whosmat(raw):
+            # Objects, such as timetables, which SciPy may not read, stand beside arrays.
+            with contextlib.suppress(Exception):
+                arrays |= loadmat(raw, variable_names=[name], simplify_cells=True)
+    return arrays_log(path, arrays)
 
 
 def read_hdf5(path: Path) -> Log:

@@ -36,6 +36,8 @@ _COUNTERS = frozenset("frame packetcounter counter sample samples index row".spl
 _GYRO = re.compile(r"gyr|angular_?vel|rotation_?rate|omega|ω|^w\W*$|[. _]w\W*$", re.IGNORECASE)
 # What else belongs to a gyro, but is not its rates.
 _NO_RATES = re.compile(r"cov|bias|offset|deriv|fifo|temp|std|var|noise|clip", re.IGNORECASE)
+# The units of rates and times in tables exported from Blackbox and PX4, and of the usual names.
+_UNITS = {"gyroADC": ("deg/s", "us"), "gyro_rad": ("rad/s", "us"), "wx": ("rad/s", None)}
 _SECOND_CHOICE = re.compile(r"raw|unfilt|uncal|#\d", re.IGNORECASE)
 
 
@@ -66,11 +68,11 @@ def imu_columns(
     names = found[0][-1]
     if not time:
         time, rate = time_column(path, log, names[0], rate)
-    unit = _unit(log, names[0], RATE_UNITS)
-    if unit is None and (names[0].endswith("wx") or time.endswith("seconds_elapsed")):
-        # The usual names, and those of a logger of phones.
-        unit = "rad/s"
-    return ImuColumns((time, *names), unit, _unit(log, time, TIME_UNITS), rate)
+    unit, time_unit = _unit(log, names[0], RATE_UNITS), _unit(log, time, TIME_UNITS)
+    usual = next((units for word, units in _UNITS.items() if word in names[0]), (None, None))
+    if time.endswith("seconds_elapsed"):
+        usual = ("rad/s", "s")
+    return ImuColumns((time, *names), unit or usual[0], time_unit or usual[1], rate)
 
 
 def _unit(log: Log, name: str, allowed: Sequence[str]) -> str | None:

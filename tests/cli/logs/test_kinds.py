@@ -84,6 +84,8 @@ TEXTS = {
     "OpenSim": ("imu\nnRows=60\nnColumns=4\nendheader\ntime\tgyro_x\tgyro_y\tgyro_z\n" + rows(T, *W.T, sep="\t"), "--unit rad/s"),
     "rostopic": ("%time,field.header.seq,field.angular_velocity.x,field.angular_velocity.y,field.angular_velocity.z\n" + rows(NS, N, *W.T), "--unit rad/s"),
     "blackbox_decode": ("loopIteration, time (us), axisP[0], gyroADC[0], gyroADC[1], gyroADC[2]\n" + rows(N, 1000 * MS, N, *DEG.T, sep=", "), "--unit deg/s"),
+    "an export of Blackbox": ('"Product","Blackbox"\n"loopIteration","time","gyroADC[0]","gyroADC[1]","gyroADC[2]"\n' + rows(N, 1000 * MS, *DEG.T), ""),
+    "ulog2csv": ("timestamp,gyro_rad[0],gyro_rad[1],gyro_rad[2],gyro_integral_dt\n" + rows(1000 * MS + 5, *W.T, N), ""),
     "records of JSON": (json.dumps([dict(t=t, gyro=dict(zip("xyz", w, strict=True))) for t, w in zip(T.tolist(), W.tolist(), strict=True)]), "--unit rad/s"),
     "lists of JSON": (json.dumps(dict(t=T.tolist(), gyro=W.tolist())), "--unit rad/s"),
     "lines of JSON": ("".join(json.dumps(dict(sensor="Gyroscope", time=t, **dict(zip("xyz", map(str, w), strict=True)))) + "\n" for t, w in zip(T.tolist(), W.tolist(), strict=True)), "--unit rad/s"),
