@@ -290,7 +290,7 @@ _FORMATS: Sequence[tuple[bytes, Callable[[Path], Log] | None, str]] = (
         None,
         "a pickle, which may run code; save its columns with to_csv or numpy.savez",
     ),
-    (rb"[\x02-\x0a]\x50", None, "a C3D file; export its motion as CSV or TSV"),
+    (rb"[\x02-\x08]\x50", None, "a C3D file; export its motion as CSV or TSV"),
     (
         rb"\x00[\x00-\x0f].{6}[\xfd\xfe]",
         None,
