@@ -67,15 +67,13 @@ def read_numpy(path: Path) -> Log:
 
 def read_mat(path: Path) -> Log:
     """Return the log of a `.mat` file (MATLAB up to v7)."""
-    from scipy.io import loadmat, whosmat
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatlabOpaque
 
-    arrays = {}
     with path.open("rb") as raw:
-        for name, *_ in whosmat(raw):
-            # Objects, such as timetables, which SciPy may not read, stand beside arrays.
-            with contextlib.suppress(Exception):
-                arrays |= loadmat(raw, variable_names=[name], simplify_cells=True)
-    return arrays_log(path, arrays)
+        found = loadmat(raw, simplify_cells=True)
+    # Objects, such as timetables, may stand beside arrays: SciPy cannot read them.
+    return arrays_log(path, {k: v for k, v in found.items() if not isinstance(v, MatlabOpaque)})
 
 
 def read_hdf5(path: Path) -> Log:

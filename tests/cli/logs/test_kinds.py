@@ -226,6 +226,26 @@ def test_arrays(name, tmp_path):
     check(tmp_path / name, "--unit rad/s")
 
 
+def test_arrays_beside_an_object_of_matlab(tmp_path):
+    """A timetable: its element names a class and holds a matrix of references."""
+
+    def element(kind, data):
+        return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
+
+    path = tmp_path / "log.mat"
+    scipy.io.savemat(path, {"x": np.arange(6, dtype=np.uint32)[:, None]})
+    parts = element(6, struct.pack("<II", 17, 0))
+    parts += element(1, b"tt") + element(1, b"MCOS") + element(1, b"timetable")
+    made = element(14, parts + path.read_bytes()[128:])
+    scipy.io.savemat(path, {"t": T, "gyro": W})
+    head, arrays = path.read_bytes()[:128], path.read_bytes()[128:]
+    path.write_bytes(head + made + arrays)
+    check(path, "--unit rad/s")
+    path.write_bytes(head + made)
+    with pytest.raises(LogError, match="save arrays, not objects"):
+        read(path, "")
+
+
 def test_hdf5_and_matlabs_new_format(tmp_path):
     path = tmp_path / "log.mat"
     for size in (0, 512):
