@@ -99,6 +99,21 @@ def fit():
     save(figure, "fit.png")
 
 
+def swing():
+    """Draw the fit of the guide's page on swings."""
+    friction = rj.suspensions.Friction(4e-3)
+    law = rj.suspensions.Axle([0, 1, 0], [0, 0, 0.25], friction=friction)
+    club, gyro = rj.shapes.box(0.8, [0.05, 0.1, 0.5]), identify.Gyro(0.2)
+    t, start = jnp.linspace(0.0, 20.0, 801), rj.Turn(0.7, 0.0)
+    log = identify.simulate_readings(gyro, club, start, t, law, key=jax.random.key(0))
+    drag = identify.Free(lambda s: s.torque.friction.viscous, "friction", scale=1e-3)
+    chart = identify.Moment(rj.shapes.box(0.8, [0.1, 0.1, 0.3]), law)
+    record = identify.Recording(t, (gyro, log))
+    figure = rj.plot.fit(identify.fit(identify.Model(record, chart, torque=law, free=[drag])))
+    figure.set_size_inches(8.4, 4.8)
+    save(figure, "swing.png")
+
+
 def predict():
     """Draw the prediction of the guide's page on predictions, from the same readings."""
     truth, first = rj.Inertia.from_principal(1.0, 1.6, 2.2), rj.Spin([1.0, 0.5, 1.2])
@@ -197,5 +212,5 @@ def workprecision():
 
 
 if __name__ == "__main__":
-    for draw in (frames, flip, start, fit, predict, simulators, workprecision):
+    for draw in (frames, flip, start, fit, swing, predict, simulators, workprecision):
         draw()

@@ -1,5 +1,5 @@
 """Run the command `python -m rigidjax`, which identifies a body from logs, gives a moment of
-inertia from a period, or compares methods.
+inertia from a swing, or compares methods.
 """
 
 import _thread

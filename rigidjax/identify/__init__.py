@@ -53,6 +53,7 @@ from rigidjax.identify.model.charts import (
 )
 from rigidjax.identify.model.free import Free as Free
 from rigidjax.identify.model.model import Model as Model, Unpacked as Unpacked
+from rigidjax.identify.model.moment import Moment as Moment
 from rigidjax.identify.model.predict import (
     Adaptive as Adaptive,
     FixedSteps as FixedSteps,
@@ -87,13 +88,13 @@ from rigidjax.identify.sensors import (
 __all__ = [
     "AbstractBodyChart", "AbstractLoss", "AbstractSensor", "Accelerometer", "Adaptive",
     "AttitudeSensor", "Candidates", "Descent", "Direction", "Entropic", "Fit", "FixedSteps",
-    "ForceTorque", "Free", "Gyro", "Huber", "Known", "LogDensity", "Magnetometer", "Marker",
-    "Mass", "Measured", "Model", "Nuts", "Position", "Posterior", "Principal",
-    "PrincipalRatios", "Range", "Ratios", "Recording", "Refit", "Scene", "Selection",
-    "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity", "Walk", "Windows",
-    "compare", "descend", "expected_quantities", "filter", "first_belief", "fisher", "fit",
-    "log_likelihood", "posterior", "predict_windows", "read_table", "refit", "report", "sample",
-    "select", "simulate_readings", "smooth", "step", "usual_terms", "windows",
+    "ForceTorque", "Free", "Gyro", "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass",
+    "Measured", "Model", "Moment", "Nuts", "Position", "Posterior", "Principal", "PrincipalRatios",
+    "Range", "Ratios", "Recording", "Refit", "Scene", "Selection", "SensorInput", "SoftL1",
+    "Tensor", "Tolerance", "Unpacked", "Velocity", "Walk", "Windows", "compare", "descend",
+    "expected_quantities", "filter", "first_belief", "fisher", "fit", "log_likelihood", "posterior",
+    "predict_windows", "read_table", "refit", "report", "sample", "select", "simulate_readings",
+    "smooth", "step", "usual_terms", "windows",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

@@ -148,6 +148,10 @@ class AbstractSuspension(eqx.Module):
         return kinetic + self.potential(body, turn.angle)
 
 
+# What acts on a body in a recording: a torque, or of a `Turn` its suspension.
+Law = base.Torque | AbstractSuspension
+
+
 class TurnEquations(eqx.Module):
     """Evaluate the equation of motion of a body about one axis as a vector field `f(t, y, args)` of
     a `Turn`.

@@ -36,5 +36,10 @@ for name, suspension in {"Axle": axle, "Strings": strings, "TorsionBar": bar}.it
         ),
         run=rj.suspensions.period,
     )
+row(
+    "identify.Moment",
+    lambda: dict(guess=s.body(), suspension=axle()),
+    groups=("stranger", "shape", "nan"),
+)
 leave_out("abstract: made by subclassing", "motion.AbstractSuspension")
 leave_out("made by a suspension's swing", "suspensions.Swing", "suspensions.Twist")

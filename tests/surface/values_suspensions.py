@@ -7,7 +7,7 @@ from surface import values as v
 from surface.values import between, leave_out, scale, way
 
 import rigidjax as rj
-from rigidjax import suspensions as hung
+from rigidjax import identify, suspensions as hung
 
 
 def matter(m, c, s):
@@ -111,6 +111,28 @@ way(
     ),
     (v.inertia, v.ordinary, scale(-1, 1), ANGLE, ANGLE, between(0.0, 3.0)), on_bar, norm=True,
     ulps=16,
+)  # fmt: skip
+
+
+def moment_chart(m, c, s, axis, point, x):
+    unit = axis / v.norm(axis)
+    arm = np.cross(unit, c - point)
+    own, far = v.dot(unit, inertia(s) @ unit), m * v.dot(arm, arm)
+    log = mp.log(2 * own + far)
+    factor = (mp.exp(x[0]) * (own + far) - far) / own
+    return factor * s, np.array([log]), np.array([log - mp.log(own + far)])
+
+
+way(
+    "identify.Moment identify.Moment.body identify.Moment.logs identify.Moment.vector",
+    lambda m, c, s, axis, point, x: (
+        (chart := identify.Moment(matter(m, c, s), hung.Axle(axis, point))).body(x).second_moment,
+        chart.logs(other := matter(m, c, 2 * s)), chart.vector(other),
+    ),
+    (
+        scale(-1, 1), v.ordinary, lambda rng, i: v.second_moment(rng, 0), v.ordinary, v.ordinary,
+        between(-1, 1, 1),
+    ), moment_chart, norm=True, ulps=32,
 )  # fmt: skip
 
 leave_out(

@@ -29,7 +29,7 @@ from rigidjax.identify.sensors import AbstractSensor, Gyro
 from rigidjax.identify.sensors.base import extras
 from rigidjax.identify.uncertainty.considered import slope_in_time
 from rigidjax.identify.uncertainty.covariance import Linearisation
-from rigidjax.motion.torques.base import Torque
+from rigidjax.motion.suspension import Law
 
 # A correction of the recorded body rates is believed if two conditions hold. The error of the
 # corrected rates, which is their difference from the rates between attitudes or the residual of
@@ -62,7 +62,7 @@ ATTITUDES = {
 }
 
 
-def cause_by_misread_file(recordings: Sequence[Recording], torque: Torque | None) -> Cause | None:
+def cause_by_misread_file(recordings: Sequence[Recording], torque: Law | None) -> Cause | None:
     """Return the likely mistake with which the gyro or the attitudes of one body were read.
 
     The correction of each possible mistake is tried on the recordings. The rates of the gyro are
@@ -125,7 +125,7 @@ class _EulerResidual(NamedTuple):
 
 def _euler_residual(
     recordings: Sequence[Recording],
-    torque: Torque | None,
+    torque: Law | None,
     correction: Float[np.ndarray, "3 3"],
     sign: float = 1.0,
 ) -> _EulerResidual:

@@ -20,7 +20,7 @@ from rigidjax.identify.answer.assess import assess
 from rigidjax.identify.answer.held_out import choose_part, with_body, with_held_out
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
-from rigidjax.identify.data.reference_states import rates, require_turning
+from rigidjax.identify.data.reference_states import rates, require_no_swing, require_turning
 from rigidjax.identify.model.model import Model, all_errors, checked_x
 from rigidjax.identify.model.predict import AbstractIntegrator, Adaptive
 from rigidjax.identify.search.checkpoint import (
@@ -164,12 +164,15 @@ def fit(
         return dataclasses.replace(result, place=_ON_CPU)
     if model.index.bodies:
         recordings = [
-            recording
+            (one.torque, recording)
             for one in stacking.kinds_of(model)
             for recording in stacking.on_host(one.records, one.counts)
         ]
-        for number, recording in enumerate(recordings, 1):
-            require_turning(rates(recording)[1], f"fit: the rates of recording {number}")
+        for number, (torque, recording) in enumerate(recordings, 1):
+            named = rates(recording).values, f"fit: the rates of recording {number}"
+            require_turning(*named)
+            if torque is None:
+                require_no_swing(*named)
     padded = stacking.pad_to_few(model)
     part = choose_part(padded, held_out)
     if before is not None:

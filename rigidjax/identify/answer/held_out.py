@@ -127,7 +127,7 @@ def with_body(model: Model, x: Float[Array, " n"], body: Any) -> tuple[Model, Ar
         raise ValueError(f"before: wanted a body for each of {names}, got {list(bodies)}")
     charts = tuple(Known(bodies[name]) for name in names)
     places = body_places(charts, model.body_indices, model.count)
-    index, slots = build_index(places, model.slots, model.index.start.shape[1] // 3)
+    index, slots = build_index(places, model.slots, model.index.start.shape[1])
     parts: Any = dict(charts=charts, index=index, slots=slots, prior=None)
     return dataclasses.replace(model, **parts), x[model.index.bodies :]
 

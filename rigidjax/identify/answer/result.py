@@ -409,7 +409,7 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
         low, high = bounds[quantity.name]
         scale, unit = _show.shown_unit(quantity.unit, rate_unit)
         name = quantity.name
-        if name.startswith("Ω"):
+        if name.startswith("Ω") or name.split(" [")[0] in ("angle", "rate"):
             axis, *where = name.split(" ", 1)
             name = " ".join([axis, "at the start", *where])
         out.append((name, quantity.value * scale, low * scale, high * scale, unit))

@@ -30,7 +30,7 @@ from rigidjax.identify.uncertainty.quantities import (
     quantity_vector,
     recording_suffixes,
     reports_starts,
-    starting_suffixes,
+    starting_labels,
 )
 from rigidjax.motion.manifold import minus, parts_by_name
 from rigidjax.rotation import quaternion
@@ -380,9 +380,10 @@ def describe_identifiability(
             determined, float(student_quantile(0.95, uncertainty.degrees_of_freedom(limit.slope)))
         )
     ]
-    if count := len(starting_suffixes(point.model)):
-        # Each recording has three components of its initial body rate.
-        rates = quantities[first : first + 3 * count]
+    starts = quantities[first : first + len(starting_labels(point.model))]
+    # A free body has three components of its initial body rate.
+    rates = [quantity for quantity in starts if quantity.name.startswith("Ω")]
+    if count := len(rates) // 3:
         size = np.array([(q.value, _half_width(q)) for q in rates]).reshape(-1, 3, 2)
         if not (size[..., 1].max(axis=1) < np.linalg.norm(size[..., 0], axis=1)).all():
             many = "rate is" if count == 1 else "rates are"

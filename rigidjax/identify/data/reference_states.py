@@ -25,7 +25,7 @@ from rigidjax.identify.sensors import (
     Velocity,
 )
 from rigidjax.identify.sensors.base import extras
-from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin, Turn
 from rigidjax.motion.manifold import leaf_names, plus
 from rigidjax.rotation import quaternion, so3
 from rigidjax.rotation.fitting import nearest_rotation
@@ -115,6 +115,31 @@ def require_turning(rates: np.ndarray, name: str) -> None:
         )
 
 
+def require_no_swing(rates: np.ndarray, name: str) -> None:
+    """Raise `ValueError` if the body `rates`, rad/s, go there and back about one axis, as those of
+    a free body never do.
+    """
+    if len(rates) < 10:
+        return
+    axis = np.linalg.eigh(rates.T @ rates)[1][:, -1]
+    along = rates @ axis
+    across = np.linalg.norm(rates - along[:, None] * axis, axis=1)
+    size = np.sqrt(np.mean(along**2))
+    turning = np.abs(along) < 0.2 * size
+    still = (
+        turning.any() and max(np.mean(across[turning] ** 2), np.mean(across**2)) < 0.04 * size**2
+    )
+    if along.min() < -0.3 * size and along.max() > 0.3 * size and still:
+        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+        raise ValueError(
+            f"{name} are those of a swing, there and back about one axis, "
+            f"[{', '.join(f'{part:.3g}' for part in axis)}]: no free body turns so, and all that "
+            "they show is the moment about this axis, if what brings the body back is known. Say "
+            "what it is: Model(recording, Moment(guess, law), torque=law) with an Axle, TorsionBar "
+            "or Strings of rigidjax.suspensions as the law; or run python -m rigidjax swing --log"
+        )
+
+
 def mean_rates(t: Float[np.ndarray, " n"], q: Float[np.ndarray | Array, "n 4"]) -> Samples:
     """Return the mean body rates, rad/s, between attitudes that differ by a turn of about 0.3 rad.
 
@@ -145,7 +170,7 @@ def _turns(first: Float[ArrayLike, "n 4"], last: Float[ArrayLike, "n 4"]) -> Flo
 class ReferenceStates(eqx.Module):
     """Hold the reference state of each recording: its initial state is a change of this state."""
 
-    # A `Spin`, `Attitude` or `Rigid`.
+    # A `Spin`, `Attitude`, `Rigid` or `Turn`.
     state: PyTree
     # The typical body rate, rad/s.
     rate: Float[Array, "*records"]
@@ -165,9 +190,12 @@ def references(recordings: Sequence[Recording], state_type: type) -> ReferenceSt
     # Use arrays: with Python floats a program would be compiled for each recording.
     x, v, length = (jnp.asarray(np.stack(part), dtype) for part in zip(*places, strict=True))
     q, still = jnp.asarray(np.stack(turns), dtype), jnp.zeros_like(x)
-    states = {Spin: Spin(still), Attitude: Attitude(q, still), Rigid: Rigid(x, v, q, still)}
     typical = jnp.asarray([_typical_rate(r) for r in recordings], dtype)
-    sizes = {"x": length, "v": length * typical, "q": jnp.ones_like(typical), "omega": typical}
+    zero, one = jnp.zeros_like(typical), jnp.ones_like(typical)
+    if state_type is Turn:
+        return ReferenceStates(Turn(zero, zero), typical, jnp.stack([one, typical], -1))
+    states = {Spin: Spin(still), Attitude: Attitude(q, still), Rigid: Rigid(x, v, q, still)}
+    sizes = {"x": length, "v": length * typical, "q": one, "omega": typical}
     state = states[state_type]
     units = [sizes[name] for name in leaf_names(state)]
     return ReferenceStates(state, typical, jnp.repeat(jnp.stack(units, -1), 3, -1))

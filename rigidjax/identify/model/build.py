@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,10 +32,11 @@ from rigidjax.identify.model.priors import AbstractLoss, Entropic
 from rigidjax.identify.model.scene import Scene, require_known_torque, require_unknown_torque
 from rigidjax.identify.model.walks import find_drifts
 from rigidjax.identify.sensors import AbstractSensor
-from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin, Turn
 from rigidjax.motion.manifold import dimension
+from rigidjax.motion.suspension import AbstractSuspension, Law
 from rigidjax.motion.torques import Carried
-from rigidjax.motion.torques.base import AbstractForce, Torque, require_torque
+from rigidjax.motion.torques.base import AbstractForce, require_torque
 from rigidjax.motion.torques.composite import parts_of
 from rigidjax.motion.torques.inputs import input_names_of
 
@@ -59,7 +61,13 @@ def fields_of_model(
     for name, kind in kinds.items():
         if parts[name] is not None:
             _checks.require_instance(parts[name], kind, name)
-    if torque is not None:
+    if isinstance(torque, AbstractSuspension):
+        if process is not None or parts["walks"]:
+            raise ValueError(
+                "process, walks: wanted none for a body on a suspension, which a filter does not "
+                "follow; give the suspension friction, or a torque"
+            )
+    elif torque is not None:
         require_torque(torque)
         require_known_torque(torque)
     if process is not None:
@@ -79,13 +87,15 @@ def fields_of_model(
         apart = tuple(range(len(names))) if apart else ("",) * len(names)
     scene = Scene(None, torque, process, data.sensors, None)
     walks, slots = find_drifts(parts["walks"], scene), find_slots(free, scene, names)
-    taken = {"Ωx", "Ωy", "Ωz"}.union(*((*one.log_names, *one.plain_names) for one in charts))
+    taken = {"Ωx", "Ωy", "Ωz", "angle", "rate"}.union(
+        *((*one.log_names, *one.plain_names) for one in charts)
+    )
     for slot in slots:
         if slot.name in taken:
             words = "a quantity of the body has this name; give another"
             raise ValueError(f"Free {slot.name!r}: {words}")
     bodies = body_places(charts, indices, len(names))
-    index, slots = build_index(bodies, slots, data.vectors_in_state)
+    index, slots = build_index(bodies, slots, data.start_size)
     # A model without a random torque or drift needs no Kalman filter, and not the number of the
     # filter's steps. The number would only force a new compilation for a recording whose longest
     # interval between times is longer or shorter.
@@ -123,7 +133,7 @@ def extended(model: Any, slots: Sequence[Slot]) -> Extended:
     They come before the parameters of one recording alone, which get other indices.
     """
     bodies = body_places(model.charts, model.body_indices, model.count)
-    index, placed = build_index(bodies, [*model.slots, *slots], model.index.start.shape[1] // 3)
+    index, placed = build_index(bodies, [*model.slots, *slots], model.index.start.shape[1])
     places = np.arange(model.size)
     places[np.asarray(model.index.start)] = np.asarray(index.start)
     for old, new in zip(model.slots, placed, strict=False):
@@ -199,8 +209,8 @@ class _Data(NamedTuple):
     state_kind: type
     # The parameters of an initial state are changes of the reference state.
     reference: ReferenceStates
-    # The number of three-vectors of a free initial state, 0 if the initial state is known.
-    vectors_in_state: int
+    # The number of parameters of an initial state, 0 if the initial state is known.
+    start_size: int
     integrator: AbstractIntegrator | None
     # For windows whose initial states have a prior about the measured states: one over the standard
     # deviation of each parameter of an initial state.
@@ -210,7 +220,7 @@ class _Data(NamedTuple):
 
 
 def _recorded_data(
-    recordings: list[Any], charts: Charts, torque: Torque | None, integrator: Any, **_: Any
+    recordings: list[Any], charts: Charts, torque: Law | None, integrator: Any, **_: Any
 ) -> _Data:
     """Return those fields of a `Model` that come from recordings, after checks."""
     if not recordings:
@@ -256,20 +266,21 @@ def _recorded_data(
     with jax.ensure_compile_time_eval():
         reference = references(recordings, state_kind)
     carried = isinstance(torque, Carried)
+    solved = isinstance(torque, AbstractSuspension) and torque.closed_form
     if _sampled_inputs(torque, recordings[0]):
         integrator = _held_steps(integrator)
-    elif integrator is None and torque is not None and not carried:
+    elif integrator is None and torque is not None and not (carried or solved):
         widest = max(float(np.diff(r.t).max()) for r in recordings)
         integrator = integrator_for(1.5 * widest * float(np.max(np.asarray(reference.rate))))
-    vectors = 0 if carried else dimension(stacking.pick(reference.state, 0)) // 3
-    return _Data(records, counts, sensors, state_kind, reference, vectors, integrator)
+    size = 0 if carried else dimension(stacking.pick(reference.state, 0))
+    return _Data(records, counts, sensors, state_kind, reference, size, integrator)
 
 
 def _windowed_data(
     windows: Windows,
     charts: Charts,
     stretches: int,
-    torque: Torque | None,
+    torque: Law | None,
     process: Any,
     integrator: Any,
     **_: Any,
@@ -292,9 +303,9 @@ def _windowed_data(
             "of windows"
         )
     counts = np.full(windows.count, windows.length + 1, np.int32)
-    vectors = 0 if weight is None else dimension(stacking.pick(reference.state, 0)) // 3
+    size = 0 if weight is None else dimension(stacking.pick(reference.state, 0))
     held = _held_steps(integrator)
-    return _Data(records, counts, sensors, state_kind, reference, vectors, held, weight, clusters)
+    return _Data(records, counts, sensors, state_kind, reference, size, held, weight, clusters)
 
 
 def _held_steps(integrator: AbstractIntegrator | None) -> HeldSteps:
@@ -323,7 +334,7 @@ def interval_steps(records: Recording, reference: ReferenceStates) -> int:
     return math.ceil(steps) if 1.0 < steps < math.inf else 1
 
 
-def require_inputs(torque: Torque | None, windows: Windows) -> None:
+def require_inputs(torque: Law | None, windows: Windows) -> None:
     """Raise `ValueError` if `windows` lack an input of the `torque`, or samples for its delays."""
     missing = [name for name in input_names_of(torque) if name not in windows.inputs]
     if missing:
@@ -337,12 +348,12 @@ def require_inputs(torque: Torque | None, windows: Windows) -> None:
         raise ValueError("; ".join(wrong))
 
 
-def _sampled_inputs(torque: Torque | None, recording: Recording) -> list[str]:
+def _sampled_inputs(torque: Law | None, recording: Recording) -> list[str]:
     """Return the names of the inputs that the `torque` reads as samples, not as functions."""
     return [name for name in input_names_of(torque) if not callable(recording.inputs[name])]
 
 
-def _state_type(sensors: Sequence[AbstractSensor], torque: Torque | None, charts: Charts) -> type:
+def _state_type(sensors: Sequence[AbstractSensor], torque: Law | None, charts: Charts) -> type:
     """Return the smallest type of state that the sensors and the torque need.
 
     `ValueError` is raised if that is `Rigid`, whose equations of motion need the mass, and a chart
@@ -352,7 +363,8 @@ def _state_type(sensors: Sequence[AbstractSensor], torque: Torque | None, charts
     if torque is not None:
         needed.append(getattr(torque, "feels", HasAttitude))
     movers = [type(sensor).__name__ for sensor in sensors if sensor.feels is HasPose]
-    movers += [type(part).__name__ for part in parts_of(torque) if isinstance(part, AbstractForce)]
+    forces = None if isinstance(torque, AbstractSuspension) else torque
+    movers += [type(part).__name__ for part in parts_of(forces) if isinstance(part, AbstractForce)]
     if HasPose in needed or movers:
         for chart in charts:
             if not has_mass(chart):
@@ -363,5 +375,12 @@ def _state_type(sensors: Sequence[AbstractSensor], torque: Torque | None, charts
                     f"{type(chart).__name__}. Without forces take Mass(guess, ['inertia']), or "
                     f"['inertia', 'com']: the motion shows no mass{pivot}"
                 )
+    if isinstance(torque, AbstractSuspension):
+        for chart in charts:
+            eqx.filter_eval_shape(
+                lambda one: torque.require_body(one.body(jnp.zeros(one.size))), chart
+            )
+        return Turn
+    if HasPose in needed or movers:
         return Rigid
     return Attitude if HasAttitude in needed else Spin

@@ -60,12 +60,12 @@ class Placed(NamedTuple):
 def build_index(
     body_places: Int[np.ndarray, "records k"],
     slots: Sequence[Slot],
-    vectors_in_state: int,
+    start_size: int,
 ) -> Placed:
     """Return the index of a model, and its `slots` with their places in x.
 
-    `body_places` is −1 where a body has fewer than k parameters. `vectors_in_state` is the number
-    of three-vectors in an initial state, such as 2 for attitude and rate.
+    `body_places` is −1 where a body has fewer than k parameters. `start_size` is the number of
+    parameters of an initial state, such as 6 for attitude and rate, or 2 for angle and rate.
     """
     count, body_number_count = len(body_places), int(body_places.max(initial=-1)) + 1
     end = body_number_count
@@ -78,9 +78,9 @@ def build_index(
 
     shared = [None if s.each else take_places(max(len(s.labels), 1), *s.shape) for s in slots]
     first_alone = end
-    start = np.concatenate(
-        [np.zeros((count, 0), int), *(take_places(count, 3) for _ in range(vectors_in_state))], 1
-    )
+    # Three-vectors, or an angle and its rate.
+    widths = (3,) * (start_size // 3) or (start_size,)
+    start = np.concatenate([take_places(count, width) for width in widths], 1)
     own = [take_places(count, *s.shape) if s.each or s.spread is not None else None for s in slots]
     blocks, twice, columns, column = [body_places], [], [], body_places.shape[1]
     placed = []

@@ -41,8 +41,9 @@ from rigidjax.identify.model.priors import AbstractLoss, Entropic, Measured
 from rigidjax.identify.model.scene import Process, Scene
 from rigidjax.identify.model.several import Part, fields_of_several
 from rigidjax.identify.model.walks import Drift, Walk
+from rigidjax.motion import Turn
 from rigidjax.motion.coupled import motion_of
-from rigidjax.motion.torques.base import Torque
+from rigidjax.motion.suspension import Law
 from rigidjax.motion.torques.inputs import Input, bind, delays_of
 from rigidjax.rotation.barrier import match_batch_axes, platform
 
@@ -99,11 +100,13 @@ class Model(eqx.Module):
       they have in common.
     - `chart`: the chart of the body: `Ratios()` (the full tensor up to scale), `PrincipalRatios()`
       (if the body axes are known to be principal), `Tensor()` or `Principal()` (the full or the
-      principal tensor with its scale), `Mass(guess)` (all ten numbers), or `Known(body)`. For
-      several bodies give recordings and charts by the names of the bodies, as in `Model({"proof":
-      [a, b], "box": [c]}, {"proof": Known(body), "box": Tensor(1e-3)})`.
+      principal tensor with its scale), `Mass(guess)` (all ten numbers), `Moment(guess, suspension)`
+      (the moment about one axis), or `Known(body)`. For several bodies give recordings and charts
+      by the names of the bodies, as in `Model({"proof": [a, b], "box": [c]}, {"proof": Known(body),
+      "box": Tensor(1e-3)})`.
     - `torque`: the torque on the body in every recording, or `None`. It reads the inputs of a
-      recording by name: `rigidjax.torques.Input("speed")`.
+      recording by name: `rigidjax.torques.Input("speed")`. Of a body on one axis it is a suspension
+      (`rigidjax.suspensions`).
     - `process`: an unknown torque as noise, a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of
       such torques. `filter`, `smooth` and `LogDensity` integrate over this torque; `fit` sets it to
       its mean, zero.
@@ -134,7 +137,8 @@ class Model(eqx.Module):
 
     The motion starts at the first time of each recording. The state of the motion is the smallest
     type of state that sensors and torque need: a `Spin` (body rate), an `Attitude` (attitude and
-    rate), or a `Rigid` (with position and velocity as well). **Raises:** `TypeError` for arguments
+    rate), or a `Rigid` (with position and velocity as well); on a suspension a `Turn` (angle and
+    rate). **Raises:** `TypeError` for arguments
     of another type; `ValueError` if they do not fit together.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -171,7 +175,7 @@ class Model(eqx.Module):
         recording: Recording | Sequence[Recording] | Mapping[str, Any] | Windows | None = None,
         chart: AbstractBodyChart | Mapping[str, AbstractBodyChart] | None = None,
         *,
-        torque: Torque | None = None,
+        torque: Law | None = None,
         process: Process | None = None,
         walks: Walk | Sequence[Walk] | tuple[Drift, ...] = (),
         free: Sequence[Free] = (),
@@ -288,6 +292,8 @@ class Model(eqx.Module):
         xp: Any = np if _checks.is_known((vector, rates, self.reference.rate)) else jnp
         spin = xp.asarray(rates) / xp.asarray(self.reference.rate)[:, None]
         spin = xp.broadcast_to(spin, (self.count, 3)).astype(kind)
+        if self.state_kind is Turn:
+            spin = xp.stack([xp.zeros(self.count), spin @ xp.asarray(self.torque.unit)], -1)
         spin = spin if self.index.start.size else spin[:, :0]
         rest = self.size - vector.size - spin.size
         own = sum(s.own.size for s in self.slots if s.own is not None)
@@ -537,7 +543,7 @@ class Motion(NamedTuple):
 
     # The states have a leading time axis.
     states: Any
-    torque: Torque | None
+    torque: Law | None
 
 
 def starting_scene(model: Model, record: Recording) -> Scene:
@@ -571,7 +577,7 @@ def motion_in(model: Model, scene: Scene, record: Recording) -> Motion:
     return Motion(states, torque)
 
 
-def bound_torque(scene: Scene, record: Recording) -> Torque | None:
+def bound_torque(scene: Scene, record: Recording) -> Law | None:
     return bind(scene.torque, input_functions(record))
 
 

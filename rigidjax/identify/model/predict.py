@@ -22,10 +22,10 @@ from rigidjax.exact.free_body import FreeMotion
 from rigidjax.identify.model.carried import CarriedMotion
 from rigidjax.identify.sensors import AbstractSensor, SensorInput
 from rigidjax.identify.sensors.base import extras
-from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin, Turn
 from rigidjax.motion.coupled import Coupled, CoupledEquations, with_own_states
+from rigidjax.motion.suspension import AbstractSuspension, Law
 from rigidjax.motion.torques import Carried
-from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.motion.torques.states import freeze_own_states
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
@@ -47,7 +47,7 @@ FINEST = 32
 _LEAST, _CLOSER = 2.5e-14, 1e-2
 
 
-State = Spin | Attitude | Rigid
+State = Spin | Attitude | Rigid | Turn
 
 
 class AbstractIntegrator(eqx.Module):
@@ -59,9 +59,7 @@ class AbstractIntegrator(eqx.Module):
     """
 
     @abc.abstractmethod
-    def states(
-        self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
-    ) -> PyTree:
+    def states(self, body: Body, state0: State, ts: Float[Array, " times"], torque: Law) -> PyTree:
         """Return the states of a forced motion at the times `ts`, s; `state0` is that at `ts[0]`.
 
         They are a `motion.Coupled` if the torque has states of its own, such as the speed of a
@@ -98,9 +96,7 @@ class FixedSteps(AbstractIntegrator):
             self.solver, AbstractExplicit, "solver", requirement="one of rigidjax.solvers"
         )
 
-    def states(
-        self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
-    ) -> PyTree:
+    def states(self, body: Body, state0: State, ts: Float[Array, " times"], torque: Law) -> PyTree:
         y0 = with_own_states(body, state0, torque, ts[0])
         field = equations_of_motion(body, y0, torque)
         return fixed(loop_low_order(self.solver), field, ts, y0, self.substeps, self.last)
@@ -134,9 +130,7 @@ class Adaptive(AbstractIntegrator):
         _checks.positive_float(self.rtol, "rtol")
         _checks.nonnegative_float(self.atol, "atol")
 
-    def states(
-        self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
-    ) -> PyTree:
+    def states(self, body: Body, state0: State, ts: Float[Array, " times"], torque: Law) -> PyTree:
         # The padding of a shorter record repeats its last time, but a solver refuses equal times. A
         # small growing time is added to the repeated times.
         first = jnp.zeros(1, bool)
@@ -173,9 +167,9 @@ def states_at(
     body: Body,
     state0: State,
     ts: Float[Array, " times"],
-    torque: Torque | None,
+    torque: Law | None,
 ) -> PyTree:
-    """Return the states of a motion at `ts`, s; free and carried ones need no `integrator`."""
+    """Return the states of a motion at `ts`, s; known ones need no `integrator`."""
     known = _known_motion(body, state0, ts, torque)
     if known is not None:
         return known(ts)
@@ -184,12 +178,15 @@ def states_at(
 
 
 def _known_motion(
-    body: Body, state0: State, ts: Float[Array, " times"], torque: Torque | None
+    body: Body, state0: State, ts: Float[Array, " times"], torque: Law | None
 ) -> Callable[[Array], PyTree] | None:
     """Return the motion as a function of times, s, if no integrator is needed, else `None`."""
     if isinstance(torque, Carried):
         return CarriedMotion(cast(MassProperties, body), torque)
-    free = FreeMotion(body, state0) if torque is None else None
+    if isinstance(torque, AbstractSuspension):
+        free = torque.swing(body, cast(Turn, state0)) if torque.closed_form else None
+    else:
+        free = FreeMotion(body, state0) if torque is None else None
     return None if free is None else lambda times: free(times - ts[0])
 
 
@@ -202,9 +199,7 @@ class HeldSteps(AbstractIntegrator):
 
     last: Int[Array, ""] | None = eqx.field(default=None, repr=False)
 
-    def states(
-        self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
-    ) -> PyTree:
+    def states(self, body: Body, state0: State, ts: Float[Array, " times"], torque: Law) -> PyTree:
         return self.driven_states(body, state0, ts, torque, {})
 
     def driven_states(
@@ -212,7 +207,7 @@ class HeldSteps(AbstractIntegrator):
         body: Body,
         state0: State,
         ts: Float[Array, " times"],
-        torque: Torque,
+        torque: Law,
         inputs: dict[str, Array],
     ) -> PyTree:
         """Return the states at `ts` under a torque that reads sampled `inputs` (before + T, *k).
@@ -221,7 +216,7 @@ class HeldSteps(AbstractIntegrator):
         own states, such as the speed of a motor, are first integrated over the samples before
         `ts[0]`, while the body is held at its initial state.
         """
-        count, size = ts.shape[0] - 1, (ts[1] - ts[0]).astype(state0.omega.dtype)
+        count, size = ts.shape[0] - 1, (ts[1] - ts[0]).astype(jax.tree.leaves(state0)[0].dtype)
         before = max((len(rows) - ts.shape[0] for rows in inputs.values()), default=0)
         start = with_own_states(
             body, state0, bind(torque, inputs_at_start(torque, size, inputs)), 0.0
@@ -256,8 +251,9 @@ def shifted_state(field: Callable[..., Any], t: Array, state: PyTree, offset: Ar
 
 
 def needed_body(body: Body, state_type: type) -> Body:
-    """Return the `Inertia` of a body, unless the state is a `Rigid`, which needs the mass."""
-    return body.inertia if isinstance(body, MassProperties) and state_type is not Rigid else body
+    """Return the `Inertia` of a body, unless the state is one that needs the mass."""
+    massless = state_type not in (Rigid, Turn)
+    return body.inertia if isinstance(body, MassProperties) and massless else body
 
 
 class Along(NamedTuple):
@@ -273,7 +269,7 @@ class Along(NamedTuple):
 def sensor_inputs(
     sensor: AbstractSensor,
     body: Body,
-    torque: Torque | None,
+    torque: Law | None,
     ts: Array,
     state0: State,
     states: PyTree,
@@ -301,6 +297,10 @@ def sensor_inputs(
             states = jax.vmap(partial(shifted_state, whole), axes)(ts, states, offset)
 
     def input_at(t: Array, state: PyTree) -> SensorInput:
+        if isinstance(torque, AbstractSuspension):
+            # A sensor sees the body, not the angle.
+            shown, rate = jax.jvp(partial(torque.state, body), (state,), (field(t, state, None),))
+            return SensorInput(t, shown, body, lambda *_: rate)
         if not isinstance(state, Coupled):
             return SensorInput(t, state, body, field)
         return SensorInput(t, state.motion, body, freeze_own_states(field, state.own), state.own)
@@ -340,9 +340,9 @@ def errors_along(
 def simulate_readings(
     sensor: AbstractSensor | Sequence[AbstractSensor],
     body: Inertia | MassProperties,
-    state0: Spin | Attitude | Rigid,
+    state0: Spin | Attitude | Rigid | Turn,
     ts: Float[ArrayLike, " times"] | Sequence[float],
-    torque: Torque | None = None,
+    torque: Law | None = None,
     *,
     key: PRNGKeyArray | None = None,
 ) -> Any:
@@ -375,7 +375,10 @@ def simulate_readings(
     (2, 3)
     """
     order = "the order is sensor, body, state0, ts"
-    _checks.require_instance(state0, (Spin, Attitude, Rigid), "state0", hint=order)
+    _checks.require_instance(state0, (Spin, Attitude, Rigid, Turn), "state0", hint=order)
+    shown = state0
+    if isinstance(state0, Turn) and isinstance(torque, AbstractSuspension):
+        shown = torque.state(body, state0)
     several = isinstance(sensor, Sequence)
     sensors = tuple(sensor) if several else (sensor,)
     if not sensors:
@@ -383,9 +386,9 @@ def simulate_readings(
     for one in sensors:
         name, wanted = type(one).__name__, "a sensor such as Gyro(0.01), or several"
         _checks.require_instance(one, AbstractSensor, "sensor", requirement=wanted)
-        if not isinstance(state0, one.feels):
+        if not isinstance(shown, one.feels):
             raise TypeError(
-                f"{name} needs a state with {one.feels.__name__}, got {type(state0).__name__}; "
+                f"{name} needs a state with {one.feels.__name__}, got {type(shown).__name__}; "
                 "take Attitude, or Rigid for what depends on the position"
             )
         if one.noise is not None and jnp.shape(one.noise) != (one.components,):
@@ -421,7 +424,7 @@ def simulate_readings(
 def _readings(
     sensor: AbstractSensor,
     body: Inertia | MassProperties,
-    torque: Torque | None,
+    torque: Law | None,
     ts: Array,
     state0: State,
     states: PyTree,

@@ -6,7 +6,8 @@ from jaxtyping import PyTree
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.sensors import AbstractSensor
-from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin, Turn
+from rigidjax.motion.suspension import Law
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.composite import parts_of
@@ -24,7 +25,7 @@ class Scene(eqx.Module):
     **Fields:**
 
     - `body`: the body, or `None` while it is not known.
-    - `torque`: the known torque on the body, or `None`.
+    - `torque`: the known torque on the body, its suspension, or `None`.
     - `process`: the unknown torque on the body, as noise, or `None`.
     - `sensors`: the sensors, in the order of the readings.
     - `start`: the state at the first time of the recording, or `None` while it is not known.
@@ -36,10 +37,10 @@ class Scene(eqx.Module):
     """
 
     body: Inertia | MassProperties | None
-    torque: Torque | None
+    torque: Law | None
     process: Process | None
     sensors: tuple[AbstractSensor, ...]
-    start: Spin | Attitude | Rigid | None
+    start: Spin | Attitude | Rigid | Turn | None
 
 
 def require_unknown_torque(process: PyTree) -> None:

@@ -17,7 +17,7 @@ from rigidjax.body.symmetric3 import from_components
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, input_functions
 from rigidjax.identify.data.reference_states import rates
-from rigidjax.identify.model.charts import BASIS
+from rigidjax.identify.model.charts import BASIS, body_list
 from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
 from rigidjax.identify.model.model import (
     Model,
@@ -26,10 +26,12 @@ from rigidjax.identify.model.model import (
     scene_at,
     scene_errors,
 )
+from rigidjax.identify.model.moment import Moment
 from rigidjax.identify.search.noise import initial_noise
-from rigidjax.motion import Spin
+from rigidjax.motion import Spin, Turn
+from rigidjax.motion.suspension import AbstractSuspension, Law, moment_about
 from rigidjax.motion.torques import Carried
-from rigidjax.motion.torques.base import Torque, evaluate_torque
+from rigidjax.motion.torques.base import evaluate_torque
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.motion.torques.states import contains_own_states
 
@@ -58,8 +60,23 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
         else:
             mine = {name: regress_inertia(tuple(r), one.torque) for name, r in members.items()}
         found = {name: body for name, body in mine.items() if body is not None} | found
-    regressed = (found.get("") if model.body_indices is None else found) or None
-    start = model.start(regressed)
+    swings = [part for part in parts_of(model) if part.model.state_kind is Turn]
+    seen: dict[int, Any] = {}
+    for part in swings:
+        one = part.model
+        own = body_list(one.unpack(one.start(_named(one, found))).body)
+        own = dict(zip(dict.fromkeys(one.body_names), own, strict=True))
+        for row, record in enumerate(stacking.on_host(one.records, one.counts)):
+            seen[part.first + row] = swing = _swing(one.torque, record, own[one.body_names[row]])
+            if swing is not None:
+                found[one.body_names[row]] = swing.body
+    regressed = _named(model, found)
+    start = np.array(model.start(regressed))
+    for part in swings:
+        for row, x in enumerate(np.asarray(part.model.index.start)):
+            if (swing := seen[part.first + row]) is not None and x.size:
+                places = part.take(np.arange(model.size))[x]
+                start[places] = swing.angle, swing.rate / float(part.model.reference.rate[row])
     bodies, places = slice(model.index.bodies), np.arange(model.size)
     starts = ((part, np.asarray(part.model.index.start)[:, -3:]) for part in parts_of(model))
     spins = np.concatenate([np.ravel(np.asarray(p.take(places))[rows]) for p, rows in starts])
@@ -68,8 +85,9 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
     out = []
     # If neither a body nor initial rates are free, there is nothing to scatter. The readings of a
     # carried body are linear in its numbers: there is one best point.
-    carried = all(map(_is_carried, kinds))
-    for index in range(count if (model.index.bodies or spins.size) and not carried else 1):
+    sure = all(_is_carried(one) or one.state_kind is Turn for one in kinds)
+    sure = sure and None not in seen.values()
+    for index in range(count if (model.index.bodies or spins.size) and not sure else 1):
         wide = 0.0 if index == 0 else (0.5 if regressed is not None and index % 2 else 1.5)
         x = np.array(start)
         middle = x[bodies] if (index == 0 or wide < 1) else 0 * x[bodies]
@@ -79,11 +97,76 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
     return out
 
 
+def _named(model: Model, bodies: dict[str, Any]) -> Any:
+    """Return `bodies` by name as `Model.start` takes them, or `None` for none."""
+    if model.body_indices is None:
+        return bodies.get("")
+    return {name: body for name, body in bodies.items() if name in model.body_names} or None
+
+
+class _Swing(NamedTuple):
+    """Hold a body that swings with the recorded period, and the first angle, rad, and rate."""
+
+    body: Any
+    angle: float
+    rate: float
+
+
+def _swing(law: AbstractSuspension, recording: Recording, body: Any) -> _Swing | None:
+    """Return the start of a swing from the period of the rate about its main axis and the angle
+    through which it turns in the first one; `None` for a body that does not turn back.
+    """
+    t, w = rates(recording)
+    if t.size < 10:
+        return None
+    unit = np.asarray(law.unit)
+    along = np.linalg.eigh(np.cov(w.T))[1][:, -1]
+    even = np.linspace(t[0], t[-1], t.size)
+    rate = np.interp(even, t, w @ along * (np.sign(along @ unit) or 1.0))
+    period = t[-1] - t[0]
+    step = period / (t.size - 1)
+    if not rate.min() < -0.1 * rate.max() < 0.0 or not rate.max() > -0.1 * rate.min():
+        return None
+    # The period of the whole record, then that of its first ten periods, if friction changes it.
+    for _ in range(2):
+        few = rate[: max(10, int(10 * period / step))]
+        few = few - few.mean()
+        size = 1 << (8 * few.size).bit_length()
+        power = np.log(np.abs(np.fft.rfft(few * np.hanning(few.size), size)) + 1e-300)
+        top = int(np.clip(np.argmax(power), 1, power.size - 2))
+        left, middle, right = power[top - 1 : top + 2]
+        top += 0.5 * (left - right) / (left - 2 * middle + right)
+        period = size * step / top
+    first = rate[: int(period / step) + 2]
+    angles = np.concatenate([[0.0], np.cumsum(0.5 * step * (first[1:] + first[:-1]))])
+    amplitude = min(0.5 * np.ptp(angles), 3.0)
+    squares, rest, own, moment = map(np.asarray, _squares(law, body, amplitude))
+    # The square of the period is linear in the moment.
+    factor = 1 + (period**2 - squares[0]) / (squares[1] - squares[0])
+    if not np.isfinite(factor):
+        return None
+    factor = max(factor, 1 - 0.99 * own / moment)
+    found = eqx.filter_jit(Moment(body, law).body)(jnp.log(jnp.asarray([factor])))
+    return _Swing(found, float(rest - 0.5 * (angles.max() + angles.min())), float(rate[0]))
+
+
+@eqx.filter_jit
+def _squares(law: AbstractSuspension, body: Any, amplitude: ArrayLike) -> tuple[Array, ...]:
+    """Return the squares of the periods, s², of a body and of one with twice its moment; the angle
+    of rest; and the body's moments about its centre of mass and about the axis.
+    """
+    bodies = [body, Moment(body, law).body(jnp.log(jnp.asarray([2.0])))]
+    angles = jnp.linspace(-jnp.pi, jnp.pi, 1441)
+    rest = jnp.nanargmin(jax.vmap(lambda angle: law.potential(body, angle))(angles))
+    squares = jnp.stack([law.period(one, amplitude) ** 2 for one in bodies])
+    return squares, angles[rest], moment_about(law.unit, body), law.moment(body, 0.0)
+
+
 def _is_carried(model: Model) -> bool:
     return isinstance(model.torque, Carried)
 
 
-def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) -> Inertia | None:
+def regress_inertia(recordings: tuple[Recording, ...], torque: Law | None) -> Inertia | None:
     """Return the inertia of a body by a regression on Euler's equations in integral form.
 
     The equation `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. Without a
@@ -207,7 +290,7 @@ def solve_inertia(matrix: Float[np.ndarray, "n 6"], rhs: Float[np.ndarray, " n"]
     return Components(components, float(values[0] / max(np.abs(values).max(), 1e-300)))
 
 
-def rate_only(torque: Torque | None) -> bool:
+def rate_only(torque: Law | None) -> bool:
     """Return whether a `torque` depends on time and body rate alone, without own states."""
     return torque is None or (
         getattr(torque, "feels", None) is HasSpin and not contains_own_states(torque)
@@ -225,7 +308,7 @@ class Balance(NamedTuple):
 
 
 def integrated_euler(
-    recording: Recording, torque: Torque | None, rate_matrix: Float[np.ndarray, "3 3"]
+    recording: Recording, torque: Law | None, rate_matrix: Float[np.ndarray, "3 3"]
 ) -> Balance:
     """Return Euler's equations integrated over a recording, linear in the components of the tensor.
 
@@ -253,7 +336,7 @@ def integrated_euler(
 
 @eqx.filter_jit
 def _torques(
-    torque: Torque, t: Float[ArrayLike, " n"], w: Float[ArrayLike, "n 3"]
+    torque: Any, t: Float[ArrayLike, " n"], w: Float[ArrayLike, "n 3"]
 ) -> Float[Array, "n 3"]:
     """Return the values, N m, at the times t, s, and the rates w, rad/s, of a `torque` that does
     not read the body: one of unit inertia takes its place.

@@ -13,6 +13,7 @@ from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
 from rigidjax.identify.model.model import Model, parts_of, shortened, values_of
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
+from rigidjax.motion import Turn
 
 # If one end of the interval of a positive number differs from the value of the number by more than
 # this factor, the interval goes from 0 to the largest possible value (often infinity).
@@ -116,8 +117,7 @@ def labels(model: Model) -> list[Label]:
     for name, chart in named_charts(model):
         for names, positive in ((chart.log_names, True), (chart.plain_names, False)):
             out += [Label(f"{n}{name}", _UNITS.get(n, chart.unit), positive) for n in names]
-    for where in starting_suffixes(model):
-        out += [Label(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]
+    out += starting_labels(model)
     every = zip(parts_of(model), recording_suffixes(model), strict=True)
     suffixes = {slot.name: names for part, names in every for slot in part.model.slots}
     for slot in model.slots:
@@ -167,23 +167,30 @@ def recording_suffixes(model: Model) -> list[list[str]]:
     return out
 
 
-def starting_suffixes(model: Model) -> list[str]:
-    """Return the suffix of each recording whose initial state a fit reports."""
-    every = zip(parts_of(model), recording_suffixes(model), strict=True)
-    return [one for part, names in every if reports_starts(part.model) for one in names]
+def starting_labels(model: Model) -> list[Label]:
+    """Return what the reported numbers of each initial state are called."""
+    out = []
+    for part, suffixes in zip(parts_of(model), recording_suffixes(model), strict=True):
+        names = {"Ωx": "rad/s", "Ωy": "rad/s", "Ωz": "rad/s"}
+        if part.model.state_kind is Turn:
+            names = {"angle": "rad", "rate": "rad/s"}
+        for where in suffixes if reports_starts(part.model) else ():
+            out += [Label(f"{name}{where}", unit, False) for name, unit in names.items()]
+    return out
 
 
 def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
     """Return the quantities that a fit reports, in the order of `labels`: numbers of each body,
-    initial body rates (rad/s), and the values of each `Free`; positive ones as logarithms.
+    initial body rates or angles and their rates, and the values of each `Free`; positive ones as
+    logarithms.
     """
     parts, bodies = [jnp.zeros(0, x.dtype)], body_list(model.bodies(x))
     for (_, chart), body in zip(named_charts(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
     for part in parts_of(model):
         if reports_starts(one := part.model):
-            rates = part.take(x)[one.index.start[:, -3:]] * one.reference.rate[:, None]
-            parts.append(rates.reshape(-1))
+            last = part.take(x)[one.index.start[:, -3:]] * one.reference.units[:, -3:]
+            parts.append(last.reshape(-1))
     values = values_of(model, x)
     for slot in model.slots:
         for name in (slot.name, f"{slot.name}, own")[: 1 + (slot.spread is not None)]:
@@ -244,7 +251,7 @@ def reported_quantities(
         shown = float(np.exp(value)) if positive else float(value)
         least, most = -np.inf, 1.0 if name.startswith(Ratios.log_names) else np.inf
         mine = tuple((float(rho[index]), away) for rho, away in cuts)
-        if close[index] > abs(deviation * shown):
+        if positive and close[index] > deviation * shown:
             deviation, positive, least, mine = close[index], False, 0.0, ()
         # No number is known better than its round-off.
         smallest = np.finfo(float).eps * (1.0 if positive else abs(shown))
