@@ -114,7 +114,8 @@ class _Swing(NamedTuple):
 
 def _swing(law: AbstractSuspension, recording: Recording, body: Any) -> _Swing | None:
     """Return the start of a swing from the period of the rate about its main axis and the angle
-    through which it turns in the first one; `None` for a body that does not turn back.
+    through which it turns in the first one; `None` for a log of less than one period, and for a
+    body that goes over the top.
     """
     t, w = rates(recording)
     if t.size < 10:
@@ -125,8 +126,6 @@ def _swing(law: AbstractSuspension, recording: Recording, body: Any) -> _Swing |
     rate = np.interp(even, t, w @ along * (np.sign(along @ unit) or 1.0))
     period = t[-1] - t[0]
     step = period / (t.size - 1)
-    if not rate.min() < -0.1 * rate.max() < 0.0 or not rate.max() > -0.1 * rate.min():
-        return None
     # The period of the whole record, then that of its first ten periods, if friction changes it.
     for _ in range(2):
         few = rate[: max(10, int(10 * period / step))]
@@ -137,7 +136,12 @@ def _swing(law: AbstractSuspension, recording: Recording, body: Any) -> _Swing |
         left, middle, right = power[top - 1 : top + 2]
         top += 0.5 * (left - right) / (left - 2 * middle + right)
         period = size * step / top
-    first = rate[: int(period / step) + 2]
+    # The rate over whole periods is the bias of the gyro, unless the body goes over the top.
+    whole = int(int((t[-1] - t[0]) / period) * period / step)
+    bias = rate[:whole].mean() if whole else np.inf
+    if not abs(bias) * period < 0.5 * np.pi:
+        return None
+    first = rate[: int(period / step) + 2] - bias
     angles = np.concatenate([[0.0], np.cumsum(0.5 * step * (first[1:] + first[:-1]))])
     amplitude = min(0.5 * np.ptp(angles), 3.0)
     squares, rest, own, moment = map(np.asarray, _squares(law, body, amplitude))
@@ -147,7 +151,7 @@ def _swing(law: AbstractSuspension, recording: Recording, body: Any) -> _Swing |
         return None
     factor = max(factor, 1 - 0.99 * own / moment)
     found = eqx.filter_jit(Moment(body, law).body)(jnp.log(jnp.asarray([factor])))
-    return _Swing(found, float(rest - 0.5 * (angles.max() + angles.min())), float(rate[0]))
+    return _Swing(found, float(rest - 0.5 * (angles.max() + angles.min())), float(first[0]))
 
 
 @eqx.filter_jit
