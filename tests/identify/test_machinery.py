@@ -453,6 +453,7 @@ MISTAKES = [
     (lambda r: identify.Free(lambda s: s.sensors[0].bias[3], "x"), "nothing is there .*out of bounds"),
     (lambda r: identify.Free(lambda s: s.body.com, "x"), "numbers of the body are those of the model's chart"),
     (lambda r: identify.Free(lambda s: s.body, "x"), "numbers of the body are those of the model's chart"),
+    (lambda r: identify.Free(lambda s: s.body[0], "x"), "numbers of the body are those of the model's chart"),
     (lambda r: identify.Free(lambda s: s.start.omega, "x"), "the initial state needs no Free"),
 ]  # fmt: skip
 

@@ -40,7 +40,7 @@ from rigidjax.identify.uncertainty import considered, covariance as uncertainty,
 from rigidjax.identify.uncertainty.covariance import (
     CorrelationTimes,
     Linearisation,
-    measured_residuals,
+    residuals_by_name,
     white_noise_variance,
 )
 from rigidjax.identify.uncertainty.degrees_of_freedom import prepare_freedom
@@ -102,7 +102,7 @@ def goodness_of_fit(
         for index in range(len(model.records.readings))
     ]
     left = tuple(index for index, one in enumerate(each) if one.word != EXPLAINS)
-    rest = [_goodness_of_number(name, off) for name, off in measured_residuals(model, linear)]
+    rest = [_goodness_of_number(name, off) for name, off in residuals_by_name(model, linear)]
     words = [one.words for one in (*each, *rest) if one.word != EXPLAINS]
     found = [one.word for one in (*each, *rest)]
     word = next((word for word in (FAILS, LEAVES) if word in found), EXPLAINS)

@@ -20,7 +20,7 @@ from rigidjax.identify.answer.table import Row, html_rows, interval_text, number
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
 from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jacobian
 from rigidjax.identify.model.terms import Noise
-from rigidjax.identify.uncertainty.covariance import Linearisation, measured_residuals
+from rigidjax.identify.uncertainty.covariance import Linearisation, residuals_by_name
 from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 from rigidjax.identify.uncertainty.quantities import Quantity, interval_about
 
@@ -439,7 +439,7 @@ def verdict(fit: Fit) -> str:
         words = "ended within 1 % of the least misfit, which does not explain the readings"
     lines.append(f"starts: {len(good)} of {len(fit.starts)} {words}")
     lines += [f"held out: {fit.held_out}"] if fit.held_out is not None else []
-    for name, off in measured_residuals(fit.model, fit.linear) if fit.linear is not None else ():
+    for name, off in residuals_by_name(fit.model, fit.linear) if fit.linear is not None else ():
         lines.append(f"measured {name}: {off:+.2g} standard deviations from the fit")
     lines += [f"- {line}" for line in fit.identifiability]
     lines += [fit.place] if fit.place else []

@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -14,7 +15,7 @@ from rigidjax.identify.model.model import (
     error_jacobians,
 )
 from rigidjax.identify.model.normal import normal_matrix
-from rigidjax.identify.model.terms import scaled_slopes
+from rigidjax.identify.model.terms import measured_residuals, scaled_slopes
 from rigidjax.identify.sensors.base import extras
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.covariance import Linearisation, white_covariance
@@ -32,7 +33,8 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
     **Arguments:**
 
     - `model`: a model whose recordings hold the planned times and the sensors, with known noise;
-      the values of the readings do not matter.
+      the values of the readings do not matter. Numbers that are `measured` beside them count as
+      readings, such as the period of a swing; priors do not count.
     - `x`: (n,) the parameters of the planned motion, such as `Model.start` returns.
 
     **Returns** the same quantities as `Fit.quantities` (`name`, `value`, and `deviation` in the
@@ -54,19 +56,19 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
         )
     _require_known_noise(model, x)
     near = flat_limit.thicken(model, x)
-    rows = tuple(map(np.asarray, _rows(model, x if near is None else near)))
-    if not all(np.isfinite(block).all() for block in rows):
+    rows, extra = jax.tree.map(np.asarray, _rows(model, x if near is None else near))
+    if not all(np.isfinite(block).all() for block in (*rows, extra)):
         raise ValueError(
             "expected_quantities: wanted a finite Fisher information, got NaN or infinity; the "
             "recordings of model hold NaN, or the motion of x overflows"
         )
-    # The readings are planned: their residuals are zero, and priors do not count.
+    # The readings are planned: their residuals are zero.
     zeros, none = tuple(block[..., 0] * 0.0 for block in rows), np.zeros(model.size)
     weights = tuple(np.ones(block.shape[:2]) for block in rows)
     mask = tuple(np.ones(block.shape, bool) for block in zeros)
-    places, extra = np.asarray(model.index.places), np.zeros((0, model.size))
+    places = np.asarray(model.index.places)
     linear = Linearisation(
-        zeros, rows, zeros, rows, weights, mask, places, none, none, extra[:, 0], extra
+        zeros, rows, zeros, rows, weights, mask, places, none, none, 0.0 * extra[:, 0], extra
     )
     white = white_covariance(linear)
     numbers = quantities_on_host(model, x, near)
@@ -76,8 +78,9 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
 def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
     """Return Fisher's information matrix `Jᵀ Σ⁻¹ J` (n, n) of the parameters x.
 
-    J holds the derivatives of all predictions with respect to x, and Σ is the covariance of the
-    noise. The result is differentiable with respect to x, for a design by gradients.
+    J holds the derivatives of all predictions and `Measured` numbers with respect to x, and Σ is
+    the covariance of the noise. The result is differentiable with respect to x, for a design by
+    gradients.
 
     **Arguments:** `model` is a model whose sensors have known noise; `x` (n,) holds the
     parameters of the motion. **Raises** `ValueError` for a sensor without noise.
@@ -92,12 +95,17 @@ def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
 
 @eqx.filter_jit
 def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-    return normal_matrix(_rows(model, x), model.index.places, model.size).core
+    rows, extra = _rows(model, x)
+    return normal_matrix(rows, model.index.places, model.size).add_rows(extra).core
 
 
 @eqx.filter_jit
-def _rows(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "records times k m"], ...]:
-    """Return the derivatives of the readings of each sensor, in standard deviations."""
+def _rows(
+    model: Model, x: Float[Array, " n"]
+) -> tuple[tuple[Float[Array, "records times k m"], ...], Float[Array, "j n"]]:
+    """Return the derivatives of the readings of each sensor and of each `Measured`, in standard
+    deviations.
+    """
     sensors = model.records.sensors
     noises: list[Any] = [sensor.noise for sensor in sensors]
     _, slopes = error_jacobians(model, x)
@@ -107,7 +115,7 @@ def _rows(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "records ti
         if jitter is not None:
             late = jitter[:, None, None] * delay_slopes(model, x)[index]
         rows.append(scaled_slopes(block, noise, late))
-    return tuple(rows)
+    return tuple(rows), jax.jacfwd(lambda x: measured_residuals(model, x))(x)
 
 
 def _require_known_noise(model: Model, x: Float[Array, " n"]) -> None:

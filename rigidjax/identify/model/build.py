@@ -25,7 +25,13 @@ from rigidjax.identify.data.windows import (
     window_starts,
 )
 from rigidjax.identify.model.charts import AbstractBodyChart, Charts, body_places, has_mass
-from rigidjax.identify.model.free import Slot, checked_labels, find_slots, group_recordings
+from rigidjax.identify.model.free import (
+    Free,
+    Slot,
+    checked_labels,
+    find_slots,
+    group_recordings,
+)
 from rigidjax.identify.model.index import build_index
 from rigidjax.identify.model.predict import AbstractIntegrator, HeldSteps, integrator_for
 from rigidjax.identify.model.priors import AbstractLoss, Entropic
@@ -85,7 +91,9 @@ def fields_of_model(
     apart = checked_labels(noise_each, "noise_each")
     if isinstance(apart, bool):
         apart = tuple(range(len(names))) if apart else ("",) * len(names)
-    scene = Scene(None, torque, process, data.sensors, None)
+    numbers = (one.where for one in free if isinstance(one, Free))
+    beside = tuple(where for where in numbers if not callable(where))
+    scene = Scene(None, torque, process, data.sensors, None, beside)
     walks, slots = find_drifts(parts["walks"], scene), find_slots(free, scene, names)
     taken = {"Ωx", "Ωy", "Ωz", "angle", "rate"}.union(
         *((*one.log_names, *one.plain_names) for one in charts)
@@ -108,6 +116,7 @@ def fields_of_model(
         "body_names": names,
         "body_indices": indices,
         "walks": walks,
+        "beside": beside,
         "slots": slots,
         "index": index,
         "noise_groups": group_recordings(apart, names, "noise_each").indices,

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from rigidjax import _checks
+from rigidjax._types import NumbersLike
 from rigidjax.identify.model.scene import Scene
 from rigidjax.identify.sensors.base import extras
 
@@ -23,7 +24,9 @@ class Free(eqx.Module):
     - `where`: a function that picks the number from a `Scene`, such as
       `lambda s: s.sensors[0].bias` or `lambda s: s.torque.coefficient`, or entries of an array,
       such as `lambda s: s.torque.coefficient[0]`. The value in the scene is the starting value. The
-      numbers of the body are those of the model's chart.
+      numbers of the body are those of the model's chart. Or the starting value itself, of a number
+      or an array that belongs to no scene, such as a length: a `Measured` reads
+      `point.values[name]`.
     - `name`: the name of the number in reports.
     - `scale`: the natural size of the number, in the unit of the number; inside the fit the number
       is in units of this size.
@@ -49,7 +52,7 @@ class Free(eqx.Module):
     'gyro bias'
     """
 
-    where: Callable[[Scene], Any]
+    where: Callable[[Scene], Any] | Array
     name: str
     scale: float
     each: bool | str | tuple[Any, ...]
@@ -60,7 +63,7 @@ class Free(eqx.Module):
 
     def __init__(
         self,
-        where: Callable[[Scene], Any],
+        where: Callable[[Scene], Any] | NumbersLike,
         name: str,
         *,
         scale: float = 1.0,
@@ -70,12 +73,11 @@ class Free(eqx.Module):
         spread: float | str | None = None,
         unit: str | None = None,
     ):
-        _checks.require_function(
-            where, "where", "of a scene, such as lambda s: s.torque.coefficient"
-        )
         _checks.require_instance(name, str, "name")
-        self.where, self.name = where, name
-        here = f"Free {name!r}"
+        self.name, here = name, f"Free {name!r}"
+        if not callable(where):
+            where = _checks.require_finite(_checks.numeric_array(where, here), here)
+        self.where = where
         self.unit = None if unit is None else _checks.require_instance(unit, str, f"{here}: unit")
         self.scale = _checks.positive_float(scale, f"{here}: scale")
         self.each = checked_labels(each, f"{here}: each")
@@ -193,11 +195,13 @@ def find_slots(
 
     An error is raised if a `Free` picks no numbers, or the numbers or the name of another one.
     """
-    slots = list(taken)
+    slots, beside = list(taken), 0
     for item in free:
         _checks.require_instance(item, Free, "free", requirement="Free(where, name)")
-        here = f"Free {item.name!r}"
-        path, value = leaf_at(item.where, scene, here, "it")
+        here, where = f"Free {item.name!r}", item.where
+        if not callable(where):
+            where, beside = (lambda s, k=beside: s.beside[k]), beside + 1
+        path, value = leaf_at(where, scene, here, "it")
         if any(overlap(slot.path, path) for slot in slots):
             raise ValueError(
                 f"{here}: another Free already frees the same numbers; give each array one Free"
@@ -297,6 +301,8 @@ class _NotHere:
 
     def __getattr__(self, name: str) -> Any:
         raise ValueError(self.why)
+
+    __getitem__ = __getattr__
 
 
 _ELSEWHERE = {

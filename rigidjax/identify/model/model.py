@@ -157,6 +157,7 @@ class Model(eqx.Module):
     torque: Any  # of several kinds a dict by kind, or `None` if no kind has one
     process: Process | None
     walks: tuple[Drift, ...]
+    beside: tuple[Array, ...]
     slots: tuple[Slot, ...]
     index: Index
     noise_groups: Int[Array, " records"]
@@ -548,7 +549,7 @@ class Motion(NamedTuple):
 
 def starting_scene(model: Model, record: Recording) -> Scene:
     """Return the scene of a recording at the starting values, without body and initial state."""
-    return Scene(None, model.torque, model.process, record.sensors, None)
+    return Scene(None, model.torque, model.process, record.sensors, None, model.beside)
 
 
 def scene_at(
@@ -558,7 +559,7 @@ def scene_at(
     scene = with_steps(starting_scene(model, record), model.slots, row)
     body = body_at(model.charts, row, body_index)
     start = reference.initial(row[model.index.first :])
-    return Scene(body, scene.torque, scene.process, scene.sensors, start)
+    return Scene(body, scene.torque, scene.process, scene.sensors, start, scene.beside)
 
 
 def motion_in(model: Model, scene: Scene, record: Recording) -> Motion:

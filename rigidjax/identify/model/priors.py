@@ -140,7 +140,7 @@ class Entropic(eqx.Module):
         D compares only the shapes of the two bodies.
         """
         if isinstance(body, MassProperties) and isinstance(self.guess, MassProperties):
-            here, there = _pseudo_inertia(body), _pseudo_inertia(self.guess)
+            here, there = pseudo_inertia(body), pseudo_inertia(self.guess)
         else:
             here, there = body.second_moment, self.guess.second_moment
         if not to_scale:
@@ -166,17 +166,17 @@ class Entropic(eqx.Module):
 
 class Measured(eqx.Module):
     """Define a measured number of the body or of the `Free`s, such as a weight, a period or a
-    length in a drawing: a reading that belongs to no recording.
+    length in a drawing, or k such numbers: a reading that belongs to no recording.
 
     A fit adds the residual `(value − of(point)) / sigma`. The sign is that of other readings.
 
     **Arguments:**
 
     - `of`: a differentiable function of an `Unpacked` (body, initial states, values of the `Free`s)
-      that returns the number, such as `lambda point: point.body.mass`. Another function is compiled
-      anew.
-    - `value`: the measured number, in its unit.
-    - `sigma`: its standard deviation, in the same unit.
+      that returns the number, such as `lambda point: point.body.mass`, or k numbers (k,). Another
+      function is compiled anew.
+    - `value`: the measured number, in its unit, or (k,) numbers.
+    - `sigma`: its standard deviation, in the same unit, one or (k,).
     - `name`: its name in reports.
 
     **Raises:** `TypeError` for anything but a function and a name; `ValueError` for a value that is
@@ -187,27 +187,34 @@ class Measured(eqx.Module):
     """
 
     of: Callable[[Any], Any] = eqx.field(static=True)
-    value: Scalar
-    sigma: Scalar
+    value: Float[Array, "*k"]
+    sigma: Float[Array, "*k"]
     name: str = eqx.field(static=True)
 
     def __init__(self, of: Callable[[Any], Any], value: NumbersLike, sigma: NumbersLike, name: str):
         self.of = _checks.require_function(of, "of", "of an `Unpacked` to a number")
         self.name = _checks.require_instance(name, str, "name")
         here, kind = f"Measured {name!r}", jnp.result_type(float)
-        number = _checks.array_of_shape(value, (), f"{here}: value").astype(kind)
+        number = _checks.numeric_array(value, f"{here}: value").astype(kind)
+        if number.ndim > 1:
+            raise ValueError(f"{here}: value: wanted a number or (k,) numbers, got {number.shape}")
         self.value = _checks.require_finite(number, f"{here}: value")
-        self.sigma = jnp.asarray(_checks.positive_float(sigma, f"{here}: sigma"), kind)
+        wide = _checks.numeric_array(sigma, f"{here}: sigma").astype(kind)
+        if wide.shape not in ((), number.shape):
+            raise ValueError(f"{here}: sigma: wanted one or {number.shape}, got {wide.shape}")
+        wide = jnp.broadcast_to(wide, number.shape)
+        self.sigma = _checks.require_positive(wide, f"{here}: sigma", "a positive number")
 
-    def residual(self, point: Any) -> Scalar:
+    def residual(self, point: Any) -> Float[Array, "*k"]:
         """Return the measured minus the computed number, in standard deviations."""
         number = _checks.differentiable_array(self.of(point), f"Measured {self.name!r}")
-        if number.shape != ():
-            raise ValueError(f"Measured {self.name!r}: wanted one number, got {number.shape}")
+        if number.shape != self.value.shape:
+            words = f"wanted {self.value.shape or 'one number'} of `of`, got {number.shape}"
+            raise ValueError(f"Measured {self.name!r}: {words}")
         return (self.value - number) / self.sigma
 
 
-def _pseudo_inertia(body: MassProperties) -> Float[Array, "4 4"]:
+def pseudo_inertia(body: MassProperties) -> Float[Array, "4 4"]:
     """Return the pseudo-inertia `J = ∫ r̃ r̃ᵀ dm` of a `body`, with the four-vectors r̃ = (r, 1)."""
     m, c = body.mass, body.com
     upper = body.second_moment + m * c[:, None] * c[None, :]

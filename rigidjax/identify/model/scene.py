@@ -1,7 +1,7 @@
 """Hold the scene of a recording, which is everything that its readings depend on."""
 
 import equinox as eqx
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
@@ -29,6 +29,7 @@ class Scene(eqx.Module):
     - `process`: the unknown torque on the body, as noise, or `None`.
     - `sensors`: the sensors, in the order of the readings.
     - `start`: the state at the first time of the recording, or `None` while it is not known.
+    - `beside`: the values of `Free`s that belong to no part of a scene, such as a length.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> model = rj.identify.Model(record, rj.identify.PrincipalRatios())
@@ -41,6 +42,7 @@ class Scene(eqx.Module):
     process: Process | None
     sensors: tuple[AbstractSensor, ...]
     start: Spin | Attitude | Rigid | Turn | None
+    beside: tuple[Array, ...] = ()
 
 
 def require_unknown_torque(process: PyTree) -> None:

@@ -164,15 +164,21 @@ def prior_weights(model: Model) -> Float[Array, " n"]:
 
 def joint_residuals(model: Model, x: Float[Array, " n"]) -> Float[Array, " j"]:
     """Return the residuals of the prior of the body, if there is one, and of each `Measured`."""
-    out = [jnp.zeros(0, x.dtype)]
+    out = []
     if model.prior is not None:
         (chart,) = model.charts
         body = chart.body(x[: model.index.bodies])
         out.append(model.prior.residuals(body, to_scale=chart.unit != "").reshape(-1))
-    if model.measured:
-        point = unpack_at(model, x)
-        out += [one.residual(point).astype(x.dtype)[None] for one in model.measured]
-    return jnp.concatenate(out)
+    return jnp.concatenate([*out, measured_residuals(model, x)])
+
+
+def measured_residuals(model: Model, x: Float[Array, " n"]) -> Float[Array, " k"]:
+    """Return the residuals of each `Measured` of a `model`, one after another."""
+    if not model.measured:
+        return jnp.zeros(0, x.dtype)
+    point = unpack_at(model, x)
+    parts = [one.residual(point).astype(x.dtype).reshape(-1) for one in model.measured]
+    return jnp.concatenate(parts)
 
 
 def prior_residuals(model: Model, x: Float[Array, " n"]) -> Float[Array, " m"]:

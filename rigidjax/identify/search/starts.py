@@ -27,6 +27,7 @@ from rigidjax.identify.model.model import (
     scene_errors,
 )
 from rigidjax.identify.model.moment import Moment
+from rigidjax.identify.model.priors import pseudo_inertia
 from rigidjax.identify.search.noise import initial_noise
 from rigidjax.motion import Spin, Turn
 from rigidjax.motion.suspension import AbstractSuspension, Law, moment_about
@@ -204,6 +205,8 @@ _UNIT = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 # If this matrix has an eigenvalue below zero, those below this fraction of the largest are raised
 # to it: the body is then possible.
 _POSSIBLE = 1e-4
+# A direction of the ten numbers is not seen below this fraction of the largest singular value.
+_SEEN = 1e-12
 
 
 def carried_bodies(model: Model, names: list[str]) -> dict[str, Any]:
@@ -223,6 +226,7 @@ def carried_bodies(model: Model, names: list[str]) -> dict[str, Any]:
         errors.append((weights * error).reshape(model.count, -1))
         slopes.append((weights[..., None] * jacobian).reshape(model.count, -1, 10))
     matrix = np.concatenate(slopes, axis=1)
+    guesses = dict(zip(names, body_list(model.bodies(x)), strict=True))
     # The errors without a body: the numbers of a light one are then not lost beside `_UNIT`.
     side = matrix @ _UNIT - np.concatenate(errors, axis=1)
 
@@ -230,8 +234,15 @@ def carried_bodies(model: Model, names: list[str]) -> dict[str, Any]:
         mine = np.array([other == name for other in model.body_names])
         # By QR with pivoting: NumPy's way by singular values takes thirty times as long.
         rows_of_body = matrix[mine].reshape(-1, 10)
-        ten: Any = lstsq(rows_of_body, side[mine].ravel(), lapack_driver="gelsy")[0]
         whole = np.zeros((4, 4))
+
+        def solve(side: np.ndarray) -> Any:
+            return lstsq(rows_of_body, side, cond=_SEEN, lapack_driver="gelsy")
+
+        ten, _, rank, _ = solve(side[mine].ravel())
+        if rank < 10:  # what the motion does not show stays that of the first guess
+            guess = np.asarray(pseudo_inertia(guesses[name]))[rows, columns]
+            ten = guess + solve(side[mine].ravel() - rows_of_body @ guess)[0]
         whole[rows, columns] = whole[columns, rows] = ten
         # Lengths in units of the body's size: the eigenvalues are then alike.
         size = np.sqrt(abs(np.trace(whole[:3, :3]) / whole[3, 3]))

@@ -183,9 +183,15 @@ def linearise(
     return Linearisation(raw=raw, raw_slopes=raw_slopes, mask=mask, **parts)
 
 
-def measured_residuals(model: Model, linear: Linearisation) -> list[tuple[str, float]]:
-    """Return the name and the residual, in standard deviations, of each `Measured` of a `model`."""
-    names = [one.name for one in model.measured]
+def residuals_by_name(model: Model, linear: Linearisation) -> list[tuple[str, float]]:
+    """Return the name and the residual, in standard deviations, of each number of each `Measured`
+    of a `model`.
+    """
+    names = [
+        f"{one.name} {place}" if one.value.ndim else one.name
+        for one in model.measured
+        for place in range(one.value.size)
+    ]
     return list(zip(names, linear.extra[len(linear.extra) - len(names) :].tolist(), strict=True))
 
 

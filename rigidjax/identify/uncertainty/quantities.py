@@ -251,7 +251,7 @@ def reported_quantities(
         shown = float(np.exp(value)) if positive else float(value)
         least, most = -np.inf, 1.0 if name.startswith(Ratios.log_names) else np.inf
         mine = tuple((float(rho[index]), away) for rho, away in cuts)
-        if positive and close[index] > deviation * shown:
+        if close[index] and close[index] > abs(deviation * shown):
             deviation, positive, least, mine = close[index], False, 0.0, ()
         # No number is known better than its round-off.
         smallest = np.finfo(float).eps * (1.0 if positive else abs(shown))
