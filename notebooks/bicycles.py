@@ -137,6 +137,7 @@ def joint(name):
     ]  # fmt: skip
     t, still = np.arange(4.0), np.tile([1.0, 0, 0, 0], (4, 1))
     scale = rj.torques.LoggedMotion(t, np.zeros((4, 3)), still)  # each part lies on a scale
+    coms = {part: body.com for part, body in bodies_of(m, classical(m)).items()}
     records, charts = {}, {}
     for part in PARTS:
         mass, wide = m[f"m{part}"], width[f"m{part}"]
@@ -144,7 +145,7 @@ def joint(name):
         sensor = identify.ForceTorque(noise, gravity=[0.0, 0.0, -9.81])
         weight = np.tile([0, 0, 9.81 * mass, 0, 0, 0], (4, 1))
         records[part] = identify.Recording(t, (sensor, weight), inputs={"motion": scale})
-        charts[part] = identify.Mass(rj.shapes.box(mass, [0.5, 0.2, 0.5]))
+        charts[part] = identify.Mass(rj.shapes.box(mass, [0.5, 0.2, 0.5]).shift(coms[part]))
     errors = identify.Free(np.zeros(len(ERRORS)), "errors", prior=1.0)
     torque = rj.torques.Carried()
     places = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xz": (0, 2)}
