@@ -161,3 +161,15 @@ def joint(name):
 
     model = identify.Model(records, charts, torque=torque, free=[errors], measured=measured)
     return model, wanted
+
+
+def compared(name):
+    """The joint fit, and the ends of its 95 % intervals of the numbers `WANTED`, minus the
+    published numbers, in published deviations.
+    """
+    model, wanted = joint(name)
+    fit = identify.fit(model)
+    published, stated = (
+        np.array([numbers(name, "published", which)[key] for key in WANTED]) for which in (0, 1)
+    )
+    return fit, [(np.asarray(end) - published) / stated for end in fit.interval_of(wanted)]
