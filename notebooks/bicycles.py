@@ -106,8 +106,8 @@ def bodies_of(m, found):
 
 
 def joint(name):
-    """One model of all parts, whose bodies are possible, and a function of its points that returns
-    the numbers `WANTED`: each measured number has an error.
+    """One model of all parts, whose bodies are possible, a function of its points that returns the
+    numbers `WANTED`, and where to start: each measured number has an error.
     """
     m, width = numbers(name, "measured"), numbers(name, "measured", 1)
 
@@ -133,11 +133,16 @@ def joint(name):
         identify.Measured(lambda point: periods(at(point), point.body),
                           [m[k] for k in TIMED], [width[k] for k in TIMED], "period"),
         identify.Measured(lines, [m[k] for k in LINES], [width[k] for k in LINES], "plumb line"),
-        identify.Measured(symmetry, np.zeros(20), 1e-6, "symmetry"),
+        identify.Measured(symmetry, np.zeros(20), 1e-5, "symmetry"),
     ]  # fmt: skip
     t, still = np.arange(4.0), np.tile([1.0, 0, 0, 0], (4, 1))
     scale = rj.torques.LoggedMotion(t, np.zeros((4, 3)), still)  # each part lies on a scale
-    coms = {part: body.com for part, body in bodies_of(m, classical(m)).items()}
+    # A possible body near each: the moment about y is at most the sum of the others.
+    found = classical(m)
+    for part in "BH":
+        most = 0.99 * (found[f"I{part}xx"] + found[f"I{part}zz"])
+        found[f"I{part}yy"] = min(found[f"I{part}yy"], most)
+    guesses = bodies_of(m, found)
     records, charts = {}, {}
     for part in PARTS:
         mass, wide = m[f"m{part}"], width[f"m{part}"]
@@ -145,7 +150,7 @@ def joint(name):
         sensor = identify.ForceTorque(noise, gravity=[0.0, 0.0, -9.81])
         weight = np.tile([0, 0, 9.81 * mass, 0, 0, 0], (4, 1))
         records[part] = identify.Recording(t, (sensor, weight), inputs={"motion": scale})
-        charts[part] = identify.Mass(rj.shapes.box(mass, [0.5, 0.2, 0.5]).shift(coms[part]))
+        charts[part] = identify.Mass(guesses[part])
     errors = identify.Free(np.zeros(len(ERRORS)), "errors", prior=1.0)
     torque = rj.torques.Carried()
     places = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xz": (0, 2)}
@@ -160,16 +165,18 @@ def joint(name):
         return jnp.stack([tensors[key] for key in WANTED])
 
     model = identify.Model(records, charts, torque=torque, free=[errors], measured=measured)
-    return model, wanted
+    return model, wanted, model.start(guesses)
 
 
 def compared(name):
-    """The joint fit, and the ends of its 95 % intervals of the numbers `WANTED`, minus the
-    published numbers, in published deviations.
+    """The joint fit; of its numbers `WANTED` how far they are from the published ones, in published
+    deviations, and how wide their intervals are beside the published.
     """
-    model, wanted = joint(name)
-    fit = identify.fit(model)
+    model, wanted, start = joint(name)
+    fit = identify.fit(model, initial=start, starts=1)
     published, stated = (
         np.array([numbers(name, "published", which)[key] for key in WANTED]) for which in (0, 1)
     )
-    return fit, [(np.asarray(end) - published) / stated for end in fit.interval_of(wanted)]
+    low, high = fit.interval_of(wanted)
+    off = (np.asarray(wanted(model.unpack(fit.x))) - published) / stated
+    return fit, off, (high - low) / (2 * 1.959964 * stated)

@@ -35,3 +35,17 @@ def test_measured_periods_give_the_published_numbers_with_their_deviations(name)
         assert abs(found[key] - published[key]) < 1e-6 * stated[key], key
         deviation = np.sqrt(sum((float(s) * width[k]) ** 2 for k, s in slopes[key].items()))
         np.testing.assert_allclose(deviation, stated[key], rtol=1e-6, err_msg=key)
+
+
+def test_one_fit_of_all_parts_takes_the_best_of_its_plumb_lines():
+    fit, off, wide = bicycles.compared("Crescendo")
+    assert fit.ok
+    for body in fit.body.values():
+        assert (np.linalg.eigvalsh(body.second_moment) > 0).all()
+    # A wheel has as many periods as moments: nothing changes. Three plumb lines show two numbers of
+    # a centre of mass, and the classical reduction takes the mean of the places where they meet.
+    np.testing.assert_allclose(off[:4], 0.0, rtol=0, atol=0.01)
+    np.testing.assert_allclose(wide[:4], 1.0, rtol=0, atol=0.01)
+    assert np.abs(off).max() < 1.6
+    assert (wide < 1.005).all()
+    assert wide.min() == pytest.approx(0.85, abs=0.01)
