@@ -226,7 +226,6 @@ def carried_bodies(model: Model, names: list[str]) -> dict[str, Any]:
         errors.append((weights * error).reshape(model.count, -1))
         slopes.append((weights[..., None] * jacobian).reshape(model.count, -1, 10))
     matrix = np.concatenate(slopes, axis=1)
-    guesses = dict(zip(names, body_list(model.bodies(x)), strict=True))
     # The errors without a body: the numbers of a light one are then not lost beside `_UNIT`.
     side = matrix @ _UNIT - np.concatenate(errors, axis=1)
 
@@ -241,6 +240,7 @@ def carried_bodies(model: Model, names: list[str]) -> dict[str, Any]:
 
         ten, _, rank, _ = solve(side[mine].ravel())
         if rank < 10:  # what the motion does not show stays that of the first guess
+            guesses = dict(zip(names, body_list(model.bodies(x)), strict=True))
             guess = np.asarray(pseudo_inertia(guesses[name]))[rows, columns]
             ten = guess + solve(side[mine].ravel() - rows_of_body @ guess)[0]
         whole[rows, columns] = whole[columns, rows] = ten
