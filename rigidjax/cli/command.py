@@ -211,6 +211,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--limit": dict(
         type=float, help="full scale of the rates, in the unit of the rates: a reading at full "
         "scale means a rate of at least this size (default: found where the log shows a plateau)"),
+    "--tolerance": dict(
+        metavar="WORD|SCALE", help="how far a gyro or accelerometer may be off: phone, consumer, "
+        "industrial, calibrated, or the deviation of its scale and axes, such as 0.01 (default: "
+        "not considered)"),
     "--loss": dict(
         choices=tuple(spec.LOSSES), default="soft-l1",
         help="how a large residual counts: linearly (soft-l1, huber) or squared (none); default: "
@@ -348,6 +352,7 @@ def _columns(
             unit, time_unit = unit or found.unit, time_unit or found.time_unit
             if not unit:
                 warn(f"{path}: no unit of the rates is said: read in rad/s; or give --unit deg/s")
+    tolerance = spec.tolerance(options.tolerance)
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
         if alone:
@@ -365,7 +370,10 @@ def _columns(
             raise LogError(f"--limit: wanted a positive number, got {options.limit}")
         channels = [spec.Channel("gyro", tuple(rates), unit, noise, options.limit)]
     units = [spec.unit_of_channel(path, log, one) for one in channels]
-    channels = [dataclasses.replace(c, unit=u) for c, u in zip(channels, units, strict=True)]
+    channels = [
+        dataclasses.replace(c, unit=u, tolerance=tolerance)
+        for c, u in zip(channels, units, strict=True)
+    ]
     return channels, dict(time=time, rate=rate, time_unit=time_unit)
 
 

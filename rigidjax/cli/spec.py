@@ -36,7 +36,9 @@ from rigidjax.identify.sensors import (
     AttitudeSensor,
     ForceTorque,
     Gyro,
+    Tolerance,
 )
+from rigidjax.identify.sensors.tolerance import tolerance_of
 from rigidjax.motion.torques import (
     Carried,
     Damping,
@@ -83,6 +85,7 @@ class Channel(eqx.Module):
     unit: str | None
     noise: tuple[float, ...] | None
     limit: float | None = None
+    tolerance: Tolerance | str | None = None
 
 
 class WheelColumn(eqx.Module):
@@ -299,9 +302,10 @@ def _sensor(
     noise = None if channel.noise is None else factor * np.array(channel.noise)
     limit = None if channel.limit is None else channel.limit * factor
     if channel.kind == "gyro":
-        return Gyro(noise, bias=zero, limit=limit), values
+        return Gyro(noise, bias=zero, limit=limit, tolerance=channel.tolerance), values
     if channel.kind == "accelerometer":
-        return Accelerometer(noise, place=[0.0, 0.0, 0.0], bias=zero, limit=limit), values
+        more: Any = dict(bias=zero, limit=limit, tolerance=channel.tolerance)
+        return Accelerometer(noise, place=[0.0, 0.0, 0.0], **more), values
     if channel.kind == "quaternion":
         return AttitudeSensor(noise), values
     try:
@@ -498,3 +502,18 @@ def _parameters(
             where = of_torque(index, "momentum.delay")
             items.append(Free(where, f"{wheel} delay", scale=1e-3, each=True))
     return items
+
+
+def tolerance(text: str | None) -> Tolerance | str | None:
+    """Return what `--tolerance` states: a word, or a number as the deviation of scale and axes."""
+    try:
+        return None if text is None else tolerance_of(text)
+    except ValueError:
+        pass
+    try:
+        return Tolerance(scale=float(text), cross_axis=float(text))
+    except ValueError:
+        raise LogError(
+            "--tolerance: wanted phone, consumer, industrial, calibrated, or a positive number "
+            f"such as 0.01, got {text!r}"
+        ) from None

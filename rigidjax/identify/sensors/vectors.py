@@ -69,7 +69,8 @@ class Gyro(VectorSensor):
       stamps are independent. An error of a time stamp changes the reading; this change is computed
       as the error times the time derivative of the prediction. The result is right if the body
       turns little in a time as long as the jitter.
-    - `tolerance`: a `Tolerance` for scale, axes, bias and clock.
+    - `tolerance`: a `Tolerance` for scale, axes, bias and clock, or a word for one: "phone",
+      "consumer", "industrial", "calibrated".
     - `g_sensitivity`: (3, 3) the matrix G, in rad/s per m/s², whose product with f is added to the
       reading. The vector f is the specific force at the gyro, in the body's axes.
     - `place`: (3,) the place of the gyro, in metres, as for `Accelerometer`; it needs
