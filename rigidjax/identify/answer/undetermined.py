@@ -1,6 +1,7 @@
 """Describe in words which numbers a fit leaves undetermined."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -51,6 +52,9 @@ FAR = 0.3
 # A sentence on a combination lists at most MOST numbers, and a report has sentences on at most
 # SEVERAL combinations.
 MOST, SEVERAL = 6, 5
+# The unit of rates is in doubt if a body whose moments differ by less than the factor ALIKE turns
+# faster than FAST, rad/s.
+FAST, ALIKE = 10.0, 0.9
 
 
 class Combination(eqx.Module):
@@ -388,6 +392,7 @@ def describe_identifiability(
         if not (size[..., 1].max(axis=1) < np.linalg.norm(size[..., 0], axis=1)).all():
             many = "rate is" if count == 1 else "rates are"
             out.append(f"The initial body {many} not determined by these data.")
+    out += _describe_limits(moments)
     out += _describe_combinations(point, uncertainty)
     if point.model.torque is None:
         out.append(
@@ -397,10 +402,38 @@ def describe_identifiability(
         if all(isinstance(sensor, Gyro) for sensor in point.model.records.sensors):
             out.append(
                 "Rates of free motion with an axis mirrored or two axes swapped fit another body "
-                "as well: they cannot show such a mistake."
+                "as well: they cannot show such a mistake. Nor do they show rates in the world's "
+                "axes if two moments are alike, or rates in deg/s read as rad/s if all are."
             )
+            out += _describe_near_ball(point)
     out += describe_full_scale(point.model.records.readings)
     return tuple(out)
+
+
+def _describe_near_ball(point: BestPoint) -> list[str]:
+    """Describe a free body that is nearly a ball and turns so fast that its unit is in doubt."""
+    rate = float(np.max(np.asarray(point.model.reference.rate)))
+    bodies = body_list(point.model.bodies(point.x))
+    moments = np.linalg.eigvalsh(np.stack([np.asarray(tensor_of(body)) for body in bodies]))
+    if rate < FAST or (moments[:, 0] < ALIKE * moments[:, -1]).any():
+        return []
+    return [
+        f"Nearly a ball, at {rate:.2g} rad/s: so look rates in deg/s that were read as rad/s. "
+        "Check the unit of the rates."
+    ]
+
+
+def _describe_limits(quantities: Sequence[Quantity]) -> list[str]:
+    """Describe a ratio whose interval is tiny beside another one that spans all possible values."""
+    wide = [(q, np.ptp(np.asarray(q.interval(0.95)))) for q in quantities if "/" in q.name]
+    tiny = [q for q, width in wide if width < 1e-4 * q.value]
+    free = [q for q, width in wide if width > 0.5]
+    return [
+        f"The interval of {one.name} is a thousandth of a per cent wide or less, that of "
+        f"{free[0].name} spans most of what is possible: the fit lies at a limit of real bodies, "
+        "and neither interval says much."
+        for one in tiny[: len(free)]
+    ]
 
 
 def _half_width(quantity: Quantity) -> float:
