@@ -280,9 +280,14 @@ def _recorded_data(
         integrator = _held_steps(integrator)
     elif integrator is None and torque is not None and not (carried or solved):
         widest = max(float(np.diff(r.t).max()) for r in recordings)
-        integrator = integrator_for(1.5 * widest * float(np.max(np.asarray(reference.rate))))
+        integrator = chosen_integrator(widest, reference)
     size = 0 if carried else dimension(stacking.pick(reference.state, 0))
     return _Data(records, counts, sensors, state_kind, reference, size, integrator)
+
+
+def chosen_integrator(widest: float, reference: ReferenceStates) -> AbstractIntegrator:
+    """Return an integrator for times that are at most `widest`, s, apart."""
+    return integrator_for(1.5 * widest * float(np.max(np.asarray(reference.rate))))
 
 
 def _windowed_data(

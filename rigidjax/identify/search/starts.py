@@ -3,6 +3,7 @@ scatter.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,7 +17,7 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import from_components
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, input_functions
-from rigidjax.identify.data.reference_states import rates
+from rigidjax.identify.data.reference_states import Samples, rates
 from rigidjax.identify.model.charts import BASIS, body_list
 from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
 from rigidjax.identify.model.model import (
@@ -59,7 +60,8 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
         if _is_carried(one):
             mine = carried_bodies(one, list(members))
         else:
-            mine = {name: regress_inertia(tuple(r), one.torque) for name, r in members.items()}
+            every = ((name, regress_inertia(tuple(r), one.torque)) for name, r in members.items())
+            mine = {name: None if one is None else one.body for name, one in every}
         found = {name: body for name, body in mine.items() if body is not None} | found
     swings = [part for part in parts_of(model) if part.model.state_kind is Turn]
     seen: dict[int, Any] = {}
@@ -171,14 +173,28 @@ def _is_carried(model: Model) -> bool:
     return isinstance(model.torque, Carried)
 
 
-def regress_inertia(recordings: tuple[Recording, ...], torque: Law | None) -> Inertia | None:
+class Regression(NamedTuple):
+    """Hold the inertia of a body and the coefficients of further torques on it."""
+
+    body: Inertia
+    coefficients: Float[np.ndarray, " k"]
+
+
+# This maps times (n,) and body rates (n, 3) to k torques (n, 3, k).
+TorqueColumns = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def regress_inertia(
+    recordings: tuple[Recording, ...], torque: Law | None, further: TorqueColumns | None = None
+) -> Regression | None:
     """Return the inertia of a body by a regression on Euler's equations in integral form.
 
-    The equation `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. Without a
-    torque they are found up to scale, as the right singular vector of the smallest singular value.
-    Principal second moments that are too small or negative are raised to 1 % of the largest one.
-    The result is `None` if samples are too few or too far apart, if the torque depends on more than
-    time and rate, or if the tensor has no positive trace.
+    The equation `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I, and in the
+    coefficients of `further` torques. Without a `torque` they are found up to scale, as the right
+    singular vector of the smallest singular value. Principal second moments that are too small or
+    negative are raised to 1 % of the largest one. The result is `None` if samples are too few or
+    too far apart, if the torque depends on more than time and rate, or if the tensor has no
+    positive trace.
     """
     balances = []
     for recording in recordings:
@@ -187,15 +203,17 @@ def regress_inertia(recordings: tuple[Recording, ...], torque: Law | None) -> In
             return None
         if not rate_only(torque):
             return None
-        balances.append(integrated_euler(recording, torque, np.eye(3)))
+        balances.append(integrated_euler(recording, torque, Samples(t, w), further))
     matrix, side, _ = (np.concatenate(part) for part in zip(*balances, strict=True))
-    tensor = np.einsum("k,kij->ij", solve_inertia(matrix, side).components, BASIS)
+    numbers = solve_inertia(matrix, side).components
+    tensor = np.einsum("k,kij->ij", numbers[:6], BASIS)
     if not np.trace(tensor) > 0:
         return None
     values, axes = np.linalg.eigh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
     values = np.maximum(values, 1e-2 * values.max())
     second_moment = (axes * values) @ axes.T
-    return Inertia(jnp.asarray(np.trace(second_moment) * np.eye(3) - second_moment))
+    body = Inertia(jnp.asarray(np.trace(second_moment) * np.eye(3) - second_moment))
+    return Regression(body, numbers[6:])
 
 
 # The place of each of ten numbers in the symmetric matrix ∫ (r, 1)(r, 1)ᵀ dm: second moments about
@@ -249,7 +267,7 @@ def carried_bodies(model: Model, names: list[str]) -> dict[str, Any]:
         units = np.array([size, size, size, 1.0])
         values, axes = np.linalg.eigh(whole / np.outer(units, units))
         if not values[0] > 0:
-            values = np.maximum(values, _POSSIBLE * values[-1])
+            values = np.maximum(values, _POSSIBLE * np.abs(values).max())
             whole = (axes * values) @ axes.T * np.outer(units, units)
         return _body_of_ten(jnp.asarray(whole[rows, columns]))
 
@@ -281,15 +299,15 @@ def _linear_errors(model: Model, x: Float[Array, " n"]) -> FirstOrder:
 
 
 class Components(NamedTuple):
-    """Hold the six components of an inertia tensor."""
+    """Hold the six components of an inertia tensor, and the coefficients of further torques."""
 
-    components: Float[np.ndarray, "6"]
+    components: Float[np.ndarray, " k"]
     # The smallest eigenvalue of the matrix of second moments, divided by the largest magnitude of
     # one: positive if a body can have this tensor.
     margin: float
 
 
-def solve_inertia(matrix: Float[np.ndarray, "n 6"], rhs: Float[np.ndarray, " n"]) -> Components:
+def solve_inertia(matrix: Float[np.ndarray, "n k"], rhs: Float[np.ndarray, " n"]) -> Components:
     """Return the inertia tensor that solves `matrix @ components = rhs` by least squares.
 
     If `rhs` is zero, the scale is unknown, and the trace is set to one.
@@ -300,7 +318,7 @@ def solve_inertia(matrix: Float[np.ndarray, "n 6"], rhs: Float[np.ndarray, " n"]
         components = np.linalg.svd(matrix, full_matrices=False)[2][-1]
         components = components * np.sign(components[:3].sum())
         components = components / components[:3].sum()
-    tensor = np.einsum("k,kij->ij", components, BASIS)
+    tensor = np.einsum("k,kij->ij", components[:6], BASIS)
     values = np.linalg.eigvalsh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
     return Components(components, float(values[0] / max(np.abs(values).max(), 1e-300)))
 
@@ -315,7 +333,7 @@ def rate_only(torque: Law | None) -> bool:
 class Balance(NamedTuple):
     """Hold the integral of Euler's equations, `matrix @ components = rhs`."""
 
-    matrix: Float[np.ndarray, "n 6"]
+    matrix: Float[np.ndarray, "n k"]
     # The impulse of the torque.
     rhs: Float[np.ndarray, " n"]
     # The part of the matrix from the angular momentum IΩ; the rest is the integral of Ω × IΩ.
@@ -323,21 +341,25 @@ class Balance(NamedTuple):
 
 
 def integrated_euler(
-    recording: Recording, torque: Law | None, rate_matrix: Float[np.ndarray, "3 3"]
+    recording: Recording,
+    torque: Law | None,
+    rates: Samples,
+    further: TorqueColumns | None = None,
 ) -> Balance:
-    """Return Euler's equations integrated over a recording, linear in the components of the tensor.
-
-    The recorded rates are first multiplied by `rate_matrix`.
+    """Return Euler's equations integrated along the body `rates` of a recording, linear in the
+    components of the tensor and in the coefficients of `further` torques.
     """
-    t, w = rates(recording)
-    w, pushed = w @ rate_matrix.T, np.zeros((t.size, 3))
+    (t, w), pushed = rates, np.zeros((rates.t.size, 3))
     if torque is not None:
         pushed = np.asarray(_torques(bind(torque, input_functions(recording)), t, w))
     momenta = np.einsum("kij,tj->tki", BASIS, w)
-    turned = np.concatenate([np.cross(w[:, None, :], momenta), pushed[:, None, :]], axis=1)
+    more = np.zeros((t.size, 3, 0)) if further is None else further(t, w)
+    parts = np.cross(w[:, None, :], momenta), -more.swapaxes(1, 2), pushed[:, None, :]
+    turned = np.concatenate(parts, axis=1)
     steps = 0.5 * (turned[1:] + turned[:-1]) * np.diff(t)[:, None, None]
     integral = np.concatenate([np.zeros_like(turned[:1]), np.cumsum(steps, axis=0)])
-    total, impulse = momenta + integral[:, :-1], integral[:, -1:]
+    total, impulse = integral[:, :-1], integral[:, -1:]
+    total[:, :6] += momenta
 
     def less_mean(x: np.ndarray) -> np.ndarray:
         # Each integrated equation has an unknown constant of integration. The difference of each
