@@ -1,34 +1,58 @@
 """Find the most likely cause of the errors of a fit.
 
-Each cause has a direction: the change that the cause would make in the readings along the fitted
-motion. The errors are regressed on this direction together with the derivatives of the readings
-with respect to all parameters (a score test: Rao 1948, doi:10.1017/S0305004100023987). Therefore a
-cause explains nothing if a change of the parameters has the same effect on the readings.
+A mistake with which a file was read is looked for in the readings themselves. Any other cause has
+a direction: the change that the cause would make in the readings along the fitted motion. The
+errors are regressed on this direction together with the derivatives of the readings with respect
+to all parameters (a score test: Rao 1948, doi:10.1017/S0305004100023987). Therefore a cause
+explains nothing if a change of the parameters has the same effect on the readings. The score test
+chooses which causes are fitted together with the model, and these refits decide.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax.identify.answer.answers import Cause
 from rigidjax.identify.data import stacking
+from rigidjax.identify.data.full_scale import beyond_gyros
 from rigidjax.identify.data.recording import Recording, readings_of
-from rigidjax.identify.data.reference_states import attitudes, mean_rates
+from rigidjax.identify.data.reference_states import Samples, attitudes, mean_rates, rates
 from rigidjax.identify.model.charts import body_list, tensor_of
+from rigidjax.identify.model.free import Free
 from rigidjax.identify.model.model import Model, part_of_sensor
 from rigidjax.identify.model.terms import Noise, scaled_slopes
+from rigidjax.identify.model.widened import widened
+from rigidjax.identify.search.stages import (
+    STRIDE,
+    Attempt,
+    Task,
+    blocks_at,
+    fit_in_stages,
+    search_whole,
+)
 from rigidjax.identify.search.starts import (
+    TorqueColumns,
     integrated_euler,
     rate_only,
+    regress_inertia,
     solve_inertia,
+    starting_points,
 )
-from rigidjax.identify.sensors import AbstractSensor, Gyro
+from rigidjax.identify.sensors import AbstractSensor, ForceTorque, Gyro
 from rigidjax.identify.sensors.base import extras
 from rigidjax.identify.uncertainty.considered import slope_in_time
-from rigidjax.identify.uncertainty.covariance import Linearisation
+from rigidjax.identify.uncertainty.covariance import (
+    Linearisation,
+    linearise,
+    white_noise_variance,
+)
+from rigidjax.motion import torques
 from rigidjax.motion.suspension import Law
 
 # A correction of the recorded body rates is believed if two conditions hold. The error of the
@@ -39,22 +63,43 @@ BETTER, LITTLE = 0.5, 0.3
 # Several corrections cannot be told apart if the error with each of them is at most EQUAL times the
 # least error: all of them are then named.
 EQUAL = 1.1
+# At most this number of causes that cannot be told apart are named.
+MOST = 3
 _SAME = np.eye(3)
 
-# These matrices (3, 3) correct the body rates for each mistake with which rates may be read.
-RATES = {
-    "deg/s read as rad/s": _SAME * np.pi / 180,
-    "rad/s read as deg/s": _SAME * 180 / np.pi,
-    "the x axis mirrored": np.diag([-1.0, 1.0, 1.0]),
-    "the y axis mirrored": np.diag([1.0, -1.0, 1.0]),
-    "the z axis mirrored": np.diag([1.0, 1.0, -1.0]),
-    "all signs turned round": -_SAME,
-    "x and y swapped": _SAME[[1, 0, 2]],
-    "y and z swapped": _SAME[[0, 2, 1]],
-    "x and z swapped": _SAME[[2, 1, 0]],
-    "axes in the order y, z, x": _SAME[[2, 0, 1]],
-    "axes in the order z, x, y": _SAME[[1, 2, 0]],
-}
+UNITS = {"deg/s read as rad/s": _SAME * np.pi / 180, "rad/s read as deg/s": _SAME * 180 / np.pi}
+WORLD = "rates in the world's axes, not the body's"
+
+
+def _orders() -> dict[str, Float[np.ndarray, "3 3"]]:
+    """Return the matrices that correct rates read in one of the 47 wrong signed orders of axes."""
+    words = {
+        (0, 1, 2): "",
+        (1, 0, 2): "x and y swapped",
+        (0, 2, 1): "y and z swapped",
+        (2, 1, 0): "x and z swapped",
+        (1, 2, 0): "axes in the order y, z, x",
+        (2, 0, 1): "axes in the order z, x, y",
+    }
+    out = {}
+    for signs, order in itertools.product(itertools.product([1.0, -1.0], repeat=3), words):
+        # Channel i reads `signs[i]` times the component `order[i]` of the rate.
+        read = np.diag(signs) @ _SAME[list(order)]
+        minus = [axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0]
+        kept = [axis for axis, own in zip("xyz", np.diag(read), strict=True) if own == 1.0]
+        if words[order]:
+            turn = f" (a quarter turn about {kept[0]})" if kept and len(minus) == 1 else ""
+            back = f", {' and '.join(minus)} reversed" if minus else ""
+            out[f"{words[order]}{back}{turn}"] = read.T
+        elif minus:
+            one = f"the {minus[0]} axis mirrored", f"half a turn about {''.join(kept)}"
+            out[(*one, "all signs turned round")[len(minus) - 1]] = read.T
+    return out
+
+
+ORDERS = _orders()
+# Without attitudes, but under a torque, only these orders are tried.
+FEW_ORDERS = {n: m for n, m in ORDERS.items() if not any(w in n for w in ("reversed", "half"))}
 # These functions correct quaternions (n, 4) for each mistake with which attitudes may be read.
 ATTITUDES = {
     "the quaternion's scalar last, not first": lambda q: np.roll(q, 1, axis=-1),
@@ -66,54 +111,67 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Law | None) -
     """Return the likely mistake with which the gyro or the attitudes of one body were read.
 
     The correction of each possible mistake is tried on the recordings. The rates of the gyro are
-    compared with the rates between successive attitudes. Without attitudes the rates are inserted
-    in Euler's equations with the inertia that fits best, and a correction is accepted only if a
-    real body can have this inertia. A mirrored axis then shows only under a torque: free motion
-    with a mirrored axis is a free motion, too.
+    compared with the rates between successive attitudes. Without one of the two the rates are
+    inserted in Euler's equations with the inertia that fits best, and a correction is accepted only
+    if a real body can have this inertia. A wrong order of axes of a gyro then shows only under a
+    torque: free motion with a mirrored axis is a free motion, too.
     """
     gyros = readings_of(recordings[0], Gyro)
-    if not gyros:
-        return None
-    turn, scale = (getattr(gyros[0].sensor, name) for name in ("mounting", "scale"))
+    turn, scale = (getattr(gyros[0].sensor, n) if gyros else None for n in ("mounting", "scale"))
     # Look for no mistake if the user gave a large mounting turn, or a scale far from 1: this user
     # has considered the axes and the units of the sensor.
     if turn is not None and np.abs(turn).max() >= 0.1:
         return None
     if scale is not None and np.abs(np.asarray(scale) - 1).max() >= 0.1:
         return None
-    known = [attitudes(recording) for recording in recordings]
-    if all(len(t) > 10 for t, _ in known):
-        bound = BETTER * _rate_difference(recordings, known, _SAME)
-        ratios = {name: _rate_difference(recordings, known, turn) for name, turn in RATES.items()}
+    known, read = ([of(one) for one in recordings] for of in (attitudes, rates))
+    turning = all(len(t) > 10 for t, _ in known)
+    bound, ratios = np.inf, {}
+    if gyros and turning:
+        pairs = list(zip(read, known, strict=True))
+        shown, wanted, world = (np.concatenate(p) for p in zip(*map(_beside, pairs), strict=True))
+        bound = BETTER * _difference(shown, wanted)
+        turns = (UNITS | ORDERS).items()
+        ratios = {name: _difference(shown @ turn.T, wanted) for name, turn in turns}
+        ratios[WORLD] = _difference(world, wanted)
         for name, change in ATTITUDES.items():
-            changed = [(t, change(q)) for t, q in known]
-            ratios[name] = _rate_difference(recordings, changed, _SAME)
-    elif rate_only(torque):
-        bound, margin = _euler_residual(recordings, torque, _SAME)
+            changed = [_beside((w, Samples(t, change(q)))) for w, (t, q) in pairs]
+            shown, wanted, _ = (np.concatenate(p) for p in zip(*changed, strict=True))
+            ratios[name] = _difference(shown, wanted)
+    elif gyros and beyond_gyros(recordings[0].readings):
+        ratios = {"deg/s read as rad/s": 0.0}
+    elif (gyros or turning) and rate_only(torque):
+        bound, margin = _euler_residual(recordings, read, torque)
         # The body that fits the uncorrected rates best may be unreal. Sensor errors alone can make
         # it slightly unreal, but not as far as a margin of −0.8. With such a margin the file was
         # misread, and a correction to a real body is believed even if it does not make the residual
         # smaller.
         bound *= BETTER if margin > -0.8 else EQUAL
-        fits = {name: _euler_residual(recordings, torque, turn) for name, turn in RATES.items()}
+        fits = {}
+        orders = {} if torque is None else FEW_ORDERS
+        for name, turn in (UNITS | orders if gyros else {}).items():
+            turned = [Samples(t, w @ turn.T) for t, w in read]
+            fits[name] = _euler_residual(recordings, turned, torque)
+        for name, change in ({} if gyros else ATTITUDES).items():
+            turned = [mean_rates(t, change(q)) for t, q in known]
+            fits[name] = _euler_residual(recordings, turned, torque)
         if torque is not None:
-            fits["the torque with the other sign"] = _euler_residual(
-                recordings, torque, _SAME, -1.0
-            )
+            other = "the torque with the other sign"
+            fits[other] = _euler_residual(recordings, read, torque, -1.0)
         # A correction is believed only if the body that fits best is real (a margin not below
         # zero) and no ball (a margin near 1): any constant rate is a free motion of a ball, so that
         # a ball is no evidence for a correction.
         ratios = {name: left if -0.01 < m < 0.8 else np.inf for name, (left, m) in fits.items()}
-    else:
-        return None
-    least = min(ratios.values())
+    least = min(ratios.values(), default=np.inf)
     if not least < min(bound, LITTLE):
         return None
-    words = " or ".join(name for name, left in ratios.items() if left <= EQUAL * least)
+    equal = [name for name in sorted(ratios, key=ratios.get) if ratios[name] <= EQUAL * least]
+    words = " or ".join(equal)
     if all(np.median(np.diff(recording.t)) == 1 for recording in recordings):
         # The motion shows the product of rates and times only.
         words = words.replace("deg/s read", "numbers of frames read as times, or deg/s read")
-    return Cause("misread", "Gyro", 1.0, f"most likely {words}", f"read the log again: {words}")
+    kind = "Gyro" if gyros else "AttitudeSensor"
+    return Cause("misread", kind, 1.0, f"most likely {words}", f"read the log again: {words}")
 
 
 class _EulerResidual(NamedTuple):
@@ -125,54 +183,77 @@ class _EulerResidual(NamedTuple):
 
 def _euler_residual(
     recordings: Sequence[Recording],
+    rates: Sequence[Samples],
     torque: Law | None,
-    correction: Float[np.ndarray, "3 3"],
     sign: float = 1.0,
 ) -> _EulerResidual:
     """Return the residual of Euler's equations with the inertia tensor that fits best.
 
-    The recorded rates are multiplied by `correction`, the torque by `sign`.
+    The torque is multiplied by `sign`.
     """
-    balances = [integrated_euler(recording, torque, correction) for recording in recordings]
+    pairs = zip(recordings, rates, strict=True)
+    balances = [integrated_euler(recording, torque, mine) for recording, mine in pairs]
     matrix, side, momentum = (np.concatenate(part) for part in zip(*balances, strict=True))
     components, margin = solve_inertia(matrix, sign * side)
     left = np.linalg.norm(matrix @ components - sign * side)
     return _EulerResidual(float(left / np.linalg.norm(momentum @ components)), margin)
 
 
-def _rate_difference(
-    recordings: Sequence[Recording],
-    attitudes: Sequence[tuple[np.ndarray, np.ndarray]],
-    correction: Float[np.ndarray, "3 3"],
-) -> float:
-    """Return the root mean square difference of the rates of a gyro, times `correction`, from those
-    between successive `attitudes` (times and quaternions), relative to these.
-    """
-    left, size = 0.0, 1e-300
-    for recording, (t, q) in zip(recordings, attitudes, strict=True):
-        when, wanted = mean_rates(t, jnp.asarray(q))
-        reading = readings_of(recording, Gyro)[0]
-        used = reading.host_mask
-        gyro_times, w = np.asarray(recording.t)[used], np.asarray(reading.values)[used]
-        shown = np.stack(
-            [np.interp(when, gyro_times, axis) for axis in (w @ correction.T).T], axis=1
-        )
-        left += float(np.sum((shown - wanted) ** 2))
-        size += float(np.sum(wanted**2))
-    return float(np.sqrt(left / size))
+class _Beside(NamedTuple):
+    """Hold what a gyro reads, and the rates between successive attitudes, at the same times."""
+
+    shown: Float[np.ndarray, "n 3"]
+    wanted: Float[np.ndarray, "n 3"]
+    body: Float[np.ndarray, "n 3"]  # what it reads, turned from the world's to the body's axes
 
 
-# The best cause is named if it explains more than the fraction ENOUGH of the squared errors. A
-# cause that explains at least NEARLY times as much as the best one is then named, too.
-ENOUGH, NEARLY = 0.7, 0.95
+def _beside(pair: tuple[Samples, Samples]) -> _Beside:
+    (t, w), (times, q) = pair
+    when, wanted = mean_rates(times, jnp.asarray(q))
+    shown = np.stack([np.interp(when, t, axis) for axis in w.T], axis=1)
+    at = np.clip(np.searchsorted(times, when), 0, len(times) - 1)
+    return _Beside(shown, wanted, _rotation(q[at]).inv().apply(shown))
+
+
+def _rotation(q: Float[np.ndarray, "n 4"]) -> Any:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(np.roll(q, -1, axis=-1))
+
+
+def _difference(shown: Float[np.ndarray, "n 3"], wanted: Float[np.ndarray, "n 3"]) -> float:
+    """Return the root mean square difference of rates from those `wanted`, relative to these."""
+    return float(np.linalg.norm(shown - wanted) / max(np.linalg.norm(wanted), 1e-150))
+
+
+def _in_body_axes(rates: Samples) -> Samples:
+    """Return body rates from rates in the world's axes, whose integral is the attitude."""
+    from scipy.spatial.transform import Rotation
+
+    t, w = rates
+    attitude, out = Rotation.identity(), [w[0]]
+    for turn, rate in zip(
+        Rotation.from_rotvec(0.5 * (w[1:] + w[:-1]) * np.diff(t)[:, None]), w[1:], strict=True
+    ):
+        attitude = turn * attitude
+        out.append(attitude.inv().apply(rate))
+    return Samples(t, np.stack(out))
+
+
+# A cause is refitted if it explains at least the fraction TRIED of the squared errors, to first
+# order, in at most TURNS rounds. It is named if the refit makes the logarithm of the errors'
+# variance, relative to that of white noise, less by more than the fraction ENOUGH. The rounds end
+# once this logarithm falls by less than SETTLED. Causes whose deviance (−2 log-likelihood) is at
+# most NEARLY higher than that of the best one are named, too. All causes are refitted if the errors
+# have more than the fraction FAR of the readings' variance.
+TRIED, TURNS, SETTLED, ENOUGH, NEARLY, FAR = 0.1, 10, 1e-3, 0.6, 10.0, 1e-3
 # A cause changes the readings along one or more directions of length one. All changes of the
 # readings that the parameters can make are subtracted from them. A combination of the remainders is
 # dropped if its singular value is at most this number, since the parameters could make nearly the
 # same change.
 APART = 0.05
-# The causes in LINEAR change the readings in proportion to their size only if the size is below
-# SMALL.
-LINEAR, SMALL = ("scale", "mounting", "skew"), 0.5
+# The torques of causes, whose `Free`s have these names after the word MISSING.
+TORQUES, MISSING = ("drag", "wheel", "spin-up", "push"), "missing "
 # The entry SKEW[i, j, k] is 1 if the k-th angle of skew adds component i, times this angle, to the
 # reading of axis j.
 SKEW = np.zeros((3, 3, 3))
@@ -181,14 +262,28 @@ SKEW[1, 0, 0] = SKEW[2, 0, 1] = SKEW[2, 1, 2] = 1.0
 
 class _Candidate(NamedTuple):
     name: str
-    direction: Float[np.ndarray, "records times 3 c"]  # the change by a cause of unit size
-    words: str  # with `{size}` for the size of the cause
+    count: int  # of numbers θ that a cause has, such as the components of a bias
+    words: str  # with `{size}` for θ
     remedy: str
+    # Return the change of the predicted readings (R, T, k) for numbers θ.
+    change: Callable[[np.ndarray, np.ndarray], np.ndarray] = lambda shown, theta: 0.0 * shown
+
+    def direction(self, shown: np.ndarray, theta: np.ndarray) -> np.ndarray:
+        """Return the derivative (R, T, k, c) of the change with respect to θ, by differences."""
+        steps = 1e-5 * np.eye(self.count)
+        ends = ((self.change(shown, theta + e), self.change(shown, theta - e)) for e in steps)
+        return np.stack([(after - before) / 2e-5 for after, before in ends], axis=-1)
 
 
 class _Share(NamedTuple):
     share: float  # of the squared errors, 0 to 1
     size: Float[np.ndarray, " c"]  # of the cause, such as the components of a bias
+
+
+class _Refit(NamedTuple):
+    candidate: _Candidate
+    size: Float[np.ndarray, " c"]
+    squares: Float[np.ndarray, " sensors"]  # the mean squared error of each sensor, in noises
 
 
 def causes(
@@ -210,15 +305,19 @@ def causes(
             return (wrong,)
     if not np.isfinite(linear.weighted_jacobian).all():
         return ()
+    model = stacking.pad_to_few(model)
+    linear = linear.first_times(model.records.t.shape[1])
     free = np.linalg.qr(linear.weighted_jacobian)[0]
-    out = []
-    for index in indices:
-        sensor: Any = model.records.readings[index].sensor
-        cause = time_stamp_cause(model, noise, linear, index)
-        if cause is None and _is_vector_error(sensor):
-            rows = _candidates(model, x, linear, index)
-            shares = [_share(model, noise, linear, index, free, row.direction) for row in rows]
-            cause = _likeliest(sensor, rows, shares)
+    out, sensors = [], model.records.sensors
+    # If all sensors that read vectors are explained, one of them may still spoil the others.
+    vectors = [index for index in indices if _is_vector_error(sensors[index])]
+    if not vectors:
+        vectors = [index for index, one in enumerate(sensors) if _is_vector_error(one)]
+    for index in sorted({*indices, *vectors}):
+        sensor: Any = sensors[index]
+        cause = time_stamp_cause(model, noise, linear, index) if index in indices else None
+        if cause is None and index in vectors:
+            cause = _likeliest(model, x, noise, linear, index, free)
         suspect = extras(sensor).suspect
         if cause is None and suspect is not None:
             cause = Cause(suspect[0], type(sensor).__name__, None, *suspect[1:])
@@ -271,33 +370,251 @@ def _cause_with_share(
 
 
 def _likeliest(
-    sensor: AbstractSensor, candidates: Sequence[_Candidate], shares: Sequence[_Share]
+    model: Model,
+    x: Float[Array, " n"],
+    noise: Noise,
+    linear: Linearisation,
+    index: int,
+    free: Float[np.ndarray, "records rows m"],
 ) -> Cause | None:
-    """Return the cause that explains most of the squared errors of a `sensor`, if that is enough.
-
-    Causes that explain nearly as much are joined to it by "or". A large error of the scale,
-    mounting or skew does not change the readings in proportion to its size, as the shares take it,
-    so that it is left out.
+    """Return the cause of the errors of a sensor whose refit explains most of them, if that is
+    enough. Causes that explain nearly as much are joined to it by "or".
     """
-    kept = [
-        (share, one.name, one.words.format(size=", ".join(f"{x:.2g}" for x in size)), one.remedy)
-        for one, (share, size) in zip(candidates, shares, strict=True)
-        if one.name not in LINEAR
-        or np.abs(size).max() < SMALL
-        # A wrong unit, such as g read as m/s², is a large scale error that is the same for all
-        # axes.
-        or (one.name == "scale" and np.ptp(size) < 0.1 * abs(size.mean()))
-    ]
-    most = max((share for share, *_ in kept), default=0.0)
-    if not most > ENOUGH:
+    reading = model.records.readings[index]
+    shown = np.asarray(reading.values) - linear.raw[index]
+    before, floor = _mean_squares(linear), _noise_floor(model, linear)
+    sizes = np.array([mask.sum() for mask in linear.mask])
+    refits, whole = [], None
+    # To first order a cause is known only if the errors are small beside the readings.
+    used, error = linear.mask[index].all(axis=-1), linear.raw[index]
+    far = np.mean(error[used] ** 2) > FAR * np.mean(np.var(shown[used], axis=0))
+    one_by_one = not model.parts and model.clusters is None
+
+    def level(squares: np.ndarray) -> float:
+        return float(sizes @ np.log(np.maximum(squares / floor, 1.0)))
+
+    def deviance(refit: _Refit) -> float:
+        return float(sizes @ np.log(refit.squares) + refit.size.size * np.log(sizes.sum()))
+
+    for one in _candidates(model, x, linear, index):
+        direction = one.direction(shown, np.zeros(one.count))
+        share, size = _share(model, noise, linear, index, free, direction)
+        after = before * np.where(np.arange(before.size) == index, 1.0 - share, 1.0)
+        if not (far or share > TRIED or level(after) < (1.0 - TRIED) * level(before)):
+            continue
+        first = _Refit(one, size, after)
+        if not one_by_one:
+            refits.append(first)
+        elif one.name in TORQUES:
+            # A torque needs another compiled program: not if an error of the sensor explains all,
+            # and the torque, to first order, does not.
+            best = min(refits, key=deviance, default=first)
+            done = not far and level(best.squares) < TRIED * level(before)
+            if done and deviance(first) > deviance(best) + NEARLY:
+                continue
+            whole = _with_torques(model, x, noise) if whole is None else whole
+            refits.append(_refit_torque(*whole, noise, one))
+        else:
+            refits.append(_refit(model, x, noise, index, one))
+    if (one_by_one and (1.0 - TRIED) * np.var(shown) < np.mean(linear.raw[index] ** 2)) or refits:
+        refits += [_refit_anew(noise, one) for one in _misread(model, index)]
+    best = min(refits, key=deviance, default=None)
+    if best is None or not level(best.squares) < (1.0 - ENOUGH) * level(before):
         return None
-    best = [row for share, *row in kept if share >= NEARLY * most]
-    names, words, remedies = (" or ".join(column) for column in zip(*best, strict=True))
-    return _cause_with_share(names, sensor, most, words, remedies)
+    named = [r for r in sorted(refits, key=deviance) if deviance(r) < deviance(best) + NEARLY]
+    if any(r.candidate.name == "wheel" for r in named):
+        named = [r for r in named if r.candidate.name != "spin-up"]
+    rows = [
+        (one.name, one.words.format(size=", ".join(f"{x:.2g}" for x in size)), one.remedy)
+        for one, size, _ in named[:MOST]
+    ]
+    names, words, remedies = (" or ".join(dict.fromkeys(x)) for x in zip(*rows, strict=True))
+    # The share is that of the sensor whose errors become less by the largest factor.
+    after = best.squares / before
+    most = int(np.argmin(sizes * np.log(after)))
+    kind = model.records.sensors[most]
+    return _cause_with_share(names, kind, 1.0 - float(after[most]), words, remedies)
+
+
+def _mean_squares(linear: Linearisation) -> Float[np.ndarray, " sensors"]:
+    """Return the mean square of the errors of each sensor, in standard deviations of the noise."""
+    rows = zip(linear.errors, linear.weights, linear.mask, strict=True)
+    return np.array([np.mean((w[..., None] * e**2)[m]) + 1e-300 for e, w, m in rows])
+
+
+def _noise_floor(model: Model, linear: Linearisation) -> Float[np.ndarray, " sensors"]:
+    """Return the mean square that white noise leaves of each sensor's errors, in its noises."""
+    out = []
+    for reading, error, mask in zip(
+        model.records.readings, linear.errors, linear.mask, strict=True
+    ):
+        if reading.has_known_noise:
+            out.append(1.0)
+            continue
+        rows = [np.moveaxis(a, -1, 0).reshape(-1, a.shape[1]) for a in (error, mask)]
+        out.append(white_noise_variance([r[m] for r, m in zip(*rows, strict=True)]) + 1e-300)
+    return np.array(out)
+
+
+class _Reread(NamedTuple):
+    model: Model
+    unit: float  # by which the errors are smaller than before
+    words: str
+    remedy: str
+
+
+def _misread(model: Model, index: int) -> list[_Reread]:
+    """Return a model without each mistake that only another fit can show."""
+    reading, out, again = model.records.readings[index], [], "read the log again: {}"
+    values, alone = np.asarray(reading.values), len(model.records.readings) == 1
+    if isinstance(reading.sensor, Gyro) and model.torque is None and alone:
+        for name, turn in UNITS.items():
+            other = _with_values(model, index, values @ turn)
+            out.append(_Reread(other, float(turn[0, 0]), name, again.format(name)))
+        world, counts = values.copy(), np.asarray(model.counts).tolist()
+        for row, t, count in zip(world, np.asarray(model.records.t), counts, strict=True):
+            row[:count] = _in_body_axes(Samples(t[:count], row[:count])).values
+        out.append(_Reread(_with_values(model, index, world), 1.0, WORLD, again.format(WORLD)))
+    pairs, structure = jax.tree.flatten_with_path(model)
+    names = [getattr(path[-1], "name", "") for path, _ in pairs]
+    if "gravity" in names:
+        leaves = [-x if n == "gravity" else x for n, (_, x) in zip(names, pairs, strict=True)]
+        words = "gravity points the other way in the frame of the poses", "negate gravity"
+        out.append(_Reread(jax.tree.unflatten(structure, leaves), 1.0, *words))
+    if isinstance(reading.sensor, ForceTorque):
+        words = "the readings are what the body does to the support", "negate all readings"
+        out.append(_Reread(_with_values(model, index, -values), 1.0, *words))
+    return out
+
+
+def _with_values(model: Model, index: int, values: np.ndarray) -> Model:
+    """Return a model with other readings of one sensor."""
+    return eqx.tree_at(lambda m: m.records.readings[index].values, model, jnp.asarray(values))
+
+
+def _refit_anew(noise: Noise, one: _Reread) -> _Refit:
+    """Return the fit of a model without a mistake, from a start of its own."""
+    sigma = tuple(each * one.unit for each in noise)
+    task = Task(one.model, sigma, 1e-4, 4 * STRIDE)
+    x = fit_in_stages(starting_points(one.model, 1, None)[0], task).x
+    squares = _mean_squares(linearise(one.model, x, sigma, blocks_at(one.model, x)))
+    kind = "sign" if one.unit == 1.0 and one.words != WORLD else "misread"
+    return _Refit(_Candidate(kind, 0, one.words, one.remedy), np.zeros(0), squares)
+
+
+def _with_torques(
+    model: Model, x: Float[Array, " n"], noise: Noise
+) -> tuple[Model, Float[Array, " m"]]:
+    """Return a model with the torques of all causes, zero at first, and its parameters at x."""
+    t, tensors = model.records.t, [tensor_of(b) for b in body_list(model.bodies(x))]
+    ends, none = [float(t.min()), float(t.max())], np.zeros(3)
+    inertia, rate = float(np.max(tensors)), float(model.typical_rate)
+    torque = torques.Sum(
+        torques.Damping(none),
+        torques.Flywheel(none),
+        torques.Flywheel(torques.Linear(ends, np.zeros((2, 3)))),
+        torques.ConstantTorque(none),
+    )
+    free = (
+        Free(lambda s: s.parts[0].coefficient, MISSING + TORQUES[0], scale=0.1 * inertia * rate),
+        Free(lambda s: s.parts[1].momentum, MISSING + TORQUES[1], scale=0.1 * inertia * rate),
+        Free(
+            lambda s: s.parts[2].momentum.values[1],
+            MISSING + TORQUES[2],
+            scale=0.1 * inertia * rate,
+        ),
+        Free(lambda s: s.parts[3].torque, MISSING + TORQUES[3], scale=0.1 * inertia * rate**2),
+    )
+    wide, point = widened(model, torque, free)
+    return wide, point(x)
+
+
+def _torque_columns(model: Model) -> dict[str, TorqueColumns]:
+    """Return the torques per unit of the numbers of each cause, by its name."""
+    first, last = float(model.records.t.min()), float(model.records.t.max())
+
+    def axes(t: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(np.eye(3), (t.size, 3, 3))
+
+    def wheel(t: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return np.cross(axes(t, w), w[:, None, :]).swapaxes(1, 2)
+
+    def spun(t: np.ndarray, w: np.ndarray) -> np.ndarray:
+        begun, rise = wheel(t, w), ((t - first) / (last - first))[:, None, None]
+        return np.concatenate([begun, begun * rise - axes(t, w) / (last - first)], axis=2)
+
+    return {
+        "drag": lambda t, w: -w[..., None] * axes(t, w),
+        "wheel": wheel,
+        "spin-up": spun,
+        "push": axes,
+    }
+
+
+def _refit_torque(
+    model: Model, x: Float[Array, " m"], noise: Noise, candidate: _Candidate
+) -> _Refit:
+    """Return the fit of a model that has the torques of all causes, with those of one of them."""
+    mine = ("wheel", "spin-up") if candidate.name == "spin-up" else (candidate.name,)
+    places = [i for i, slot in enumerate(model.slots) if slot.name.startswith(MISSING)]
+    # The priors hold the other torques at zero: all causes then share one compiled program.
+    priors = [
+        jnp.asarray(1e6 if model.slots[i].name.removeprefix(MISSING) in mine else 1e-9)
+        for i in places
+    ]
+    held = eqx.tree_at(
+        lambda m: [m.slots[i].prior for i in places], model, priors, is_leaf=lambda y: y is None
+    )
+    task, ends = Task(held, noise, 1e-4, 4 * STRIDE), []
+    ends.append(fit_in_stages(x, task))
+    if model.body_indices is None:
+        columns = _torque_columns(model)[candidate.name]
+        known = model.torque.parts[0] if len(model.torque.parts) == 2 else None
+        found = regress_inertia(stacking.on_host(model.records, model.counts), known, columns)
+        if found is not None:
+            start = np.array(model.start(found.body))
+            factor = np.trace(tensor_of(model.bodies(jnp.asarray(start)))) / np.trace(
+                found.body.tensor
+            )
+            for name, values in zip(mine, found.coefficients.reshape(-1, 3), strict=True):
+                slot = next(one for one in model.slots if one.name == MISSING + name)
+                start[np.asarray(slot.shared)] = factor * values / float(slot.scale)
+            ends.append(search_whole(Attempt(jnp.asarray(start)), task))
+    end = min(ends, key=lambda one: float(one.cost))
+    linear = linearise(held, end.x, noise, blocks_at(held, end.x))
+    return _Refit(candidate, np.zeros(candidate.count), _mean_squares(linear))
+
+
+def _refit(
+    model: Model, x: Float[Array, " n"], noise: Noise, index: int, candidate: _Candidate
+) -> _Refit:
+    """Return the fit of a model together with a cause, started at x.
+
+    In turn the numbers of the cause and the parameters are fitted. The cause is subtracted from the
+    readings, so that the compiled program of the search serves.
+    """
+    values = np.asarray(model.records.readings[index].values)
+    theta, changed, moved, best = np.zeros(candidate.count), model, 0.0 * values, None
+    for _ in range(TURNS):
+        linear = linearise(changed, x, noise, blocks_at(changed, x))
+        if not np.isfinite(linear.weighted_jacobian).all():
+            break
+        now = _Refit(candidate, theta, _mean_squares(linear))
+        gain = 1.0 if best is None else float(np.sum(np.log(best.squares / now.squares)))
+        best = now if gain > 0.0 else best
+        if best is not now or gain < SETTLED:
+            break
+        shown, free = values - moved - linear.raw[index], np.linalg.qr(linear.weighted_jacobian)[0]
+        direction = candidate.direction(shown, theta)
+        theta = theta + _share(changed, noise, linear, index, free, direction, 1e-3).size
+        moved = candidate.change(shown, theta)
+        changed = _with_values(model, index, values - moved)
+        x = search_whole(Attempt(x), Task(changed, noise, 1e-4, STRIDE)).x
+    return _Refit(candidate, theta, np.full(len(noise), np.inf)) if best is None else best
 
 
 def _is_vector_error(sensor: AbstractSensor) -> bool:
-    return sensor.reading_shape == (3,) and sensor.components == 3
+    return sensor.reading_shape == (sensor.components,) and sensor.components in (3, 6)
 
 
 def _candidates(
@@ -306,32 +623,53 @@ def _candidates(
     """Return the possible causes of the errors of a sensor."""
     reading = model.records.readings[index]
     t, shown = np.asarray(model.records.t), np.asarray(reading.values) - linear.raw[index]
-    axes = np.broadcast_to(np.eye(3), (*shown.shape, 3))
-    turned = np.cross(shown[..., None, :], axes).swapaxes(-1, -2)
-    unit, itself = reading.sensor.unit, shown[..., None] * axes
-    response = _rate_response(model, x, linear, index)
-    rows = (
-        ("lag", slope_in_time(model, shown)[..., None], "a clock offset of {size} s",
-         "let a Free move the sensor's offset, or the delay of the torque's log"),
-        ("bias", axes, f"a bias left out, ({{size}}) {unit}", "let a Free move the sensor's bias"),
-        ("scale", itself,
-         "scale errors of ({size}) (all equal: a unit, or a clock that runs fast or slow)",
-         "look at the sensor's unit, or let a Free move its scale"),
-        ("drag", response(-itself), "a torque against the rate, such as drag of the air",
-         "add a Damping or QuadraticDamping whose coefficient is free"),
-        ("wheel", response(turned), "a constant internal angular momentum, such as a wheel's",
-         "add a Flywheel whose momentum is free"),
-        ("mounting", turned, "axes turned by ({size}) rad",
-         "let a Free move the sensor's mounting, or take a chart of the full tensor"),
-        ("skew", np.einsum("rti,ijk->rtjk", shown, SKEW),
-         "axes not orthogonal by ({size}) rad", "let a Free move the sensor's skew"),
-        ("push", response(axes), "a constant torque in the body's axes",
-         "add a ConstantTorque whose value is free"),
-        ("drift", axes * (t - t[:, :1])[..., None, None],
-         f"a bias that drifts by ({{size}}) {unit} a second",
-         "cut the record into pieces with a bias each"),
-    )  # fmt: skip
-    return [_Candidate(*row) for row in rows]
+    k, unit, since = shown.shape[-1], reading.sensor.unit, (t - t[:, :1])[..., None]
+
+    def late(y: np.ndarray, s: np.ndarray) -> np.ndarray:
+        slope = slope_in_time(model, y)
+        return slope * s + slope_in_time(model, slope) * s**2 / 2
+
+    def turned(y: np.ndarray, s: np.ndarray) -> np.ndarray:
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_rotvec(-s).apply(y.reshape(-1, 3)).reshape(y.shape) - y
+
+    few = [
+        ("lag", 1, "a clock offset of {size} s",
+         "let a Free move the sensor's offset, or the delay of the torque's log", late),
+        ("bias", k, f"a bias left out, ({{size}}) {unit}", "let a Free move the sensor's bias",
+         lambda y, s: np.broadcast_to(s, y.shape)),
+        ("scale", k, "scale errors of ({size}) (all equal: a unit, or a clock that runs fast or "
+         "slow)", "look at the sensor's unit, or let a Free move its scale", lambda y, s: y * s),
+        ("drift", k, f"a bias that drifts by ({{size}}) {unit} a second",
+         "cut the record into pieces with a bias each", lambda y, s: since * s),
+    ]  # fmt: skip
+    if k == 3:
+        few += [
+            ("mounting", 3, "axes turned by ({size}) rad",
+             "let a Free move the sensor's mounting, or take a chart of the full tensor", turned),
+            ("skew", 3, "axes not orthogonal by ({size}) rad", "let a Free move the sensor's skew",
+             lambda y, s: np.einsum("rti,ijk,k->rtj", y, SKEW, s)),
+        ]  # fmt: skip
+    if isinstance(reading.sensor, Gyro):
+        response = _rate_response(model, x, linear, index)
+        pushes = {
+            name: response(np.stack([columns(*row) for row in zip(t, shown, strict=True)]))
+            for name, columns in _torque_columns(model).items()
+        }
+        words = {
+            "drag": ("a torque against the rate, such as drag of the air",
+                     "add a Damping or QuadraticDamping whose coefficient is free"),
+            "wheel": ("a constant internal angular momentum, such as a wheel's",
+                      "add a Flywheel whose momentum is free"),
+            "spin-up": ("a wheel that spins up or down", "add a Flywheel with the wheel's speed"),
+            "push": ("a constant torque in the body's axes",
+                     "add a ConstantTorque whose value is free"),
+        }  # fmt: skip
+        few += [
+            (name, d.shape[-1], *words[name], lambda y, s, d=d: d @ s) for name, d in pushes.items()
+        ]
+    return [_Candidate(*row) for row in few]
 
 
 def _rate_response(
@@ -367,6 +705,7 @@ def _share(
     index: int,
     free_columns: Float[np.ndarray, "records rows m"],
     direction: Float[np.ndarray, "records times k c"],
+    apart: float = APART,
 ) -> _Share:
     """Return the fraction of a sensor's squared errors that a cause along `direction` explains.
 
@@ -388,7 +727,7 @@ def _share(
         return (x - free_columns @ (free_columns.swapaxes(1, 2) @ x)).reshape(-1, width)
 
     u, s, v = np.linalg.svd(residual_of_free(columns, size.size), full_matrices=False)
-    projection = np.where(s > APART, u.T @ residual_of_free(errors, 1)[:, 0], 0.0)
+    projection = np.where(s > apart, u.T @ residual_of_free(errors, 1)[:, 0], 0.0)
     total = float(np.sum(errors[index] ** 2))
     share = min(float(projection @ projection) / total, 1.0)
-    return _Share(share, v.T @ (projection / np.maximum(s, APART)) / size)
+    return _Share(share, v.T @ (projection / np.maximum(s, apart)) / size)

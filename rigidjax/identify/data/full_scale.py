@@ -8,9 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from rigidjax.identify.data.recording import Reading, Recording
+from rigidjax.identify.sensors import Gyro
 
 # Readings are cut off only if at least this number of readings in a row have the largest value.
 RUN = 3
+# No gyro reads rates above this number, rad/s: the full scale of the fastest ones is 4000 deg/s.
+FASTEST = 70.0
 # If more than this fraction of the readings of a channel have the largest value, the channel is
 # taken as constant, not as cut off.
 MOST = 0.7
@@ -68,6 +71,16 @@ def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
                 is_leaf=lambda node: node is None,
             )
     return out
+
+
+def beyond_gyros(readings: Sequence[Reading]) -> float | None:
+    """Return the largest reading of a gyro, rad/s, if no gyro reads so much, else `None`."""
+    sizes = [
+        float(np.abs(np.asarray(one.values)[one.host_mask]).max(initial=0.0))
+        for one in readings
+        if isinstance(one.sensor, Gyro)
+    ]
+    return max(sizes, default=0.0) if max(sizes, default=0.0) > FASTEST else None
 
 
 def describe_full_scale(readings: Sequence[Reading]) -> list[str]:

@@ -74,11 +74,16 @@ class Linearisation(eqx.Module):
         return int(self.extra_slopes.shape[-1])
 
     def first_times(self, count: int) -> "Linearisation":
-        """Return the residuals and derivatives at the first `count` times, without the masked
-        readings with which a fit pads recordings.
+        """Return the residuals and derivatives at the first `count` times, without or with more of
+        the masked readings with which a fit pads recordings.
         """
         long = ("raw", "raw_slopes", "errors", "slopes", "weights", "mask")
-        parts = {name: tuple(a[:, :count] for a in getattr(self, name)) for name in long}
+
+        def first(a: np.ndarray) -> np.ndarray:
+            more = max(count - a.shape[1], 0)
+            return np.pad(a[:, :count], [(0, more if i == 1 else 0) for i in range(a.ndim)])
+
+        parts = {name: tuple(map(first, getattr(self, name))) for name in long}
         return dataclasses.replace(self, **parts)
 
     @property
