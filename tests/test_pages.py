@@ -92,7 +92,7 @@ def test_readme_simulates_what_it_says():
 @pytest.mark.long
 def test_readme_fits_what_it_says():
     found = run_as_shown(README)[0]["found"]
-    assert found.status == "ok"
+    assert found.ok
     for name, ratio in (("Ix/Iz", 1.0 / 2.2), ("Iy/Iz", 1.6 / 2.2)):
         low, high = found.interval(0.95)[name]
         assert low < ratio < high

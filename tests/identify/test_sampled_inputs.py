@@ -50,7 +50,7 @@ def test_the_motion_is_that_of_a_batch_and_its_numbers_come_back(delay):
     found = identify.fit(
         Model(recordings, Known(BODY), torque=Push(np.ones(3), source), free=free), tolerance=1e-6
     )
-    assert found.status == "ok"
+    assert found.ok
     np.testing.assert_allclose(found.values["gain"], GAIN, rtol=0, atol=1e-9)
     at = found.model.motion(found.x)
     for k, (t, _, w) in enumerate(runs):

@@ -93,7 +93,7 @@ def test_a_fit_of_two_kinds_is_scipys_of_all_residuals(both):
     chi2 = 2 * found.cost - np.sum(((found.x[6:9] - 1.3 * np.asarray(PUSH)) / 10.0) ** 2)
     np.testing.assert_allclose(both.chi2, chi2, rtol=1e-6)
     assert both.dof == 3 * (40 + 55 + 70) + 1 - 21
-    assert both.status == "ok"
+    assert both.ok
 
 
 def test_what_a_fit_of_two_kinds_says(both):

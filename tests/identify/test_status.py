@@ -8,6 +8,13 @@ import turns
 
 import rigidjax as rj
 from rigidjax import identify
+from rigidjax.identify.answer.causes import (
+    ATTITUDES,
+    ORDERS,
+    UNITS,
+    WORLD,
+    cause_by_misread_file,
+)
 from rigidjax.identify.data.full_scale import full_scale_of
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -153,7 +160,7 @@ WRONG = {
 CAUSES = {
     "skew of 3 degrees": "axes not orthogonal",
     "axes that are not principal": "axes turned by",
-    "a bias left out": "a bias left out, (0.039, -0.041, 0.053) rad/s",
+    "a bias left out": "a bias left out, (0.044, -0.04, 0.059) rad/s",
     "deg/s, a gyro alone": "deg/s read as rad/s",
     "time stamps that scatter": "time stamps that scatter by 42 ms",
     "deg/s read as rad/s": "deg/s read as rad/s",
@@ -316,4 +323,43 @@ def test_many_short_recordings_are_no_correlated_errors():
     read = np.asarray(motions) + SIGMA * np.random.default_rng(1).normal(size=motions.shape)
     records = [identify.Recording(ts, (identify.Gyro(SIGMA), rows)) for rows in read]
     found = identify.fit(identify.Model(records, identify.Ratios()), starts=1)
-    assert found.status == "ok"
+    assert found.ok
+
+
+def test_every_wrong_order_of_axes_beside_attitudes_has_its_own_name():
+    ts = np.linspace(0.0, 4.0, 200)
+    rates, turned = tumble(omega=(1.5, 1.1, -2.0), ts=ts)
+    assert len(ORDERS) == 47
+    wrong = ORDERS | UNITS
+    for name, turn in wrong.items():
+        read = rates @ np.linalg.inv(turn).T
+        record = identify.Recording(
+            ts, (identify.Gyro(), read), (identify.AttitudeSensor(), turned)
+        )
+        found = cause_by_misread_file([record], None)
+        assert found is not None and found.words == f"most likely {name}"
+    world = np.asarray(jax.vmap(rj.quaternion.rotate)(jnp.asarray(turned), jnp.asarray(rates)))
+    for values, name in ((world, WORLD), (rates, None)):
+        record = identify.Recording(
+            ts, (identify.Gyro(), values), (identify.AttitudeSensor(), turned)
+        )
+        found = cause_by_misread_file([record], None)
+        assert found is None if name is None else found.words == f"most likely {name}"
+    for name, change in ATTITUDES.items():
+        back = np.roll(turned, -1, axis=1) if "last" in name else change(turned)
+        record = identify.Recording(ts, (identify.Gyro(), rates), (identify.AttitudeSensor(), back))
+        assert cause_by_misread_file([record], None).words == f"most likely {name}"
+
+
+def test_a_status_says_if_what_of_a_sensor_it_holds():
+    rates = tumble(**right(0))[0]
+    for gyro, condition in (
+        (identify.Gyro(right(0)["sigma"]), "ok, if the Gyro is right to"),
+        (identify.Gyro(right(0)["sigma"], tolerance="phone"), "ok"),
+    ):
+        record = identify.Recording(TS, (gyro, rates))
+        found = identify.fit(identify.Model(record, identify.PrincipalRatios()), starts=2)
+        assert found.ok and found.status.startswith(condition)
+        assert (", if" in found.status) == (gyro.tolerance is None)
+    with pytest.raises(ValueError, match="phone"):
+        identify.Gyro(tolerance="telephone")

@@ -3,17 +3,25 @@ allow for.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from rigidjax.identify.model.free import split_path
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise
+from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.uncertainty import considered
-from rigidjax.identify.uncertainty.considered import Consideration, sensor_slots
+from rigidjax.identify.uncertainty.considered import (
+    Consideration,
+    sensor_slots,
+    unit_shifts,
+)
 from rigidjax.identify.uncertainty.covariance import Linearisation
 from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
-from rigidjax.identify.uncertainty.quantities import Quantity, named_charts
+from rigidjax.identify.uncertainty.quantities import Quantity, log_deviation, named_charts
+from rigidjax.motion.torques import Damping, QuadraticDamping
 
 # One sentence names at most this number of quantities.
 MOST = 3
@@ -21,12 +29,22 @@ MOST = 3
 # square of the readings. In a record that is worth a fit, the bias of a real gyro is about a
 # hundredth of the rates.
 REMARKABLE = 0.2
+# A status has a condition on the bias of a gyro if this fraction of the readings' root mean square
+# would move a moment by half its interval.
+USUAL_BIAS = 0.03
 # These words describe the two kinds of small constant errors of a sensor. The sizes of these
 # errors, 1 % and 1°, are the numbers of `considered.USUAL`.
 _WAYS = {
     "scale": "an error of 1 % in the scale of one axis",
     "cross_axis": "an axis that leans by 1°",
 }
+
+
+class Allowance(NamedTuple):
+    """Hold what the intervals of a fit allow for."""
+
+    words: str  # sentences on the constant errors of sensors
+    condition: str  # under which the intervals are right, such as "if the Gyro is right to 0.1 %"
 
 
 def describe_allowed(
@@ -37,8 +55,9 @@ def describe_allowed(
     considered_errors: tuple[Consideration, ...],
     quantities: Sequence[Quantity],
     slopes: Float[np.ndarray, "_ n"],
-) -> str:
-    """Return sentences on the constant sensor errors that the intervals of a fit allow for.
+) -> Allowance:
+    """Return sentences on the constant sensor errors that the intervals of a fit allow for, and
+    the condition under which the intervals are right.
 
     For a sensor without a `Tolerance` they say how far a small error would move moments of bodies
     or, without these, the values of `Free`s. The `covariance` is that for white errors; `slopes`
@@ -54,8 +73,27 @@ def describe_allowed(
     sensors = model.records.sensors
     if considered_errors:
         out.append(f"They allow for {considered.describe(considered_errors, sensors)}.")
+    halves = [
+        float(student_quantile(0.95, one.freedom)) * log_deviation(one)
+        for one in (quantities[i] for i in rows)
+    ]
+    conditions = []
     for index, by_kind in shifts:
         clauses = []
+        name, own = type(sensors[index]).__name__, []
+        # The errors of scale and bias that would move a quantity by half its interval.
+        scale = 0.01 * np.min(np.divide(halves, by_kind.get("scale", 0.0) + 1e-300))
+        if scale < considered.USUAL["scale"]:
+            own.append(f"the {name} is right to {100 * scale:.1g} %")
+        if isinstance(sensors[index], Gyro) and not sensor_slots(model, index, "bias"):
+            one = unit_shifts(model, linear, noise, covariance, index, "bias")
+            bias = np.min(np.divide(halves, np.abs(slopes[rows] @ one).max(axis=1) + 1e-300))
+            reading = model.records.readings[index]
+            size = np.sqrt(np.mean(np.asarray(reading.values)[reading.host_mask] ** 2))
+            if bias < USUAL_BIAS * size:
+                whose = "its" if own else f"the {name}'s"
+                own.append(f"{whose} bias below {bias:.1g} {reading.sensor.unit}")
+        conditions += [" and ".join(own)] if own else []
         for kind, sizes in by_kind.items():
             words = []
             for quantity, shift in zip((quantities[i] for i in rows[:MOST]), sizes, strict=False):
@@ -65,16 +103,18 @@ def describe_allowed(
                 shown = f"{quantity.name} by {abs(unit) * shift:.2g}"
                 words.append(f"{shown} (interval ±{half:.2g})" if np.isfinite(half) else shown)
             clauses.append(f"{_WAYS[kind]} would move {', '.join(words)}")
-        name = type(sensors[index]).__name__
         out.append(
             f"They do not allow for a {name} that is off: {'; '.join(clauses)}. Give its "
             f"tolerance, such as {name}(…, tolerance=Tolerance(scale=0.01, cross_axis=0.01))."
         )
-    return " ".join(out) or "They do not allow for a sensor that is off."
+    words = " ".join(out) or "They do not allow for a sensor that is off."
+    condition = " and ".join(dict.fromkeys(conditions))
+    return Allowance(words, f"if {condition}" if condition else "")
 
 
-def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
-    """Describe each sensor bias without a prior that is large compared with the readings.
+def describe_doubtful(model: Model, quantities: Sequence[Quantity]) -> str:
+    """Describe each sensor bias without a prior that is large compared with the readings, and each
+    damping below zero.
 
     Such a bias may stand for a part of the motion that the model lacks: in one fit the bias of a
     pendulum's gyro came out as 1.6 rad/s.
@@ -99,5 +139,17 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
                 f"{reading.sensor.unit}, {100 * largest / size:.0f} % of the readings: it may "
                 "stand for a part of the motion that the model lacks. Give what is known of it, "
                 "such as Free(…, prior=…)."
+            )
+    for slot in model.slots:
+        holder, (leaf, _) = model.torque, split_path(slot.path)
+        if slot.path[0].name != "torque":
+            continue
+        for key in leaf[1:-1]:
+            holder = getattr(holder, key.name) if hasattr(key, "name") else holder[key.idx]
+        mine = [q.value for q in quantities if f"{q.name} ".startswith(f"{slot.name} ")]
+        if isinstance(holder, Damping | QuadraticDamping) and min(mine, default=0.0) < 0:
+            out.append(
+                f"{slot.name!r}, a damping, came out as {min(mine):.2g}: below zero it would drive "
+                "the motion. Something else stands behind it, or it is zero within its interval."
             )
     return " ".join(out)

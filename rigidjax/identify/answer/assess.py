@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rigidjax import _show
-from rigidjax.identify.answer.allowance import describe_allowed, describe_large_biases
+from rigidjax.identify.answer.allowance import describe_allowed, describe_doubtful
 from rigidjax.identify.answer.answers import (
     EXPLAINS,
     FAILS,
@@ -26,6 +26,7 @@ from rigidjax.identify.answer.answers import (
 from rigidjax.identify.answer.causes import time_stamp_cause
 from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
 from rigidjax.identify.answer.result import Fit, Start
+from rigidjax.identify.data.full_scale import beyond_gyros
 from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.model import Model, late_delays
 from rigidjax.identify.model.terms import Noise
@@ -76,6 +77,7 @@ class _SensorGoodness(NamedTuple):
     words: str = ""  # how large the errors are, and when
     chi2: float = 0.0  # zero if the noise is estimated, and so is the number of errors
     many: int = 0
+    white: bool = False  # whether the errors, although large, are white and of unknown noise
 
 
 class Goodness(NamedTuple):
@@ -101,6 +103,9 @@ def goodness_of_fit(
         _goodness_of_sensor(model, noise, linear, times, own, index)
         for index in range(len(model.records.readings))
     ]
+    if any(one.word == EXPLAINS for one in each):
+        # Beside a sensor that the model explains, another one may read little but white noise.
+        each = [one._replace(word=EXPLAINS) if one.white else one for one in each]
     left = tuple(index for index, one in enumerate(each) if one.word != EXPLAINS)
     rest = [_goodness_of_number(name, off) for name, off in residuals_by_name(model, linear)]
     words = [one.words for one in (*each, *rest) if one.word != EXPLAINS]
@@ -157,7 +162,8 @@ def _goodness_of_sensor(
     # larger (`factor` is 1); or they are small beside the readings, with at most a QUARTER of the
     # variance of the readings.
     small = has_noise or left <= QUARTER * varies + tiny
-    if factor == 1.0 and white and small and not has_clock_error:
+    beyond = None if len(model.records.readings) > 1 else beyond_gyros([reading])
+    if factor == 1.0 and white and small and not has_clock_error and not beyond:
         return _SensorGoodness(EXPLAINS, "", total, many)
     lasting = max(times.closeness, 0.0) * left
     missed = left > HALF * varies + tiny or lasting > TENTH * varies + tiny
@@ -168,7 +174,10 @@ def _goodness_of_sensor(
     span = None if white else times.longest_span
     words = _describe_errors(model, reading, error, mask, factor, share, span)
     word = FAILS if missed and (factor > 1.0 or not has_noise) else LEAVES
-    return _SensorGoodness(word, words, total, many)
+    if beyond:
+        words = f"{words}, and the Gyro reads {beyond:.3g} rad/s, more than gyros do"
+    only_white = white and not has_noise and not has_clock_error and not beyond
+    return _SensorGoodness(word, words, total, many, only_white)
 
 
 def _describe_errors(
@@ -381,10 +390,10 @@ def assess(
         limits,
         freedom.of_variance(numbers.jacobian),
     )
-    words = describe_allowed(
+    allowed = describe_allowed(
         model, linear, noise, white.determined, considered_errors, quantities, numbers.jacobian
     )
-    words = f"{words} {describe_large_biases(model, quantities)}".rstrip()
+    words = f"{allowed.words} {describe_doubtful(model, quantities)}".rstrip()
     if not np.isfinite(best_cost):
         search = Answer(NOT_ENDED, ("no start gave a finite cost",))
     elif not done:
@@ -405,6 +414,7 @@ def assess(
             freedom=freedom,
             considered=considered_errors,
             allowance=words,
+            condition=allowed.condition,
         ),
         assessment=Assessment(search, explanation, left, chi2, dof, times.longest_span),
         quantities=quantities,

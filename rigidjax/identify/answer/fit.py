@@ -132,9 +132,9 @@ def fit(
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
     >>> result = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()))
-    >>> result.status, bool(jnp.allclose(result.body.tensor / result.body.tensor[0, 0],
+    >>> result.ok, bool(jnp.allclose(result.body.tensor / result.body.tensor[0, 0],
     ...                                  jnp.diag(jnp.array([1.0, 2.0, 2.5])), atol=1e-6))
-    ('ok', True)
+    (True, True)
     """
     _checks.require_instance(model, Model, "fit", requirement="a Model")
     starts = _checks.integer(starts, "starts", 1, _MOST_STARTS)

@@ -54,6 +54,9 @@ class Uncertainty(eqx.Module):
       them as infinite.
     - `considered`: the sensor errors that the covariance allows for by a `Tolerance`.
     - `allowance`: the sentences on the sensor errors that the intervals allow for.
+    - `condition`: the condition under which the intervals are right, such as "if the Gyro is right
+      to 0.1 %": an error of this size would move a moment by half of its interval. It is empty if
+      each sensor has a `Tolerance`, or if an error of 1 % moves less.
     """
 
     covariance: Float[Array, "n n"]
@@ -65,6 +68,7 @@ class Uncertainty(eqx.Module):
     freedom: Freedom | None = None
     considered: tuple[Consideration, ...] = ()
     allowance: str = ""
+    condition: str = ""
 
     def degrees_of_freedom(self, slope: np.ndarray) -> np.ndarray:
         """Return the degrees of freedom (…,) of variances of functions with slopes (…, n)."""

@@ -146,18 +146,22 @@ class Fit(eqx.Module):
         point?) and `explanation` (does the model explain the readings?).
 
         The line is `ok` if the search found the best point, the model explains the readings, and
-        neither answer has a reason.
+        neither answer has a reason. It is, for example, `ok, if the Gyro is right to 0.1 %` if
+        no `Tolerance` says how far the sensor may be off, and an error of 0.1 % in the scale of an
+        axis, which no residual shows, would move a moment by half of its interval.
         """
-        return answers.joined_status(self.search, self.explanation)
+        line = answers.joined_status(self.search, self.explanation)
+        condition = self.uncertainty.condition
+        return f"{line}, {condition}" if line == "ok" and condition else line
 
     @property
     def ok(self) -> bool:
-        """Return whether the `status` of this fit is `ok`.
+        """Return whether the `status` of this fit is `ok`, perhaps with a condition on a sensor.
 
         If it is, the search has converged, the model explains the readings, and no other motion
         fits as well.
         """
-        return self.status == "ok"
+        return answers.joined_status(self.search, self.explanation) == "ok"
 
     @property
     def causes(self) -> tuple[Cause, ...]:
@@ -168,7 +172,11 @@ class Fit(eqx.Module):
         """
         if not self.assessment.left or self.linear is None:
             return ()
-        return causes(self.model, self.x, self.noises, self.linear, self.assessment.left)
+        # Each refit of a cause takes time: keep the causes of the fit that was asked for last.
+        if _LAST.get("linear") is not self.linear:
+            parts = self.model, self.x, self.noises, self.linear, self.assessment.left
+            _LAST.update(linear=self.linear, causes=causes(*parts))
+        return _LAST["causes"]
 
     @property
     def advice(self) -> str:
@@ -336,6 +344,9 @@ class Fit(eqx.Module):
         )
 
 
+_LAST: dict[str, Any] = {}
+
+
 def value_and_interval_of(
     fit: Fit, function: Callable[[Unpacked], Any], level: float = 0.95
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -428,7 +439,8 @@ def verdict(fit: Fit) -> str:
     """
     require_one_fit(fit)
     good = [start for start in fit.starts if start.fits]
-    lines = ["status: ok"] if fit.ok else [f"search: {fit.search}", f"model: {fit.explanation}"]
+    both = [f"search: {fit.search}", f"model: {fit.explanation}"]
+    lines = [f"status: {fit.status}"] if fit.ok else both
     lines += [str(cause) for cause in fit.causes] + [fit.advice]
     words = "reached a motion that fits as well as the best"
     if not fit.explanation.word == answers.FAILS:
