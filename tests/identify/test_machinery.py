@@ -372,7 +372,9 @@ def test_the_command_line_reads_wheels_and_writes_reports(
     out = capsys.readouterr().out
     assert "status: ok" in out and "I3" in out and "drag x" in out
     held = json.loads(numbers.read_text())
-    assert held["status"].startswith("ok") and held["files"] == [f"throw{i}.csv" for i in range(len(paths))]
+    assert held["status"].startswith("ok") and held["files"] == [
+        f"throw{i}.csv" for i in range(len(paths))
+    ]
     low, high = held["quantities"]["I3"]["interval_95"]
     assert 0.9 * low < 2.1 < 1.1 * high
     text = page.read_text()

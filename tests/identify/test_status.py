@@ -113,6 +113,15 @@ def still(momentum=0.1):
     return rj.torques.Flywheel(rj.torques.Wheel(momentum, [0.0, 0.0, 1.0], speed))
 
 
+def spun():
+    speed = rj.torques.Series(np.linspace(0.0, 10.0, 4), np.linspace(0.0, 1.0, 4))
+    return rj.torques.Flywheel(rj.torques.Wheel(0.3, [0.0, 0.6, 0.8], speed))
+
+
+def world(rates, turned):
+    return np.asarray(jax.vmap(rj.quaternion.rotate)(jnp.asarray(turned), jnp.asarray(rates)))
+
+
 BIAS = np.array([0.05, -0.04, 0.06])
 WHEEL = law()
 TURN = rj.quaternion.exp(jnp.array([0.15, -0.2, 0.1]))
@@ -148,6 +157,10 @@ WRONG = {
     "the wheel the other way": lambda: wheel(tumble(law=WHEEL)[0], law(-0.6)),
     "the wheel about x": lambda: wheel(tumble(law=WHEEL)[0], law(axis=(1.0, 0.0, 0.0))),
     "the wheel's log late": lambda: wheel(tumble(law=WHEEL)[0], law(late=0.5)),
+    "rates in the world's axes": lambda: both(world(*tumble()), tumble()[1]),
+    "half a turn about x": lambda: both(tumble()[0] * [1, -1, -1], tumble()[1]),
+    "a wheel that spins up": lambda: gyro(tumble(law=spun())[0], noise=None),
+    "rates that no gyro reads": lambda: gyro(80.0 * tumble()[0], noise=None, ts=TS / 80.0),
     "drag left out": lambda: wheel(tumble(law=WHEEL)[0], law(drag=(0.0,) * 3), free=False),
     "two bodies mixed": lambda: together(tumble()[0], tumble(PLATE, seed=1)[0]),
     "cut off, then smoothed": lambda: gyro(
@@ -181,6 +194,10 @@ CAUSES = {
     "the wheel the other way": "the torque with the other sign",
     "the wheel about x": "axes in the order y, z, x",
     "the wheel's log late": "a clock offset of 0.4",
+    "rates in the world's axes": "rates in the world's axes",
+    "half a turn about x": "half a turn about x",
+    "a wheel that spins up": "a wheel that spins up",
+    "rates that no gyro reads": "deg/s read as rad/s",
     "drag left out": "a torque against the rate",
 }
 
@@ -338,8 +355,7 @@ def test_every_wrong_order_of_axes_beside_attitudes_has_its_own_name():
         )
         found = cause_by_misread_file([record], None)
         assert found is not None and found.words == f"most likely {name}"
-    world = np.asarray(jax.vmap(rj.quaternion.rotate)(jnp.asarray(turned), jnp.asarray(rates)))
-    for values, name in ((world, WORLD), (rates, None)):
+    for values, name in ((world(rates, turned), WORLD), (rates, None)):
         record = identify.Recording(
             ts, (identify.Gyro(), values), (identify.AttitudeSensor(), turned)
         )
