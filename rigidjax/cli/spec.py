@@ -506,12 +506,15 @@ def _parameters(
 
 def tolerance(text: str | None) -> Tolerance | str | None:
     """Return what `--tolerance` states: a word, or a number as the deviation of scale and axes."""
+    if text is None:
+        return None
     try:
-        return None if text is None else tolerance_of(text)
+        return tolerance_of(text)
     except ValueError:
         pass
     try:
-        return Tolerance(scale=float(text), cross_axis=float(text))
+        size: Any = float(text)
+        return Tolerance(scale=size, cross_axis=size)
     except ValueError:
         raise LogError(
             "--tolerance: wanted phone, consumer, industrial, calibrated, or a positive number "

@@ -165,7 +165,11 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Law | None) -
     least = min(ratios.values(), default=np.inf)
     if not least < min(bound, LITTLE):
         return None
-    equal = [name for name in sorted(ratios, key=ratios.get) if ratios[name] <= EQUAL * least]
+    equal = [
+        name
+        for name in sorted(ratios, key=lambda one: ratios[one])
+        if ratios[name] <= EQUAL * least
+    ]
     words = " or ".join(equal)
     if all(np.median(np.diff(recording.t)) == 1 for recording in recordings):
         # The motion shows the product of rates and times only.
@@ -262,7 +266,7 @@ SKEW[1, 0, 0] = SKEW[2, 0, 1] = SKEW[2, 1, 2] = 1.0
 
 class _Candidate(NamedTuple):
     name: str
-    count: int  # of numbers θ that a cause has, such as the components of a bias
+    width: int  # how many numbers θ a cause has, such as the components of a bias
     words: str  # with `{size}` for θ
     remedy: str
     # Return the change of the predicted readings (R, T, k) for numbers θ.
@@ -270,7 +274,7 @@ class _Candidate(NamedTuple):
 
     def direction(self, shown: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """Return the derivative (R, T, k, c) of the change with respect to θ, by differences."""
-        steps = 1e-5 * np.eye(self.count)
+        steps = 1e-5 * np.eye(self.width)
         ends = ((self.change(shown, theta + e), self.change(shown, theta - e)) for e in steps)
         return np.stack([(after - before) / 2e-5 for after, before in ends], axis=-1)
 
@@ -397,7 +401,7 @@ def _likeliest(
         return float(sizes @ np.log(refit.squares) + refit.size.size * np.log(sizes.sum()))
 
     for one in _candidates(model, x, linear, index):
-        direction = one.direction(shown, np.zeros(one.count))
+        direction = one.direction(shown, np.zeros(one.width))
         share, size = _share(model, noise, linear, index, free, direction)
         after = before * np.where(np.arange(before.size) == index, 1.0 - share, 1.0)
         if not (far or share > TRIED or level(after) < (1.0 - TRIED) * level(before)):
@@ -512,19 +516,18 @@ def _with_torques(
     torque = torques.Sum(
         torques.Damping(none),
         torques.Flywheel(none),
-        torques.Flywheel(torques.Linear(ends, np.zeros((2, 3)))),
+        torques.Flywheel(torques.Linear(jnp.asarray(ends), jnp.zeros((2, 3)))),
         torques.ConstantTorque(none),
     )
-    free = (
-        Free(lambda s: s.parts[0].coefficient, MISSING + TORQUES[0], scale=0.1 * inertia * rate),
-        Free(lambda s: s.parts[1].momentum, MISSING + TORQUES[1], scale=0.1 * inertia * rate),
-        Free(
-            lambda s: s.parts[2].momentum.values[1],
-            MISSING + TORQUES[2],
-            scale=0.1 * inertia * rate,
-        ),
-        Free(lambda s: s.parts[3].torque, MISSING + TORQUES[3], scale=0.1 * inertia * rate**2),
+    sizes = inertia * rate * np.array([0.1, 0.1, 0.1, 0.1 * rate])
+    numbers: tuple[Callable[[Any], Any], ...] = (
+        lambda s: s.parts[0].coefficient,
+        lambda s: s.parts[1].momentum,
+        lambda s: s.parts[2].momentum.values[1],
+        lambda s: s.parts[3].torque,
     )
+    every = zip(numbers, TORQUES, sizes.tolist(), strict=True)
+    free = [Free(where, MISSING + name, scale=size) for where, name, size in every]
     wide, point = widened(model, torque, free)
     return wide, point(x)
 
@@ -582,7 +585,7 @@ def _refit_torque(
             ends.append(search_whole(Attempt(jnp.asarray(start)), task))
     end = min(ends, key=lambda one: float(one.cost))
     linear = linearise(held, end.x, noise, blocks_at(held, end.x))
-    return _Refit(candidate, np.zeros(candidate.count), _mean_squares(linear))
+    return _Refit(candidate, np.zeros(candidate.width), _mean_squares(linear))
 
 
 def _refit(
@@ -594,7 +597,7 @@ def _refit(
     readings, so that the compiled program of the search serves.
     """
     values = np.asarray(model.records.readings[index].values)
-    theta, changed, moved, best = np.zeros(candidate.count), model, 0.0 * values, None
+    theta, changed, moved, best = np.zeros(candidate.width), model, 0.0 * values, None
     for _ in range(TURNS):
         linear = linearise(changed, x, noise, blocks_at(changed, x))
         if not np.isfinite(linear.weighted_jacobian).all():
