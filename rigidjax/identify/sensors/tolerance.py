@@ -75,7 +75,8 @@ _WORDS = {
 def tolerance_of(tolerance: object) -> Tolerance | None:
     """Return `tolerance` if it is a `Tolerance` or `None`, or the `Tolerance` of a word."""
     if isinstance(tolerance, str):
-        return Tolerance(*_WORDS[_checks.require_option(tolerance, tuple(_WORDS), "tolerance")])
+        deviations: Any = _WORDS[_checks.require_option(tolerance, tuple(_WORDS), "tolerance")]
+        return Tolerance(*deviations)
     wanted = "Tolerance(scale=…, cross_axis=…, bias=…, clock=…), a word such as 'phone', or None"
     return _checks.require_instance(
         tolerance, (Tolerance, NoneType), "tolerance", requirement=wanted
