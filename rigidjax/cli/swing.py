@@ -5,6 +5,7 @@ the log of a gyro.
 import argparse
 import dataclasses
 import operator
+from pathlib import Path
 from typing import Any, cast
 
 import jax
@@ -15,7 +16,8 @@ from rigidjax import identify
 from rigidjax._types import Scalar
 from rigidjax.body.inertia import MassProperties
 from rigidjax.cli import spec
-from rigidjax.cli.logs.layouts import imu_columns
+from rigidjax.cli.logs.layouts import ImuColumns, imu_columns
+from rigidjax.cli.logs.table import open_log
 from rigidjax.identify.data.reference_states import rates
 from rigidjax.suspensions import AbstractSuspension, Axle, Friction, Strings, TorsionBar, period
 
@@ -136,10 +138,14 @@ def _fit(
     """Return the fit of a log, the moment through the centre of mass and its deviation, kg m²; add
     the period and the amplitude to the `numbers`.
     """
-    time, *columns = options.columns or imu_columns(options.log).columns
-    channel = spec.Channel("gyro", tuple(columns), options.unit, None, None)
-    channel = dataclasses.replace(channel, unit=spec.unit_of_channel(options.log, channel))
-    record = spec.read_log(options.log, [channel], time=time, free=("bias",), window=options.window)
+    log = open_log(Path(options.log))
+    given = options.columns
+    found = ImuColumns(tuple(given), None, None) if given else imu_columns(options.log, log)
+    time, *columns = found.columns
+    channel = spec.Channel("gyro", tuple(columns), options.unit or found.unit, None, None)
+    channel = dataclasses.replace(channel, unit=spec.unit_of_channel(options.log, log, channel))
+    how: Any = dict(time=time, time_unit=found.time_unit, rate=found.rate, window=options.window)
+    record = spec.read_log(options.log, [channel], log=log, free=("bias",), **how)
     w = rates(record).values
     axes = np.linalg.eigh(np.cov(w.T))[1][:, ::-1]
     body, law = _hung(kind, jnp.asarray(1e-3), numbers, axes)
