@@ -11,7 +11,7 @@ VERBS = frozenset(
     """
     Add Apply Attract Bind Broadcast Call Check Choose Compare Compute Connect Control Convert Copy Define Delay Derive Describe
     Draw Estimate Evaluate Fill Find Fit Follow Give Handle Hang Hold Identify Import Integrate Interpolate Join Locate Make Map
-    Measure Minimise Name Normalise Predict Prepare Present Print Provide Raise Read Refuse Return Reverse Run Scale Set
+    Measure Minimise Name Normalise Predict Prepare Present Print Provide Raise Read Refuse Return Reverse Run Scale Select Set
     Share Show Simulate Solve Sort Split Store Sum Take Trace Turn Warn Wrap Write Yield
     """.split()
 )

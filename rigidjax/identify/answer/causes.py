@@ -27,7 +27,7 @@ from rigidjax.identify.model.charts import body_list, tensor_of
 from rigidjax.identify.model.free import Free
 from rigidjax.identify.model.model import Model, part_of_sensor
 from rigidjax.identify.model.terms import Noise, scaled_slopes
-from rigidjax.identify.model.widened import widened
+from rigidjax.identify.model.widened import with_slots, with_torques
 from rigidjax.identify.search.stages import (
     STRIDE,
     Attempt,
@@ -513,7 +513,7 @@ def _with_torques(
     t, tensors = model.records.t, [tensor_of(b) for b in body_list(model.bodies(x))]
     ends, none = [float(t.min()), float(t.max())], np.zeros(3)
     inertia, rate = float(np.max(tensors)), float(model.typical_rate)
-    torque = torques.Sum(
+    further = (
         torques.Damping(none),
         torques.Flywheel(none),
         torques.Flywheel(torques.Linear(jnp.asarray(ends), jnp.zeros((2, 3)))),
@@ -521,15 +521,15 @@ def _with_torques(
     )
     sizes = inertia * rate * np.array([0.1, 0.1, 0.1, 0.1 * rate])
     numbers: tuple[Callable[[Any], Any], ...] = (
-        lambda s: s.parts[0].coefficient,
-        lambda s: s.parts[1].momentum,
-        lambda s: s.parts[2].momentum.values[1],
-        lambda s: s.parts[3].torque,
+        lambda s: s.torque.parts[-4].coefficient,
+        lambda s: s.torque.parts[-3].momentum,
+        lambda s: s.torque.parts[-2].momentum.values[1],
+        lambda s: s.torque.parts[-1].torque,
     )
     every = zip(numbers, TORQUES, sizes.tolist(), strict=True)
     free = [Free(where, MISSING + name, scale=size) for where, name, size in every]
-    wide, point = widened(model, torque, free)
-    return wide, point(x)
+    wide, places = with_slots(with_torques(model, further), free)
+    return wide, jnp.zeros(wide.size, x.dtype).at[places].set(x)
 
 
 def _torque_columns(model: Model) -> dict[str, TorqueColumns]:
@@ -572,7 +572,7 @@ def _refit_torque(
     ends.append(fit_in_stages(x, task))
     if model.body_indices is None:
         columns = _torque_columns(model)[candidate.name]
-        known = model.torque.parts[0] if len(model.torque.parts) == 2 else None
+        known = model.torque.parts[0] if len(model.torque.parts) > len(TORQUES) else None
         found = regress_inertia(stacking.on_host(model.records, model.counts), known, columns)
         if found is not None:
             start = np.array(model.start(found.body))

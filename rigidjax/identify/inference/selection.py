@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -16,14 +15,13 @@ from rigidjax import _checks
 from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.answer.fit import fit
 from rigidjax.identify.answer.result import Fit
-from rigidjax.identify.data import stacking
 from rigidjax.identify.inference.compare import criterion
 from rigidjax.identify.model.build import Extended, extended
 from rigidjax.identify.model.charts import body_list
-from rigidjax.identify.model.free import Free, Slot, find_slots
-from rigidjax.identify.model.model import Model, require_one_kind, starting_scene
-from rigidjax.identify.model.predict import integrator_for
+from rigidjax.identify.model.free import Free, Slot
+from rigidjax.identify.model.model import Model, require_one_kind
 from rigidjax.identify.model.scene import Scene
+from rigidjax.identify.model.widened import with_slots, with_torques
 from rigidjax.identify.sensors.vectors import VectorSensor
 from rigidjax.identify.uncertainty.covariance import Linearisation, owners
 from rigidjax.motion import Attitude, Rigid
@@ -33,7 +31,6 @@ from rigidjax.motion.torques import (
     Flywheel,
     InSpace,
     QuadraticDamping,
-    Sum,
 )
 from rigidjax.motion.torques.composite import parts_of
 
@@ -132,8 +129,8 @@ def usual_terms(model: Model) -> Candidates:
     _checks.require_instance(model, Model, "usual_terms", requirement="a Model")
     require_one_kind(model, "usual_terms")
     t, rate, zero = np.asarray(model.records.t), float(model.typical_rate), np.zeros(3)
-    first: Any = body_list(model.bodies(model.start()))[0]
-    length, moment = float(np.max(t[:, -1] - t[:, 0])), float(jnp.trace(tensor_of(first))) / 3
+    body: Any = body_list(model.bodies(model.start()))[0]
+    length, moment = float(np.max(t[:, -1] - t[:, 0])), float(jnp.trace(tensor_of(body))) / 3
     laws = {
         "linear drag": (Damping(zero), "coefficient", moment / length),
         "quadratic drag": (QuadraticDamping(zero), "coefficient", moment / length / rate),
@@ -144,22 +141,12 @@ def usual_terms(model: Model) -> Candidates:
         laws["torque in space"] = (InSpace(zero), "torque", moment * rate / length)
     old = tuple(map(type, parts_of(model.torque)))
     laws = {name: law for name, law in laws.items() if not isinstance(law[0], old)}
-    own = () if model.torque is None else getattr(model.torque, "parts", (model.torque,))
+    first = 0 if model.torque is None else 1
     terms = {
         name: Free(partial(_part, place, field), name, scale=scale)
-        for place, (name, (_, field, scale)) in enumerate(laws.items(), len(own))
+        for place, (name, (_, field, scale)) in enumerate(laws.items(), first)
     }
-    slots, records, integrator = model.slots, model.records, model.integrator
-    if own == (model.torque,):
-        # What was free in the only torque is free in the first part of the sum.
-        key = jax.tree_util
-        into = (key.GetAttrKey("torque"), key.GetAttrKey("parts"), key.SequenceKey(0))
-        slots = tuple(
-            dataclasses.replace(slot, path=(*into, *slot.path[1:]))
-            if slot.path[0] == into[0]
-            else slot
-            for slot in slots
-        )
+    records = model.records
     for index, sensor in enumerate(records.sensors):
         if not isinstance(sensor, VectorSensor):
             continue
@@ -180,12 +167,8 @@ def usual_terms(model: Model) -> Candidates:
             alike = [type(one) for one in records.sensors].count(type(sensor))
             name += f" {index}" if alike > 1 else ""
             terms[name] = Free(place, name, scale=scale)
-    if integrator is None:
-        widest = float(np.max(np.diff(t)))
-        integrator = integrator_for(1.5 * widest * rate)
-    parts: Any = dict(torque=Sum(*own, *(law for law, *_ in laws.values())), slots=slots)
-    parts |= dict(records=records, integrator=integrator)
-    return Candidates(dataclasses.replace(model, **parts), terms)
+    wider = with_torques(model, [law for law, *_ in laws.values()]) if laws else model
+    return Candidates(dataclasses.replace(wider, records=records), terms)
 
 
 def _part(place: int, field: str, scene: Scene) -> Any:
@@ -239,11 +222,9 @@ def select(
     if not candidates:
         raise ValueError("candidates: wanted one or more terms, got none")
     groups = {n: [one] if isinstance(one, Free) else list(one) for n, one in candidates.items()}
-    scene = starting_scene(model, stacking.pick(model.records, 0))
     free = [one for group in groups.values() for one in group]
-    slots = find_slots(free, scene, model.body_names, model.slots)[len(model.slots) :]
     of_term = {name: [one.name for one in group] for name, group in groups.items()}
-    terms = _Terms(model, extended(model, slots), of_term)
+    terms = _Terms(model, with_slots(model, free), of_term)
     none, every = frozenset[str](), frozenset(groups)
     trials = {one: fit(terms.held(one), starts=starts, key=key) for one in (none, every)}
     best, path = none, [Step((), 0.0, trials[none].rms, _held_out(trials[none]))]

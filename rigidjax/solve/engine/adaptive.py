@@ -22,17 +22,29 @@ REPLAY, NO_METER = ReplayAdjoint(), dfx.NoProgressMeter()
 
 
 class AdaptiveRun(NamedTuple):
-    """Hold the result of a run with adaptive steps."""
+    """Hold the result of a run with adaptive steps: the states, and how the run ended.
 
-    ys: Any  # the states at the saved times; NaN at a time that the run did not reach
-    num_steps: Array  # rejected steps included
+    **Fields:**
+
+    - `ys`: the states at `ts`; NaN at a time that the run did not reach.
+    - `num_steps`: the number of all steps, rejected steps included.
+    - `num_rejected`: the number of rejected steps.
+    - `result`: a `diffrax.RESULTS`, which says how the run ended.
+    - `last_time`: the time at the end of the run, s.
+    - `last`: the state at `last_time`.
+    - `next_step`: the length of the step that would follow, s; NaN if the run was made with another
+      adjoint than `ReplayAdjoint`, which records the steps.
+    - `missed`: whether some part of the field switches at more times than can be stored; steps then
+      do not end at all of these times. `None` if no switch of the field depends on the time.
+    """
+
+    ys: Any
+    num_steps: Array
     num_rejected: Array
     result: dfx.RESULTS
-    last_time: Array  # the end of the run, s
-    last: Any  # the state at `last_time`
-    next_step: Array  # the length of the step that would follow, s, or NaN if not known
-    # Whether some part of the field switches at more times than can be stored; steps then do not
-    # end at all of them. `None` if no switch of the field depends on the time.
+    last_time: Array
+    last: Any
+    next_step: Array
     missed: Array | None
 
 

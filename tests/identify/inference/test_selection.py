@@ -9,9 +9,7 @@ import rigidjax as rj
 from rigidjax import identify, torques
 from rigidjax.identify.answer.fit import fit
 from rigidjax.identify.inference import selection
-from rigidjax.identify.model.build import extended
-from rigidjax.identify.model.free import find_slots
-from rigidjax.identify.model.model import starting_scene
+from rigidjax.identify.model.widened import with_slots
 
 TIMES = jnp.linspace(0.0, 4.0, 90)
 BODY = rj.Inertia.from_principal(1.0, 1.7, 2.1)
@@ -46,9 +44,8 @@ CANDIDATES = {
 def test_first_order_is_exact_where_the_readings_are_linear(count):
     """Of a known body and gyro errors alone: the sum of squares by NumPy's least squares."""
     model = model_of({"bias": [0.05, -0.04, 0.03]}, identify.Known(BODY), count=count)
-    scene = starting_scene(model, jax.tree.map(lambda leaf: leaf[0], model.records))
-    slots = find_slots(list(CANDIDATES.values()), scene, model.body_names)
-    terms = selection._Terms(model, extended(model, slots), {"bias": ["bias"], "scale": ["scale"]})
+    wide = with_slots(model, list(CANDIDATES.values()))
+    terms = selection._Terms(model, wide, {"bias": ["bias"], "scale": ["scale"]})
     trial = fit(terms.held(frozenset(["bias"])), starts=1, held_out=False)
     value = terms.first_order(trial, 1.0)
 
