@@ -403,7 +403,7 @@ def _asks_for(asked, wanted):
 WRONG = [
     (["--sensor", "gyro=wx,wy"], "wanted 3 columns, got 'wx,wy'"),
     (["--sensor", "compass=a,b,c"], "wanted gyro, accelerometer, quaternion or euler-SEQUENCE"),
-    (["--sensor", "gyro=wx,wy,wz:km/h"], "wanted the unit rad/s or deg/s or rpm, got 'km/h'"),
+    (["--sensor", "gyro=wx,wy,wz:km/h"], "wanted the unit rad/s or deg/s or mdeg/s or rpm, got 'km/h'"),
     (["--sensor", "gyro=wx,wy,wz:rad/s:-1"], "wanted a positive noise"),
     (["--sensor", "gyro=wx,wy,wz:rad/s:1,2"], "wanted one noise or three, got 2"),
     (["--noise", "0.1", "0.0", "0.1"], "--noise: wanted a positive noise, got 0"),
@@ -437,7 +437,7 @@ def test_logs_of_other_kinds(tmp_path):
     savemat(tmp_path / "a.mat", {"t": t, "w": np.ones(5)})
     with pytest.raises(LogError, match="arrays of different lengths"):
         identify.read_table(tmp_path / "a.mat", ["t", "w"])
-    with pytest.raises(LogError, match="no array 'q'; the arrays are t, w"):
+    with pytest.raises(LogError, match="no column 'q'; the columns are t, w"):
         identify.read_table(tmp_path / "a.npz", ["q"])
 
 
