@@ -91,8 +91,8 @@ def describe_allowed(
             reading = model.records.readings[index]
             size = np.sqrt(np.mean(np.asarray(reading.values)[reading.host_mask] ** 2))
             if bias < USUAL_BIAS * size:
-                whose = "its" if own else f"the {name}'s"
-                own.append(f"{whose} bias below {bias:.1g} {reading.sensor.unit}")
+                whose = "its bias" if own else f"the {name}'s bias is"
+                own.append(f"{whose} below {bias:.1g} {reading.sensor.unit}")
         conditions += [" and ".join(own)] if own else []
         for kind, sizes in by_kind.items():
             words = []
