@@ -403,7 +403,10 @@ def _asks_for(asked, wanted):
 WRONG = [
     (["--sensor", "gyro=wx,wy"], "wanted 3 columns, got 'wx,wy'"),
     (["--sensor", "compass=a,b,c"], "wanted gyro, accelerometer, quaternion or euler-SEQUENCE"),
-    (["--sensor", "gyro=wx,wy,wz:km/h"], "wanted the unit rad/s or deg/s or mdeg/s or rpm, got 'km/h'"),
+    (
+        ["--sensor", "gyro=wx,wy,wz:km/h"],
+        "wanted the unit rad/s or deg/s or mdeg/s or rpm, got 'km/h'",
+    ),
     (["--sensor", "gyro=wx,wy,wz:rad/s:-1"], "wanted a positive noise"),
     (["--sensor", "gyro=wx,wy,wz:rad/s:1,2"], "wanted one noise or three, got 2"),
     (["--noise", "0.1", "0.0", "0.1"], "--noise: wanted a positive noise, got 0"),
