@@ -427,11 +427,12 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
     return out
 
 
-def verdict(fit: Fit) -> str:
+def verdict(fit: Fit, rate_unit: str = "rad/s") -> str:
     """Return in words whether the search of a fit found the best point, whether the model explains
     the readings, what to try, and what the data do not determine.
 
-    **Arguments:** `fit` a result of `rigidjax.identify.fit`.
+    **Arguments:** `fit` a result of `rigidjax.identify.fit`; `rate_unit` the unit of the errors of
+    rates that were held out, as for `rows`.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> verdict(result).splitlines()[0]
@@ -450,7 +451,9 @@ def verdict(fit: Fit) -> str:
         good = [start for start in fit.starts if start.cost <= 1.01 * lowest]
         words = "ended within 1 % of the least misfit, which does not explain the readings"
     lines.append(f"starts: {len(good)} of {len(fit.starts)} {words}")
-    lines += [f"held out: {fit.held_out}"] if fit.held_out is not None else []
+    if fit.held_out is not None:
+        pairs = tuple(pair.in_unit(rate_unit) for pair in fit.held_out.pairs)
+        lines.append(f"held out: {dataclasses.replace(fit.held_out, pairs=pairs)}")
     for name, off in residuals_by_name(fit.model, fit.linear) if fit.linear is not None else ():
         lines.append(f"measured {name}: {off:+.2g} standard deviations from the fit")
     lines += [f"- {line}" for line in fit.identifiability]
@@ -482,7 +485,7 @@ def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str
         (name, (shown := numbers(*three))[0], interval_text(shown), unit)
         for name, *three, unit in (*rows(fit, rate_unit), *more)
     )
-    head, *words = verdict(fit).splitlines()
+    head, *words = verdict(fit, rate_unit).splitlines()
     said = "".join(f"<li>{html.escape(line.removeprefix('- '))}</li>" for line in words)
     colour = "#009E73" if fit.ok else "#D55E00"
     return f"""<p style="color: {colour}; font-weight: 600">{html.escape(head)}</p>

@@ -246,6 +246,10 @@ def _final_state(
             # run did not reach, it is called with the state at the start, for which it has a finite
             # value; `masked` then replaces the result by infinity.
             states = jnp.where(there[:, None], states, run.y0)
+            if sub.t1:
+                # The end of the run follows the saved times that it reached, as in diffrax.
+                order = jnp.argsort(~there)
+                ts, states, there = ts[order], states[order], there[order]
         out = jax.vmap(lambda t, y: sub.fn(t, make_state(y), args))(ts, states)
         if sub.ts is None:
             return dataclasses.replace(old, ts=ts, ys=out, save_index=jnp.asarray(len(ts)))
