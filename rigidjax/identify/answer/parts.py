@@ -4,7 +4,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax import _show
 from rigidjax.identify.answer.answers import Answer
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise
@@ -118,12 +117,6 @@ class Pair(eqx.Module):
     fitted: float
     held_out: float
     before: float | None = None
-
-    def in_unit(self, rate_unit: str) -> "Pair":
-        """Return this pair in the unit that a report shows, if the errors are rates `rate_unit`."""
-        scale, unit = _show.shown_unit(self.unit, rate_unit)
-        before = None if self.before is None else scale * self.before
-        return Pair(self.sensor, unit, scale * self.fitted, scale * self.held_out, before)
 
     def __str__(self) -> str:
         before = "" if self.before is None else f", before {self.before:.3g}"

@@ -15,7 +15,7 @@ from rigidjax import _checks, _show
 from rigidjax.identify.answer import answers, undetermined
 from rigidjax.identify.answer.answers import Answer, Cause
 from rigidjax.identify.answer.causes import causes
-from rigidjax.identify.answer.parts import Assessment, BestPoint, HeldOut, Uncertainty
+from rigidjax.identify.answer.parts import Assessment, BestPoint, HeldOut, Pair, Uncertainty
 from rigidjax.identify.answer.table import Row, html_rows, interval_text, numbers, table
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
 from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jacobian
@@ -452,8 +452,13 @@ def verdict(fit: Fit, rate_unit: str = "rad/s") -> str:
         words = "ended within 1 % of the least misfit, which does not explain the readings"
     lines.append(f"starts: {len(good)} of {len(fit.starts)} {words}")
     if fit.held_out is not None:
-        pairs = tuple(pair.in_unit(rate_unit) for pair in fit.held_out.pairs)
-        lines.append(f"held out: {dataclasses.replace(fit.held_out, pairs=pairs)}")
+        pairs = []
+        for pair in fit.held_out.pairs:
+            scale, unit = _show.shown_unit(pair.unit, rate_unit)
+            before = None if pair.before is None else scale * pair.before
+            sizes = scale * pair.fitted, scale * pair.held_out, before
+            pairs.append(Pair(pair.sensor, unit, *sizes))
+        lines.append(f"held out: {dataclasses.replace(fit.held_out, pairs=tuple(pairs))}")
     for name, off in residuals_by_name(fit.model, fit.linear) if fit.linear is not None else ():
         lines.append(f"measured {name}: {off:+.2g} standard deviations from the fit")
     lines += [f"- {line}" for line in fit.identifiability]
