@@ -2,6 +2,7 @@
 
 import dataclasses
 import html
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -172,11 +173,12 @@ class Fit(eqx.Module):
         """
         if not self.assessment.left or self.linear is None:
             return ()
-        # Each refit of a cause takes time: keep the causes of the fit that was asked for last.
-        if _LAST.get("linear") is not self.linear:
+        # Each refit of a cause takes time, and a report asks several times: the causes of the fit
+        # that was asked for last are kept, but not its arrays.
+        if _last_causes[0]() is not self.linear:
             parts = self.model, self.x, self.noises, self.linear, self.assessment.left
-            _LAST.update(linear=self.linear, causes=causes(*parts))
-        return _LAST["causes"]
+            _last_causes[:] = weakref.ref(self.linear), causes(*parts)
+        return _last_causes[1]
 
     @property
     def advice(self) -> str:
@@ -344,7 +346,8 @@ class Fit(eqx.Module):
         )
 
 
-_LAST: dict[str, Any] = {}
+# A weak reference to the `linear` of a fit, and its causes.
+_last_causes: list[Any] = [lambda: None, ()]
 
 
 def value_and_interval_of(

@@ -245,10 +245,14 @@ def select(
         goal = best
         while (ahead := min([goal, *terms.neighbours(goal)], key=first_order)) != goal:
             goal = ahead
-        near = sorted(terms.neighbours(best), key=first_order)[:TRIED]
-        new = {one for one in (goal, *near) if first_order(one) < first_order(best)}
-        # First order fails where terms are hard to tell apart, so that a term less is always tried.
-        new |= {best - {name} for name in best if best != every}
+        # The fit of all terms is only a place to start from, where terms run away together.
+        new = {goal}
+        if goal == best or best != every:
+            # First order fails where terms are hard to tell apart, so that a term less is always
+            # tried, and what seems to do nearly as well.
+            near = sorted(set(terms.neighbours(best)) - {*trials}, key=first_order)[:TRIED]
+            new |= {one for one in near if first_order(one) < first_order(best) + ALIKE}
+            new |= {best - {name} for name in best}
         new -= {*trials}
         if not new:
             break
@@ -312,10 +316,11 @@ class _Terms(NamedTuple):
         return [slot for name in self.names(terms) for slot in self.of_term[name]]
 
     def neighbours(self, terms: frozenset[str]) -> list[frozenset[str]]:
-        """Return the sets with one term more, one less, or one exchanged for another."""
+        """Return the sets with one term more, one less, or one in the place of one or two."""
         rest = [name for name in self.of_term if name not in terms]
-        less = [terms - {name} for name in self.names(terms)]
-        return [one | {name} for one in (terms, *less) for name in rest] + less
+        less = [terms - {name} for name in terms]
+        few = {one - {name} for one in less for name in one}
+        return [one | {name} for one in (terms, *less, *few) for name in rest] + less
 
     def held(self, terms: frozenset[str]) -> Model:
         """Return the model with all slots, where those of other terms hardly move."""
