@@ -38,11 +38,11 @@ from rigidjax.motion.torques.composite import parts_of
 # that is in has a prior of one over it, in units of its scale: so all subsets of the terms share
 # one compiled program.
 HELD = 1e-9
-# In each round so many of the changes that promise most to first order are fitted.
+# So many of the changes that promise most to first order are fitted in a round.
 TRIED = 3
 # A larger set of terms may not predict held-out readings with errors larger by this factor.
 WORSE = 1.05
-# Terms are named as alternatives if their criteria differ by less: the odds are below e³.
+# Sets of terms do nearly as well if their criteria differ by less: the odds are below e³ = 20.
 ALIKE = 6.0
 
 
@@ -189,13 +189,14 @@ def select(
 ) -> Selection:
     """Select the terms of a model for which its recordings ask, and fit the model with these terms.
 
-    Rounds add, drop or exchange one term. In each round the effect of every change is computed to
-    first order (a score test: Rao 1948, doi:10.1017/S0305004100023987), and the three best ones are
-    fitted. The best fit is kept if it lowers the extended Bayesian information criterion
-    `Σ Nₛ log s² + p log N + 2 k log K` for k of K candidates with p parameters (Chen and Chen
-    2008, doi:10.1093/biomet/asn034; Nₛ, s and N as for `compare`) and, if it has more terms,
-    predicts the readings that a fit of the rest has not seen no worse; otherwise the selection
-    ends.
+    The first two fits have no term and all terms. Each round starts from the best fit so far. It
+    computes to first order (a score test: Rao 1948, doi:10.1017/S0305004100023987) the effect of
+    one term more, one less, or one in the place of one or two, and fits the sets of terms that
+    promise most and all with one term less. The best fit is that of the least extended Bayesian
+    information criterion `Σ Nₛ log s² + p log N + 2 k log K` for k of K candidates with p
+    parameters (Chen and Chen 2008, doi:10.1093/biomet/asn034; Nₛ, s and N as for `compare`); a fit
+    with more terms must also predict the readings that a fit of the rest has not seen, with errors
+    at most 5 % larger. The selection ends after a round without a new set.
 
     **Arguments:**
 
@@ -206,8 +207,7 @@ def select(
     - `starts`, `key`: as for `fit`, for the fit without terms and for the last one.
 
     **Returns** a `Selection` with `terms`, `fit`, `path` and `alternatives`. **Raises**
-    `ValueError`
-    for no candidates and for a model of several kinds of recordings.
+    `ValueError` for no candidates and for a model of several kinds of recordings.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> select(rj.identify.Model(record, rj.identify.Ratios()), {})
@@ -253,7 +253,7 @@ def select(
             near = sorted(set(terms.neighbours(best)) - {*trials}, key=first_order)[:TRIED]
             new |= {one for one in near if first_order(one) < first_order(best) + ALIKE}
             new |= {best - {name} for name in best}
-        new -= {*trials}
+        new = sorted(new - {*trials}, key=first_order)
         if not new:
             break
         trials |= {one: fit(terms.held(one), starts=2, initial=trials[best].x) for one in new}
