@@ -73,16 +73,17 @@ def record(rng, key):
 def main(count):
     """Print how often the right terms are selected."""
     free = {n: identify.Free(FREE[n], n, scale=size) for n, size in SIZES.items()}
-    right = false = missed = 0
+    right = told = 0
     took = []
     for seed in range(count):
         model, names = record(np.random.default_rng(seed), jax.random.key(seed))
         begin = time.process_time()
         found = identify.select(model, free, starts=2)
         took.append(time.process_time() - begin)
-        extra, lost = set(found.terms) - names, names - set(found.terms)
-        right, false, missed = right + (not extra | lost), false + bool(extra), missed + bool(lost)
-        if extra | lost:
+        right += set(found.terms) == names
+        # Each hidden term is selected, or named as what the data do not tell from a selected one.
+        told += names <= set(found.terms).union(*found.alternatives.values())
+        if set(found.terms) != names:
             print(
                 seed,
                 took[-1],
@@ -93,7 +94,7 @@ def main(count):
                 flush=True,
             )
             print(found)
-    print(f"{count} records: right {right}, a false term {false}, a missed one {missed}")
+    print(f"{count} records: right {right}, each hidden term found or an alternative {told}")
     print(f"CPU s of a selection, median {np.median(took):.2f}")
 
 
