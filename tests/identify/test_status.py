@@ -1,5 +1,7 @@
 """What a fit says of itself: of wrong set-ups none is `ok`, of right ones all are."""
 
+from contextlib import nullcontext
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -246,7 +248,10 @@ def test_numbers_of_frames_as_times_are_among_the_causes():
     "name", [*FEW_WRONG, *(pytest.param(name, marks=pytest.mark.slow) for name in WRONG)]
 )
 def test_no_wrong_set_up_is_called_ok(name):
-    found = (FEW_WRONG | WRONG)[name]()
+    # What the sizes of the rates show is said before the search.
+    units = pytest.warns(UserWarning, match="fit: most likely .*; the search goes on, but")
+    with units if "/s" in CAUSES.get(name, "") and "read as" in CAUSES[name] else nullcontext():
+        found = (FEW_WRONG | WRONG)[name]()
     print(f"{name}: {found.status}")
     assert not found.ok and "can be trusted" not in found.advice
     said = " ".join(str(cause) for cause in found.causes)

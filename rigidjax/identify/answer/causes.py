@@ -9,6 +9,7 @@ chooses which causes are fitted together with the model, and these refits decide
 """
 
 import itertools
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -176,6 +177,22 @@ def cause_by_misread_file(recordings: Sequence[Recording], torque: Law | None) -
         words = words.replace("deg/s read", "numbers of frames read as times, or deg/s read")
     kind = "Gyro" if gyros else "AttitudeSensor"
     return Cause("misread", kind, 1.0, f"most likely {words}", f"read the log again: {words}")
+
+
+def warn_of_unit(recording: Recording, torque: Law | None) -> None:
+    """Warn, before the search, of rates that are too large or too small because of their unit.
+
+    Such a search takes some twenty times as long, and its answer is wrong.
+    """
+    odd = beyond_gyros(recording.readings)
+    turning = mean_rates(*attitudes(recording)).values
+    if readings_of(recording, Gyro) and len(turning) > 10:
+        sizes = [np.sqrt(np.mean(one**2)) for one in (rates(recording).values, turning)]
+        odd = odd or not 0.1 < sizes[0] / max(sizes[1], 1e-150) < 10.0
+    cause = cause_by_misread_file([recording], torque) if odd else None
+    if cause is not None:
+        words = "the search goes on, but takes long"
+        warnings.warn(f"fit: {cause.words}: {cause.remedy}; {words}", stacklevel=4)
 
 
 class _EulerResidual(NamedTuple):

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax._names import suggest_arguments
 from rigidjax.identify.answer.assess import assess
+from rigidjax.identify.answer.causes import warn_of_unit
 from rigidjax.identify.answer.held_out import choose_part, with_body, with_held_out
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
@@ -126,7 +127,8 @@ def fit(
     **Raises:** `TypeError` unless `model` is a `Model`. `ValueError` for fewer than one start or
     more than 10 000; for a body whose rates in a recording are all zero; for more than 1000
     parameters that recordings share (`descend` takes any number); and for a checkpoint that is
-    damaged, belongs to another model, or lies in a folder that does not exist.
+    damaged, belongs to another model, or lies in a folder that does not exist. A `UserWarning`
+    says, before the search, that the sizes of the rates show a wrong unit.
 
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
@@ -164,11 +166,13 @@ def fit(
         return dataclasses.replace(result, place=_ON_CPU)
     if model.index.bodies:
         recordings = [
-            (one.torque, recording)
+            (one.torque, recording, place == 0)
             for one in stacking.kinds_of(model)
-            for recording in stacking.on_host(one.records, one.counts)
+            for place, recording in enumerate(stacking.on_host(one.records, one.counts))
         ]
-        for number, (torque, recording) in enumerate(recordings, 1):
+        for number, (torque, recording, is_first) in enumerate(recordings, 1):
+            if is_first:
+                warn_of_unit(recording, torque)
             named = rates(recording).values, f"fit: the rates of recording {number}"
             require_turning(*named)
             if torque is None:

@@ -166,7 +166,10 @@ def usual_terms(model: Model) -> Candidates:
             name = f"{type(sensor).__name__} {'clock' if field == 'offset' else field}"
             alike = [type(one) for one in records.sensors].count(type(sensor))
             name += f" {index}" if alike > 1 else ""
-            terms[name] = Free(place, name, scale=scale)
+            # Without a prior, errors of sensors run away where the motion explains as much.
+            prior = 10 * scale if field == "offset" else scale
+            prior = prior if sensor.tolerance is None else None
+            terms[name] = Free(place, name, scale=scale, prior=prior)
     wider = with_torques(model, [law for law, *_ in laws.values()]) if laws else model
     return Candidates(dataclasses.replace(wider, records=records), terms)
 
@@ -196,7 +199,8 @@ def select(
     information criterion `Σ Nₛ log s² + p log N + 2 k log K` for k of K candidates with p
     parameters (Chen and Chen 2008, doi:10.1093/biomet/asn034; Nₛ, s and N as for `compare`); a fit
     with more terms must also predict the readings that a fit of the rest has not seen, with errors
-    at most 5 % larger. The selection ends after a round without a new set.
+    at most 5 % larger, and its search must have ended. The selection ends after a round without a
+    new set.
 
     **Arguments:**
 
@@ -234,25 +238,25 @@ def select(
         before = _held_out(trials[best])
         for one, trial in trials.items():
             after = _held_out(trial)
-            if before and after and len(one) > len(best) and _mean_ratio(after, before) > WORSE:
+            worse = not after or (before and _mean_ratio(after, before) > WORSE)
+            if one != best and worse:
                 found[one] = math.inf
         least = min(found, key=lambda one: found[one])
         if least != best:
             sizes = trials[least].rms, _held_out(trials[least])
             path.append(Step(terms.names(least), found[best] - found[least], *sizes))
-        best = least
-        first_order = terms.first_order(trials[best], correlation)
-        goal = best
-        while (ahead := min([goal, *terms.neighbours(goal)], key=first_order)) != goal:
-            goal = ahead
-        # The fit of all terms is only a place to start from, where terms run away together.
-        new = {goal}
-        if goal == best or best != every:
-            # First order fails where terms are hard to tell apart, so that a term less is always
-            # tried, and what seems to do nearly as well.
-            near = sorted(set(terms.neighbours(best)) - {*trials}, key=first_order)[:TRIED]
-            new |= {one for one in near if first_order(one) < first_order(best) + ALIKE}
-            new |= {best - {name} for name in best}
+        best, new = least, set()
+        # The fit of all terms, which may run away together in it, is a place to start from.
+        for source in (every, best):
+            first_order, goal = terms.first_order(trials[source], correlation), source
+            while (ahead := min([goal, *terms.neighbours(goal)], key=first_order)) != goal:
+                goal = ahead
+            new.add(goal)
+        # First order fails where terms are hard to tell apart, so that a term less is always tried,
+        # and what seems to do nearly as well.
+        near = sorted(set(terms.neighbours(best)) - {*trials}, key=first_order)[:TRIED]
+        new |= {one for one in near if first_order(one) < first_order(best) + ALIKE}
+        new |= {best - {name} for name in best}
         new = sorted(new - {*trials}, key=first_order)
         if not new:
             break
