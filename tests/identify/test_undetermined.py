@@ -11,7 +11,8 @@ import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.answer.answers import Answer
 from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
-from rigidjax.identify.answer.undetermined import Combination
+from rigidjax.identify.answer.undetermined import Combination, _describe_limits
+from rigidjax.identify.uncertainty.quantities import Quantity
 
 TS = np.linspace(0.0, 1.0, 5)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -201,3 +202,17 @@ def test_the_place_of_a_marker_is_known_only_from_the_centre_of_mass():
     ]
     units = {quantity.name: quantity.unit for quantity in found.quantities}
     assert units["com x"] == units["place x"] == "m"
+
+
+@pytest.mark.parametrize(
+    ("ratio", "other", "many"), [(1e-7, 2.0, 1), (1e-7, 0.02, 0), (1e-3, 2.0, 0)]
+)
+def test_a_tiny_interval_beside_one_of_everything_is_told(ratio, other, many):
+    """Of two ratios of moments, given with these relative deviations."""
+    ratios = [
+        Quantity("Ix/Iz", 1.0, ratio, "", True, most=1.0),
+        Quantity("Iy/Iz", 0.5, 0.5 * other, "", True, most=1.0),
+    ]
+    said = _describe_limits(ratios)
+    assert len(said) == many
+    assert all("of Ix/Iz" in one and "of Iy/Iz spans most" in one for one in said)

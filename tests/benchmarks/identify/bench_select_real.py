@@ -76,7 +76,9 @@ def throws(folder):
     for path in box.paths("object_empty"):
         log, speed = box.columns(path, box.WINDOW[0]), box.speed(path)
         rates = np.stack([log["wx"], log["wy"], log["wz"]], axis=1)
-        records.append(identify.Recording(log["t"][::4], (gyro, rates[::4]), inputs={"speed": speed}))
+        records.append(
+            identify.Recording(log["t"][::4], (gyro, rates[::4]), inputs={"speed": speed})
+        )
     wheel = box.law(tilt=[0.0, 0.0]).parts[0]
     zero = [0.0] * 3
     law = torques.Sum(

@@ -145,6 +145,20 @@ def test_a_large_bias_without_a_prior_is_told():
     assert "without a prior" not in fitted(RATES + off, free=(known,), bias=np.zeros(3)).advice
 
 
+@pytest.mark.parametrize("size", [-0.1, 0.1])
+def test_a_damping_below_zero_is_told(size):
+    """Rates of a body that a torque along its rate drives: what a damping makes of them."""
+    law = rj.torques.Damping(size * np.ones(3))
+    noise = 0.01 * np.random.default_rng(0).normal(size=RATES.shape)
+    rates = np.asarray(rj.simulate(BODY, rj.Spin([2.0, 4.0, -3.0]), T, law).ys.omega) + noise
+    record = identify.Recording(T, (identify.Gyro(0.01), rates))
+    free = [identify.Free(lambda s: s.torque.coefficient, "air", scale=0.1)]
+    zero = rj.torques.Damping(np.zeros(3))
+    model = identify.Model(record, identify.PrincipalRatios(), torque=zero, free=free)
+    told = "'air', a damping, came out as -0.0" in identify.fit(model, starts=1).advice
+    assert told == (size < 0)
+
+
 def test_an_entry_that_is_estimated_is_not_considered_once_more():
     """The scale of one axis is free, with the tolerance as its prior: the same as all that are."""
     gyro = identify.Gyro(0.01, tolerance=TOLERANCE, scale=[1.0, 1.0, 1.0], skew=[0.0, 0.0, 0.0])
