@@ -114,6 +114,29 @@ def swing():
     save(figure, "swing.png")
 
 
+def terms():
+    """Draw the errors before and after the selection of the guide's page on terms."""
+    ts = jnp.linspace(0.0, 4.0, 160)
+    body = rj.Inertia.from_principal(1.0, 1.6, 2.2)
+    hidden = rj.torques.Damping([0.2, 0.3, 0.25])
+    gyro = identify.Gyro(noise=0.02, bias=[0.05, -0.04, 0.06])
+    read = identify.simulate_readings(
+        gyro, body, rj.Spin([1.5, 0.8, 3.0]), ts, hidden, key=jax.random.key(0)
+    )
+    record = identify.Recording(ts, (identify.Gyro(noise=0.02), read))
+    found = identify.select(identify.Model(record, identify.Ratios()))
+    none = identify.fit(identify.Model(record, identify.Ratios()))
+    figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.4), layout="constrained", sharey=True)
+    for ax, one, word in zip(axes, (none, found.fit), ("no term", found.terms), strict=True):
+        for k, colour in enumerate(rj.plot.COLOURS[:3]):
+            ax.plot(ts, one.residuals[0][0, :, k], color=colour, lw=1, label=f"$Ω_{'xyz'[k]}$")
+        ax.axvspan(3.0, 4.0, color="0.93", zorder=0)
+        ax.set(xlabel="time, s", title=word if isinstance(word, str) else " + ".join(word))
+    axes[0].set_ylabel("gyro − fit, rad/s")
+    axes[0].legend(fontsize=8, frameon=False)
+    save(figure, "terms.png")
+
+
 def predict():
     """Draw the prediction of the guide's page on predictions, from the same readings."""
     truth, first = rj.Inertia.from_principal(1.0, 1.6, 2.2), rj.Spin([1.0, 0.5, 1.2])
@@ -212,5 +235,5 @@ def workprecision():
 
 
 if __name__ == "__main__":
-    for draw in (frames, flip, start, fit, swing, predict, simulators, workprecision):
+    for draw in (frames, flip, start, fit, swing, terms, predict, simulators, workprecision):
         draw()

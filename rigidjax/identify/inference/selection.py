@@ -40,7 +40,7 @@ from rigidjax.motion.torques.composite import parts_of
 HELD = 1e-9
 # So many of the changes that promise most to first order are fitted in a round.
 TRIED = 3
-# A larger set of terms may not predict held-out readings with errors larger by this factor.
+# A new set of terms may not predict held-out readings with errors larger by this factor.
 WORSE = 1.05
 # Sets of terms do nearly as well if their criteria differ by less: the odds are below e³ = 20.
 ALIKE = 6.0
@@ -115,8 +115,8 @@ def usual_terms(model: Model) -> Candidates:
 
     The torques are linear and quadratic drag, a constant torque, a wheel of constant speed and, if
     the model follows the attitude, a torque that is constant in space. A sensor of vectors has a
-    bias and a scale, and a clock offset beside other sensors. A term that the model has is left
-    out.
+    bias and a scale, and a clock offset beside other sensors, with priors unless the sensor has a
+    tolerance: a tenth of the readings, 5 %, and 0.1 s. A term that the model has is left out.
 
     **Arguments:** `model` the model to which the terms are added. **Returns** `Candidates` with the
     fields `model` and `terms`. **Raises** `TypeError` unless `model` is a `Model`, and `ValueError`
@@ -197,8 +197,8 @@ def select(
     one term more, one less, or one in the place of one or two, and fits the sets of terms that
     promise most and all with one term less. The best fit is that of the least extended Bayesian
     information criterion `Σ Nₛ log s² + p log N + 2 k log K` for k of K candidates with p
-    parameters (Chen and Chen 2008, doi:10.1093/biomet/asn034; Nₛ, s and N as for `compare`); a fit
-    with more terms must also predict the readings that a fit of the rest has not seen, with errors
+    parameters (Chen and Chen 2008, doi:10.1093/biomet/asn034; Nₛ, s and N as for `compare`); a new
+    set of terms must also predict the readings that a fit of the rest has not seen, with errors
     at most 5 % larger, and its search must have ended. The selection ends after a round without a
     new set.
 
