@@ -316,12 +316,13 @@ def test_other_mistakes_are_named(tumble):
 def test_a_record_of_another_length_is_the_same_program(caplog):
     """The appended readings change nothing: neither the result, nor its intervals, nor a word."""
 
-    def fitted(count):
+    def fitted(count, factor=1.0):
         ts = jnp.linspace(0.0, 8.0, 100)[:count]
         law = rj.torques.Damping([0.02, 0.02, 0.02])
         motion = rj.simulate(rj.Inertia.from_principal(1.0, 1.6, 2.1), rj.Spin([0.4, 1.2, -0.3]), ts, law)  # fmt: skip
         noise = np.random.default_rng(0).normal(size=(100, 3))[:count]
         record = identify.Recording(ts, (identify.Gyro(), motion.ys.omega + 0.01 * noise))
+        law = rj.torques.Damping([factor * 0.02] * 3)
         return identify.fit(identify.Model(record, identify.Tensor(1.0), torque=law), starts=1)
 
     fitted(95)
@@ -346,3 +347,8 @@ def test_a_record_of_another_length_is_the_same_program(caplog):
         np.array(list(short.interval().values())), np.array(list(plain.interval().values())),
         rtol=1e-6, atol=1e-9,
     )  # fmt: skip
+    # The torque counted twice: the same residuals with twice the moments, and a line that says so.
+    twice = fitted(92, 2.0)
+    np.testing.assert_allclose(twice.body.moments, 2.0 * short.body.moments, rtol=1e-4)
+    np.testing.assert_allclose(twice.chi2, short.chi2, rtol=1e-6)
+    assert "a wheel counted twice" in short.identifiability[-1]

@@ -19,6 +19,7 @@ from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
 from rigidjax.identify.model.model import Model, parts_of, shortened
 from rigidjax.identify.model.several import Part
 from rigidjax.identify.search.stages import blocks_at
+from rigidjax.identify.search.starts import rate_only
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 from rigidjax.identify.uncertainty.flat_limit import bodies_at
@@ -394,18 +395,24 @@ def describe_identifiability(
             out.append(f"The initial body {many} not determined by these data.")
     out += _describe_limits(moments)
     out += _describe_combinations(point, uncertainty)
+    only_gyros = all(isinstance(sensor, Gyro) for sensor in point.model.records.sensors)
     if point.model.torque is None:
         out.append(
             "Free motion cannot show the absolute inertia, only ratios of moments; nor the mass or "
             "the centre of mass."
         )
-        if all(isinstance(sensor, Gyro) for sensor in point.model.records.sensors):
+        if only_gyros:
             out.append(
                 "Rates of free motion with an axis mirrored or two axes swapped fit another body "
                 "as well: they cannot show such a mistake. Nor do they show rates in the world's "
                 "axes if two moments are alike, or rates in deg/s read as rad/s if all are."
             )
             out += _describe_near_ball(point)
+    elif only_gyros and rate_only(point.model.torque) and "kg m²" in {q.unit for q in moments}:
+        out.append(
+            "All moments are in proportion to the torque: rates cannot show that it is wrong by a "
+            "factor, as of a wheel counted twice."
+        )
     out += describe_full_scale(point.model.records.readings)
     return tuple(out)
 
