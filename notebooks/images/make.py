@@ -129,7 +129,7 @@ def terms():
     figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.4), layout="constrained", sharey=True)
     for ax, one, word in zip(axes, (none, found.fit), ("no term", found.terms), strict=True):
         for k, colour in enumerate(rj.plot.COLOURS[:3]):
-            ax.plot(ts, one.residuals[0][0, :, k], color=colour, lw=1, label=f"$Ω_{'xyz'[k]}$")
+            ax.plot(ts, one.residuals[0][:, k], color=colour, lw=1, label=f"$Ω_{'xyz'[k]}$")
         ax.axvspan(3.0, 4.0, color="0.93", zorder=0)
         ax.set(xlabel="time, s", title=word if isinstance(word, str) else " + ".join(word))
     axes[0].set_ylabel("gyro − fit, rad/s")
