@@ -267,8 +267,8 @@ def sorted_for_chunks(key: Array, chunk: int, num_devices: int) -> tuple[Array, 
     chunk = min(chunk, -(-count // num_devices))
     size = -(-count // (chunk * num_devices)) * chunk
     # The sorted bodies fill the positions in the array for the devices in turn: first chunk 0 of
-    # every device, then chunk 1 of every device, and so on. `seats` has the turn of each position.
-    # Each device has `size` positions; the last device may have fewer.
+    # every device, then chunk 1 of every device, and so on. `seats[i]` is the rank of the body at
+    # position i. Each device has `size` positions; the last device may have fewer.
     seats = (
         np.arange(size * num_devices).reshape(-1, num_devices, chunk).transpose(1, 0, 2).reshape(-1)
     )

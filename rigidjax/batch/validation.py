@@ -137,7 +137,7 @@ def check_batch(
     shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
     row = (lambda a: a[0]) if isinstance(bodies, MassProperties) else shape
     validation.require_compatible(*eqx.combine(shared, jax.tree.map(row, per_body), constants))
-    validation.warn_of_scale(bodies, torque)
+    validation.warn_of_relative_inertia(bodies, torque)
     batch = BodyBatch(shared, per_body, constants, count, dtype, tuple(checks))
     if all(isinstance(index, np.ndarray | np.integer) for index, _ in checks):
         # The numbers of few bodies have been checked on the host, not on the device. The error can

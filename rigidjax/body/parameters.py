@@ -201,7 +201,9 @@ def curvature_rows_near_flat_body(
 
 
 def _from_shape(shape: Float[Array, "5"]) -> Mat3:
-    """Return the second moment (1 + V)²/Tr((1 + V)²) that five numbers of `pack_shape` describe."""
+    """Return the second moment (1 + V)²/Tr((1 + V)²), of trace 1, where the symmetric V without a
+    trace has the five numbers of `pack_shape`.
+    """
     root = _root(shape)
     # The root is scaled first: after a step of an optimiser that is much too long, squares of the
     # entries would overflow.

@@ -71,7 +71,7 @@ def require_single_body(
     requirement: str = "",
     hint: str = "",
 ) -> Any:
-    """Return `value` if it is one real body of one of the classes `kinds`.
+    """Return `value` if it is a single body of one of the classes `kinds`, and a possible one.
 
     Impossible numbers raise an error if they are known, and become NaN if they are traced. A moment
     may be zero: a function that divides by the moments calls `require_physical_body`. The other

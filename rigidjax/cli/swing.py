@@ -180,8 +180,11 @@ def _excess(kind: str, moment: Scalar, numbers: dict[str, Scalar]) -> Scalar:
 def _hung(
     kind: str, moment: Scalar, numbers: dict[str, Scalar], axes: np.ndarray
 ) -> tuple[MassProperties, AbstractSuspension]:
-    """Return a body and its suspension; the columns of `axes` are the axis and two directions
-    across it.
+    """Return a body with a `moment` about the axis of its suspension, and the suspension of this
+    `kind`, whose other quantities (mass, arm, gravity, …) are `numbers`.
+
+    The columns of `axes` are the axis and two directions across it, of which the first one points
+    to the centre of mass.
     """
     x, (up, side, _) = numbers, jnp.asarray(axes.T)
     body = MassProperties(

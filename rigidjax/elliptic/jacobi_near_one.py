@@ -86,7 +86,7 @@ def _power_times_exp(base: Array, exponent: Array, power: Array) -> Array:
 def _power_times_exp_jvp(
     primals: tuple[Array, Array, Array], tangents: tuple[PyTree, ...]
 ) -> tuple[Array, Array]:
-    """Return p^n e^y and its tangent."""
+    """Return p^n e^y and its tangent, for the primals (p, y, n) with a constant n."""
     (p, y, n), (dp, dy, _) = primals, tangents
     value = _power_times_exp(p, y, n)
     slope = jnp.where(n == 0, 0, n * _power_times_exp(p, y, n - 1))

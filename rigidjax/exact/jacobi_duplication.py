@@ -78,8 +78,9 @@ def is_aperiodic(modulus: Modulus) -> Bool[Array, ""]:
 
 
 def clip_time(reduced_time: Scalar, modulus: Modulus) -> Scalar:
-    """Return a time from which whole half periods were subtracted; on the separatrix it is clipped
-    to the time after which the motion is taken as a steady spin about the middle axis.
+    """Return the time `reduced_time`, from which whole half periods are subtracted already; clip it
+    on the separatrix to the time after which the motion is taken as a steady spin about the middle
+    axis.
     """
     big = jnp.maximum(modulus.p, modulus.q)
     rest = iteration_limits(reduced_time.dtype).rest / jnp.sqrt(jnp.where(big > 0, big, 1.0))

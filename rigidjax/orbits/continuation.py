@@ -164,7 +164,8 @@ def _family_tangent(scene: "AbstractReversible", numbers: Array, index: int) -> 
 @eqx.filter_jit
 def _slope(scene: "AbstractReversible", numbers: Array, index: int) -> PeriodicOrbit:
     """Return the derivative of the start and period of an orbit along its family with respect to
-    the number with this `index`; for 3 with respect to the whole period.
+    `numbers[index]`; `numbers[3]` is half the period, but the derivative is then with respect to
+    the whole period.
     """
     unknown = _family_tangent(scene, numbers, index)
     change = orbit_of(correction.insert_held(unknown, jnp.ones_like(unknown[0]), index))

@@ -100,8 +100,8 @@ def _simulate_flow(scene: BenchmarkScene, setting_is_accuracy: bool = False) -> 
 
 
 def _adaptive_flow(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
-    """Return the flow of a Runge–Kutta method in the loop of `simulate`, with the setting as
-    relative tolerance, differentiable in forward and reverse mode.
+    """Return the `Flow` of a Runge–Kutta method in the loop of `simulate`, differentiable in
+    forward and reverse mode; the setting of this `Flow` is the relative tolerance.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:

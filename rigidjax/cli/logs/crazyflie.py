@@ -27,7 +27,9 @@ def read_crazyflie(path: Path) -> Log:
     data = path.read_bytes()
     version, count = struct.unpack_from("<HH", data, 1)
     if data[0] != FIRST_BYTE or version not in (1, 2):
-        raise ValueError(f"wanted a µSD log of version 1 or 2, got {data[0]:#x}, {version}")
+        raise ValueError(
+            f"wanted a µSD log of version 1 or 2, got version {version}, first byte {data[0]:#x}"
+        )
     at, events = 5, {}
 
     def text(start: int) -> tuple[str, int]:

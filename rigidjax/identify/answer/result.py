@@ -118,7 +118,9 @@ class Fit(eqx.Module):
 
     @property
     def search(self) -> Answer:
-        """Return the answer on the search: `found`, `not alone` or `not ended`."""
+        """Return the answer about the search: `found`, `not alone` (another motion fits as well),
+        or `not ended`.
+        """
         return self.assessment.search
 
     @property

@@ -132,7 +132,7 @@ def undetermined_combinations(
     if not null.size:
         return ()
     best = basis = None
-    values, slopes = _numbers_on_host(point)
+    values, slopes = _named_quantities_on_host(point)
     names, many = _labels(model), len(named_charts(model))
     first = len(labels(model))
     turns = sum("attitude about the body" in one.name for one in names)
@@ -260,17 +260,21 @@ def _labels(model: Model) -> list[Label]:
     return out
 
 
-def _numbers_on_host(point: BestPoint) -> FirstOrder:
+def _named_quantities_on_host(point: BestPoint) -> FirstOrder:
     """Return all numbers that a report may name, in the order of `_labels`."""
-    return FirstOrder(*map(np.asarray, _numbers(shortened(point.model), point.derivative_point)))
+    return FirstOrder(
+        *map(np.asarray, _named_quantities(shortened(point.model), point.derivative_point))
+    )
 
 
 @eqx.filter_jit
-def _numbers(model: Model, point: Float[Array, " n"]) -> FirstOrder:
-    """Return all numbers that a report may name.
+def _named_quantities(model: Model, point: Float[Array, " n"]) -> FirstOrder:
+    """Return the values at `point` of all quantities that a report may name, with their
+    derivatives with respect to the parameters.
 
-    An initial attitude is a turn from that at `point`; an initial position or velocity is the
-    difference from that of the reference state.
+    An initial attitude is a rotation vector from that at `point`, once along the world's axes and
+    once along the body's; an initial position or velocity is the difference from that of the
+    reference state.
     """
 
     def initial_states(part: Part, x: Array) -> dict[str, Array]:
@@ -472,7 +476,7 @@ def _scale_is_free(point: BestPoint, uncertainty: Uncertainty) -> bool:
     if not len(null) or point.model.body_indices is not None:
         return False
     first = len(labels(point.model))
-    values, slopes = _numbers_on_host(point)
+    values, slopes = _named_quantities_on_host(point)
     here, moved = values[first : first + 6], slopes[first : first + 6] @ null.T
     wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)
     return bool(np.linalg.norm(moved @ wanted - here) < 1e-3 * np.linalg.norm(here))

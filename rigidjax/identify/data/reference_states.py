@@ -183,7 +183,7 @@ class ReferenceStates(eqx.Module):
 
 
 def references(recordings: Sequence[Recording], state_type: type) -> ReferenceStates:
-    """Return the reference states of recordings, found from their first readings, of rate zero."""
+    """Return a reference state for each recording, at the rate zero, from its first readings."""
     turns = [[*attitudes(r).values, np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
     places = [_first_motion(r) for r in recordings]
     dtype = recordings[0].t.dtype

@@ -210,8 +210,8 @@ def _iteration(
     path: ExtendedState,
     kicks: Float[Array, "stops normals"],
 ) -> _Iteration:
-    """Return one Gauss–Newton iteration: the most probable motion of the problem linearised about a
-    `path` of N + 1 states and the noise that `kicks` make.
+    """Return the most probable motion of the problem that is linearised about the N + 1 states of
+    `path` and about the noise of `kicks`: one Gauss–Newton iteration.
     """
     dtype = belief.root.dtype
 

@@ -11,8 +11,8 @@ from rigidjax import _checks
 from rigidjax.identify.model.model import (
     Model,
     checked_x,
-    delay_slopes,
     error_jacobians,
+    error_slopes_by_delay,
 )
 from rigidjax.identify.model.normal import normal_matrix
 from rigidjax.identify.model.terms import measured_residuals, scaled_slopes
@@ -113,7 +113,7 @@ def _rows(
     for index, (sensor, noise, block) in enumerate(zip(sensors, noises, slopes, strict=True)):
         jitter, late = extras(sensor).jitter, None
         if jitter is not None:
-            late = jitter[:, None, None] * delay_slopes(model, x)[index]
+            late = jitter[:, None, None] * error_slopes_by_delay(model, x)[index]
         rows.append(scaled_slopes(block, noise, late))
     return tuple(rows), jax.jacfwd(lambda x: measured_residuals(model, x))(x)
 

@@ -28,8 +28,8 @@ from rigidjax.identify.model.charts import AbstractBodyChart, Charts, body_place
 from rigidjax.identify.model.free import (
     Free,
     Slot,
+    added_slots,
     checked_labels,
-    find_slots,
     group_recordings,
 )
 from rigidjax.identify.model.index import build_index
@@ -94,7 +94,7 @@ def fields_of_model(
     numbers = (one.where for one in free if isinstance(one, Free))
     beside = tuple(where for where in numbers if not callable(where))
     scene = Scene(None, torque, process, data.sensors, None, beside)
-    walks, slots = find_drifts(parts["walks"], scene), find_slots(free, scene, names)
+    walks, slots = find_drifts(parts["walks"], scene), added_slots(free, scene, names)
     taken = {"Ωx", "Ωy", "Ωz", "angle", "rate"}.union(
         *((*one.log_names, *one.plain_names) for one in charts)
     )

@@ -188,10 +188,10 @@ _UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place"
 TOLERANCES = {"scale": "scale", "skew": "cross_axis", "bias": "bias", "offset": "clock"}
 
 
-def find_slots(
+def added_slots(
     free: Sequence[Free], scene: Scene, body_names: Sequence[str], taken: Sequence[Slot] = ()
 ) -> list[Slot]:
-    """Return the slots in `taken`, and a `Slot` without places in x for each `Free`.
+    """Return the slots in `taken`, and after them a `Slot`, without places in x yet, for each `Free`.
 
     An error is raised if a `Free` picks no numbers, or the numbers or the name of another one.
     """

@@ -713,7 +713,7 @@ def _row_jacobians(
 
 
 @eqx.filter_jit
-def delay_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
+def error_slopes_by_delay(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
     """Return the derivative of each sensor's errors by a delay of its clock, per second."""
 
     def derivative_of_recording(row: Row, *rest: PyTree) -> Any:

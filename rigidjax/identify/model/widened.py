@@ -9,7 +9,7 @@ from jax.tree_util import GetAttrKey, SequenceKey
 
 from rigidjax.identify.data import stacking
 from rigidjax.identify.model.build import Extended, chosen_integrator, extended
-from rigidjax.identify.model.free import Free, find_slots
+from rigidjax.identify.model.free import Free, added_slots
 from rigidjax.identify.model.model import Model, starting_scene
 from rigidjax.motion.torques import Sum
 from rigidjax.motion.torques.base import Torque
@@ -39,5 +39,5 @@ def with_torques(model: Model, torques: Sequence[Torque]) -> Model:
 def with_slots(model: Model, free: Sequence[Free]) -> Extended:
     """Return a `model` of one kind of recordings with a slot for each `Free`."""
     scene = starting_scene(model, stacking.pick(model.records, 0))
-    slots = find_slots(free, scene, model.body_names, model.slots)
+    slots = added_slots(free, scene, model.body_names, model.slots)
     return extended(model, slots[len(model.slots) :])

@@ -164,7 +164,9 @@ def _next_state(
     settings: Settings,
     gain_of_noise: Callable[[Any, NormalMatrix], Array] | None,
 ) -> LMState:
-    """Return the state after the `evaluation` at `state.trial`; arguments as of `minimise`."""
+    """Accept or refuse `state.trial` by its `evaluation` (values, cost, normal matrix, gradient),
+    and return the state with the next damping and trial; other arguments are as of `minimise`.
+    """
     values, cost, normal, slope = evaluation
     parts = jax.tree.leaves((cost, normal, slope))
     finite = jnp.stack([jnp.isfinite(part).all() for part in parts]).all()

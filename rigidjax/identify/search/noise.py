@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax.identify.model.model import Model, delay_slopes
+from rigidjax.identify.model.model import Model, error_slopes_by_delay
 from rigidjax.identify.model.terms import Blocks, Noise, whiten
 from rigidjax.identify.sensors.base import extras
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
@@ -45,7 +45,7 @@ def estimate_noise(model: Model, x: Float[Array, " n"], blocks: Blocks, noise: N
     if any(reading.jitter_error is not None for reading in readings):
         # A search holds these errors constant. If it changed them, errors would count less wherever
         # a motion changes quickly, and the search would prefer quick motions.
-        for index, change in enumerate(delay_slopes(model, x)):
+        for index, change in enumerate(error_slopes_by_delay(model, x)):
             if (tau := extras(readings[index].sensor).jitter) is not None:
                 late = tau[:, None, None] * change
                 readings[index] = dataclasses.replace(readings[index], jitter_error=late)

@@ -186,7 +186,9 @@ class _Kind(NamedTuple):
 
 
 def _kind(model: Model, part: Part, noise: Noise, weights: Float[Array, "records times"]) -> _Kind:
-    """Return the `_Kind` of a `part` of a `model`."""
+    """Return what a search needs of the recordings of one `part` of a `model`: their own model, and
+    their places, noise and weights.
+    """
     one, places = (
         dataclasses.replace(part.model, loss=model.loss),
         model.index.places[part.recordings_slice],

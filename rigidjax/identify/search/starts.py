@@ -116,9 +116,10 @@ class _Swing(NamedTuple):
 
 
 def _swing(law: AbstractSuspension, recording: Recording, body: Any) -> _Swing | None:
-    """Return the start of a swing from the period of the rate about its main axis and the angle
-    through which it turns in the first one; `None` for a log of less than one period, and for a
-    body that goes over the top.
+    """Return where the fit of a swing starts: the body with its moment, the angle of rest and the
+    first rate, from the period of the rate about the axis of most motion and the angle turned in
+    the first period; `None` for a log of less than one period, and for a body that goes over the
+    top.
     """
     t, w = rates(recording)
     if t.size < 10:

@@ -94,7 +94,7 @@ def _sensor_attitude(q: Array, mounting: Vec3 | None) -> Array:
 
 
 def _unit_vector(world: NumbersLike) -> Vec3:
-    """Return the unit vector along the direction `world`, after a check of its length."""
+    """Return the unit vector along `world`; raise an error if `world` has the length zero."""
     vector = base.array_field("world")(world)
     length = jnp.sqrt(dot(vector, vector))
     words = "world: wanted a direction, got a vector of length zero"

@@ -84,7 +84,7 @@ def leave_one_out(model: Model, root: Root | None) -> Stretches | None:
 
 
 def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
-    """Return the jackknife's covariance of a fit of windows.
+    """Return the jackknife's covariance of a fit of windows, by leaving out a stretch at a time.
 
     Parameters on which one window alone depends, such as its initial state, keep their covariance
     for `white` errors.

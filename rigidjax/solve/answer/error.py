@@ -231,7 +231,7 @@ def estimate_error_of_run(
         closer = _more_accurate(setup, ts, times_of_peaks(setup, ts, ys, num_steps))
         rtol, factor = closer.rtol, closer.factor
         others, *_ = solve(closer.setup, jax.tree.map(lambda leaf: leaf[0], ys), ts)
-    steps = jax.tree.map(lambda part: factor * part, _distances_of_states(others, ys))
+    steps = jax.tree.map(lambda part: factor * part, _distances(others, ys))
     return _error_with_round_off(setup, ts, ys, num_steps, steps, rtol, search)
 
 
@@ -379,7 +379,7 @@ def _placeholder_run(setup: DiffraxRun, state0: PyTree, ts: Array, rtol: Array) 
     return jax.tree.map(empty, run)._replace(rtol=jnp.asarray(rtol, ts.dtype))
 
 
-def _distances_of_states(others: PyTree, ys: PyTree) -> dict[str, Array]:
+def _distances(others: PyTree, ys: PyTree) -> dict[str, Array]:
     """Return how far the states of two runs are apart, (T,) by the name of each array.
 
     For a quaternion it is the angle of the turn from one to the other, rad.
@@ -423,7 +423,7 @@ def _largest_relative_distance(distances: dict[str, Array], sizes: dict[str, Arr
 
 def _relative_distance(others: PyTree, ys: PyTree) -> Array:
     """Return the largest relative distance (T,) of the states of two runs; NaN if not reached."""
-    return _largest_relative_distance(_distances_of_states(others, ys), _error_scales_by_name(ys))
+    return _largest_relative_distance(_distances(others, ys), _error_scales_by_name(ys))
 
 
 class AccurateRun(NamedTuple):

@@ -163,7 +163,11 @@ def _exponents(
     rtol: Any,
     atol: Any,
 ) -> Exponents:
-    """Return the Lyapunov exponents along a motion; `options` are static."""
+    """Return the Lyapunov exponents along a motion of the duration `length`.
+
+    The static `options` are the solver, the number of exponents, the number of intervals, how many
+    of them come before exponents are counted, and the `max_steps` of an interval.
+    """
     # The options are no arrays: `filter_jit` takes them as static, and compiles again if one of
     # them changes.
     solver, many, intervals, transient, max_steps = options

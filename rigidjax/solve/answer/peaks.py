@@ -37,8 +37,11 @@ _SHORTER, _LARGE = 60, 1e30
 _STEEP = {"tanh", "logistic", "erf", "erfc", "atan", "asinh", "sinh", "cosh", "expm1"}
 
 
-def _height(eqn: Any, inputs: list[Any], kinds: list[int], out: Any) -> tuple[Array, bool] | None:
-    """Return a number that is largest at a peak, and whether it is the equation's own result.
+def _peak_height(
+    eqn: Any, inputs: list[Any], kinds: list[int], out: Any
+) -> tuple[Array, bool] | None:
+    """Return the height of a peak in time of an equation, a number that is largest there, and
+    whether it is the equation's own result.
 
     Else it is the logarithm of the result, as far as it matters. `None`: there is no peak.
     """
@@ -84,7 +87,7 @@ def times_of_peaks(setup: DiffraxRun, ts: Array, ys: PyTree, num_steps: Array) -
         def see(path: Any, inputs: Any, kinds: Any, out: Any) -> None:
             if any(DECLARED in str(eqn.source_info.name_stack) for eqn in path):
                 return  # steps end at the jumps of the law, and between them it has no peak
-            found = (_height(path[-1], inputs, kinds, one) for one in out)
+            found = (_peak_height(path[-1], inputs, kinds, one) for one in out)
             rows.extend((jnp.ravel(h).astype(dtype), own) for h, own in filter(None, found))
 
         saved = jnp.searchsorted(way * ts[1:], way * t, side="right")

@@ -47,7 +47,7 @@ def checked_run(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> Ch
         lambda leaf: leaf if leaf.dtype == dtype else leaf.astype(dtype), (ts, state0)
     )
     require_compatible(body, state0, torque)
-    warn_of_scale(body, torque)
+    warn_of_relative_inertia(body, torque)
     if body is not None:
         body = real_or_nan(body, throw, isinstance(state0, Turn))
     return Checked(body, state0, ts)
@@ -108,7 +108,7 @@ def _laws_within(law: Any) -> list[Any]:
     return [*parts_of(law), *(part for one in inner for part in _laws_within(one))]
 
 
-def warn_of_scale(body: Any, torque: Any) -> None:
+def warn_of_relative_inertia(body: Any, torque: Any) -> None:
     """Warn if a torque in N m acts on a body whose inertia is known only up to a factor.
 
     The gravity gradient without harmonics needs none: it is proportional to the inertia.

@@ -91,7 +91,9 @@ class _Pieces:
     def run_saving_starts(
         self, constants: Arrays, first_step: Array, y: Arrays
     ) -> tuple[Arrays, _PieceStarts]:
-        """Take all steps; return the state at their end, and the starts of the pieces."""
+        """Take all steps from the index `first_step` on; return the state at their end, and the
+        states at which the pieces start.
+        """
         firsts, length, left = self.divide(first_step)
 
         def piece(y: Arrays, begin: Array) -> tuple[Arrays, Arrays]:
