@@ -191,7 +191,7 @@ TOLERANCES = {"scale": "scale", "skew": "cross_axis", "bias": "bias", "offset": 
 def added_slots(
     free: Sequence[Free], scene: Scene, body_names: Sequence[str], taken: Sequence[Slot] = ()
 ) -> list[Slot]:
-    """Return the slots in `taken`, and after them a `Slot`, without places in x yet, for each `Free`.
+    """Return the slots in `taken`, and for each `Free` one more `Slot`, without places in x yet.
 
     An error is raised if a `Free` picks no numbers, or the numbers or the name of another one.
     """

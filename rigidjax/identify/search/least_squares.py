@@ -164,7 +164,7 @@ def _next_state(
     settings: Settings,
     gain_of_noise: Callable[[Any, NormalMatrix], Array] | None,
 ) -> LMState:
-    """Accept or refuse `state.trial` by its `evaluation` (values, cost, normal matrix, gradient),
+    """Take or refuse `state.trial` by its `evaluation` (values, cost, normal matrix, gradient),
     and return the state with the next damping and trial; other arguments are as of `minimise`.
     """
     values, cost, normal, slope = evaluation

@@ -116,8 +116,8 @@ class _Swing(NamedTuple):
 
 
 def _swing(law: AbstractSuspension, recording: Recording, body: Any) -> _Swing | None:
-    """Return where the fit of a swing starts: the body with its moment, the angle of rest and the
-    first rate, from the period of the rate about the axis of most motion and the angle turned in
+    """Return where the fit of a swing starts: the body with its moment, the first angle and rate,
+    from the period of the rate about the axis of most motion and the angle turned in
     the first period; `None` for a log of less than one period, and for a body that goes over the
     top.
     """
