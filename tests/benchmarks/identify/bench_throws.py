@@ -270,6 +270,15 @@ def of_all(name, joint, levers, rows=None):
     return 0.5 * (low + high), np.hypot((high - low) / 2, known)
 
 
+def judged(name, row, joint, levers, beside):
+    """The fit of one throw; middles and half-widths of its log moments, those of `shared` beside."""
+    one = alone(name, row, joint)
+    low, high = one.interval_of(
+        lambda point: log_moments(name, point.body.tensor, joint.body, levers)
+    )
+    return one, 0.5 * (low + high), np.hypot((high - low) / 2, beside)
+
+
 def copies(joint, levers, count):
     """Print how many intervals of the joint fit hold in simulated copies of the experiment."""
     rng = np.random.default_rng(0)
@@ -342,13 +351,9 @@ def main(every=1, end=0.53, laws=(), whole=False, count=0):
         errors, reaches, words = [], [], []
         beside = shared(joint, levers, name, joint.body[name].tensor)
         for row in range(len(records[name])):
-            one = alone(name, row, joint)
-
-            low, high = one.interval_of(
-                lambda point, n=name: log_moments(n, point.body.tensor, joint.body, levers)
-            )
-            errors.append(0.5 * (low + high) - np.log(truth))
-            reaches.append(np.hypot((high - low) / 2, beside))
+            one, middle, reach = judged(name, row, joint, levers, beside)
+            errors.append(middle - np.log(truth))
+            reaches.append(reach)
             words.append(one.explanation.word)
         print("  status:", ", ".join(f"{words.count(word)} {word}" for word in sorted(set(words))))
         alone_held.append(
