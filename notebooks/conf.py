@@ -52,10 +52,18 @@ def _block(self, node):
     raise nodes.SkipNode
 
 
+def _overview(app, exception):
+    """Write `llms.txt` beside the pages."""
+    if exception is None:
+        text = docs_reference.overview(HERE.parent / "README.md", HERE / "index.md")
+        (Path(app.outdir) / "llms.txt").write_text(text, encoding="utf-8")
+
+
 def setup(app):
     """Formulas become MathML, which browsers draw themselves; the reference is written first."""
     app.add_html_math_renderer(
         "mathml", inline_renderers=(_inline, None), block_renderers=(_block, None)
     )
     app.connect("builder-inited", lambda _: docs_reference.write(HERE / "reference"))
+    app.connect("build-finished", _overview)
     app.connect("doctree-read", docs_reference.link_to_source, priority=100)  # before viewcode

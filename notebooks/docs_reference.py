@@ -9,6 +9,7 @@ argument's type has its short name (`Vec3Like`), and not what that stands for. T
 
 import ast
 import inspect
+import re
 import sys
 import textwrap
 import types
@@ -22,6 +23,34 @@ import docs_topics
 from surface import public
 
 _OUTER, _INNER = "::::::", ":::::"
+
+
+def overview(readme: Path, contents: Path) -> str:
+    """Returns `llms.txt`: what the library is, its conventions, and its pages in their groups.
+
+    A page is named with its title and with what one learns from it.
+    """
+    text = readme.read_text(encoding="utf-8")
+    # What README says first, and its section of conventions, without links.
+    first, conventions = (
+        re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text.partition(head)[2].partition(end)[0]).strip()
+        for head, end in (("# rigidjax", "```"), ("## Conventions", "\n## "))
+    )
+    parts = ["# rigidjax", first, f"## Conventions\n\n{conventions}"]
+    trees = re.findall(
+        r"^```{toctree}\n:caption: (.*?)\n(.*?)^```", contents.read_text(encoding="utf-8"), re.M | re.S
+    )
+    for caption, lines in trees:
+        rows = []
+        for name in lines.split():
+            path = contents.parent / f"{name}.md"
+            if path.exists():
+                title, _, learnt, *_ = path.read_text(encoding="utf-8").split("\n", 3)
+                learnt = learnt.removeprefix("*You learn: ").removesuffix("*")
+                rows.append(f"- [{title.removeprefix('# ')}]({name}.html): {learnt}")
+        title = caption.strip('"')
+        parts.append(f"## {title}\n\n" + "\n".join(rows))
+    return "\n\n".join(parts) + "\n"
 
 
 def write(folder: Path) -> list[str]:

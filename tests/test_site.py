@@ -79,3 +79,13 @@ def test_a_page_that_is_gone_is_removed(reference, tmp_path):
     (tmp_path / "rigidjax.gone.md").write_text("# gone")
     reference.write(tmp_path)
     assert not (tmp_path / "rigidjax.gone.md").exists()
+
+
+def test_the_overview_has_every_page_with_what_one_learns(reference):
+    text = reference.overview(NOTEBOOKS.parent / "README.md", NOTEBOOKS / "index.md")
+    assert text.startswith("# rigidjax\n\nDifferentiable") and "scalar first" in text
+    for path in [*NOTEBOOKS.glob("guide/*.md"), *NOTEBOOKS.glob("*.md")]:
+        page = path.relative_to(NOTEBOOKS).with_suffix(".html").as_posix()
+        assert text.count(f"]({page}): ") == (page != "index.html"), page
+    # Links of README do not lead from here to anywhere.
+    assert not re.search(r"\]\((?!\S+\.html\))", text)
