@@ -26,30 +26,30 @@ _OUTER, _INNER = "::::::", ":::::"
 
 
 def overview(readme: Path, contents: Path) -> str:
-    """Returns `llms.txt`: what the library is, its conventions, and its pages in their groups.
+    """Returns `llms.txt`: what the library is, by examples, its conventions, and its pages in groups.
 
     A page is named with its title and with what one learns from it.
     """
-    text = readme.read_text(encoding="utf-8")
-    # What README says first, and its section of conventions, without links.
-    first, conventions = (
-        re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text.partition(head)[2].partition(end)[0]).strip()
-        for head, end in (("# rigidjax", "```"), ("## Conventions", "\n## "))
-    )
-    parts = ["# rigidjax", first, f"## Conventions\n\n{conventions}"]
+    parts, text = [], readme.read_text(encoding="utf-8")
+    for title, end in (("# rigidjax", "![Left: time of a run"), ("## Conventions", "\n## ")):
+        part = text.partition(title)[2].partition(end)[0]
+        part = re.sub(r"^!.*\n\n|\s*\(\[[^]]*\]\([^)]*\)\)", "", part, flags=re.M)
+        part = re.sub(r"\[([^]]*)\]\((?:notebooks|#)[^)]*\)", r"\1", part)
+        parts += [title, part.strip()]
     trees = re.findall(
-        r"^```{toctree}\n:caption: (.*?)\n(.*?)^```", contents.read_text(encoding="utf-8"), re.M | re.S
+        r"^```{toctree}\n:caption: (.*?)\n(.*?)^```",
+        contents.read_text(encoding="utf-8"),
+        re.M | re.S,
     )
     for caption, lines in trees:
         rows = []
-        for name in lines.split():
-            path = contents.parent / f"{name}.md"
+        for path in (contents.parent / f"{name}.md" for name in lines.split()):
             if path.exists():
                 title, _, learnt, *_ = path.read_text(encoding="utf-8").split("\n", 3)
+                page = path.relative_to(contents.parent).with_suffix(".html").as_posix()
                 learnt = learnt.removeprefix("*You learn: ").removesuffix("*")
-                rows.append(f"- [{title.removeprefix('# ')}]({name}.html): {learnt}")
-        title = caption.strip('"')
-        parts.append(f"## {title}\n\n" + "\n".join(rows))
+                rows.append(f"- [{title.removeprefix('# ')}]({page}): {learnt}")
+        parts += ["## " + caption.strip('"'), "\n".join(rows)]
     return "\n\n".join(parts) + "\n"
 
 

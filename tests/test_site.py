@@ -87,5 +87,6 @@ def test_the_overview_has_every_page_with_what_one_learns(reference):
     for path in [*NOTEBOOKS.glob("guide/*.md"), *NOTEBOOKS.glob("*.md")]:
         page = path.relative_to(NOTEBOOKS).with_suffix(".html").as_posix()
         assert text.count(f"]({page}): ") == (page != "index.html"), page
+    assert "jnp.where(t < te" in text and "identify.fit(" in text
     # Links of README do not lead from here to anywhere.
     assert not re.search(r"\]\((?!\S+\.html\))", text)
