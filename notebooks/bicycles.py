@@ -137,12 +137,12 @@ def joint(name):
     ]  # fmt: skip
     t, still = np.arange(4.0), np.tile([1.0, 0, 0, 0], (4, 1))
     scale = rj.torques.LoggedMotion(t, np.zeros((4, 3)), still)  # each part lies on a scale
-    # A possible body near each: the moment about y is at most the sum of the others.
-    found = classical(m)
-    for part in "BH":
-        most = 0.99 * (found[f"I{part}xx"] + found[f"I{part}zz"])
-        found[f"I{part}yy"] = min(found[f"I{part}yy"], most)
-    guesses = bodies_of(m, found)
+    # A possible body near each: no second moment along an axis is below a hundredth of the largest.
+    guesses = {}
+    for part, body in bodies_of(m, classical(m)).items():
+        along, axes = np.linalg.eigh(body.second_moment)
+        second = axes @ np.diag(np.maximum(along, 0.01 * along[-1])) @ axes.T
+        guesses[part] = rj.MassProperties(body.mass, body.com, second)
     records, charts = {}, {}
     for part in PARTS:
         mass, wide = m[f"m{part}"], width[f"m{part}"]
