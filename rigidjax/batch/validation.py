@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
-from rigidjax.body.validation import first_impossible_inertia
+from rigidjax.body.validation import first_impossible_inertia, require_physical_body
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import Torque
@@ -226,7 +226,7 @@ def _check_inertia(
     """Return the bodies, with NaN for impossible traced inertias, and checks of known ones."""
     tensor = tensor_of(bodies)
     if not _checks.is_known(tensor):
-        return validation.real_or_nan(bodies), []
+        return require_physical_body(bodies, throw=False), []
     # Under an outer trace the reshape of a known tensor would be traced without this context.
     with jax.ensure_compile_time_eval():
         tensors = tensor.reshape(-1, 3, 3)

@@ -168,7 +168,7 @@ class Inertia(eqx.Module):
         """Return `self` unchanged. **Raises:** `ValueError` (`equinox` error under `jit`) if a
         principal moment is zero: Euler's equations divide by the moments.
         """
-        return validation.require_physical_body(self, self.tensor, None, throw=True)
+        return validation.require_physical_body(self, throw=True)
 
     def __add__(self, other: "Inertia") -> "Inertia":
         """Return the inertia of two bodies that are joined into one; both inertias are about the
@@ -243,7 +243,7 @@ class MassProperties(eqx.Module):
         """Return `self` unchanged. **Raises:** `ValueError` (`equinox` error under `jit`) if a
         principal moment about the centre of mass is zero: Euler's equations divide by the moments.
         """
-        return validation.require_physical_body(self, self.inertia.tensor, self.mass, throw=True)
+        return validation.require_physical_body(self, throw=True)
 
     def second_moment_about(self, point: Vector) -> Mat3:
         """Return the second moment about another point, (3, 3), kg m², body axes: `𝔖 + m d dᵀ`,

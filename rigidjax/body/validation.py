@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
 from rigidjax._types import Quat, Quaternion
@@ -80,11 +80,7 @@ def require_single_body(
     body = _checks.require_unbatched_instance(
         value, kinds, name, requirement=requirement, hint=hint
     )
-    has_mass = hasattr(body, "mass")
-    tensor = body.inertia.tensor if has_mass else body.tensor
-    return require_physical_body(
-        body, tensor, body.mass if has_mass else None, throw=False, allow_zero_moment=True
-    )
+    return require_physical_body(body, throw=False, allow_zero_moment=True)
 
 
 def require_symmetric_or_nan(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
@@ -96,20 +92,15 @@ def require_symmetric_or_nan(a: Float[Array, "3 3"], name: str) -> Float[Array, 
     return jnp.where(_asymmetry(a)[1], jnp.nan, a)
 
 
-def require_physical_body(
-    body: PyTree,
-    tensor: Float[Array, "*batch 3 3"],
-    mass: Array | None,
-    throw: bool,
-    *,
-    allow_zero_moment: bool = False,
-) -> Any:
-    """Return `body` (any tree) if a real body can have the inertia `tensor` and the `mass`, kg, and
-    if no principal moment is zero or zero is allowed.
+def require_physical_body(body: Any, throw: bool, *, allow_zero_moment: bool = False) -> Any:
+    """Return an `Inertia` or `MassProperties` if a real body can have its inertia and mass, and if
+    no principal moment is zero or zero is allowed.
 
     If not, an error is raised for known numbers, and for traced ones if `throw` is true; else every
     number of the body becomes NaN.
     """
+    mass = getattr(body, "mass", None)
+    tensor = body.tensor if mass is None else body.inertia.tensor
     tensor = _checks.numeric_array(tensor, "inertia tensor")
     is_known = _checks.is_known((tensor, mass))
     if not is_known and _checks.is_known(plain := lax.stop_gradient((tensor, mass))):

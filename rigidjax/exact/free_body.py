@@ -199,7 +199,7 @@ def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
     for name, array in arrays.items():
         if array.dtype != tensor.dtype:
             raise TypeError(f"{name} is {array.dtype}, but the inertia tensor is {tensor.dtype}")
-    inertia = validation.require_physical_body(inertia, tensor, None, throw=False)
+    inertia = validation.require_physical_body(inertia, throw=False)
     if not _checks.is_known((tensor, arrays)):
         return inertia
     for name, array in arrays.items():

@@ -79,7 +79,7 @@ def _checked_periods(inertia: Inertia, omega0: Vec3Like) -> tuple[Scalar, Scalar
     _checks.require_unbatched_instance(
         inertia, Inertia, "inertia", hint="of MassProperties pass .inertia"
     )
-    tensor = validation.require_physical_body(inertia, inertia.tensor, None, throw=False).tensor
+    tensor = validation.require_physical_body(inertia, throw=False).tensor
     rate = _checks.array_of_shape(omega0, (3,), "omega0").astype(tensor.dtype)
     return _periods(tensor, rate)
 

@@ -136,7 +136,7 @@ def _require_invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
     moments; a traced inertia becomes NaN in these cases.
     """
     _checks.require_unbatched_instance(inertia, _inertia.Inertia, "inertia")
-    return validation.require_physical_body(inertia, inertia.tensor, None, throw=False)
+    return validation.require_physical_body(inertia, throw=False)
 
 
 class RotationalHamiltonian(eqx.Module):

@@ -49,7 +49,8 @@ def checked_run(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> Ch
     require_compatible(body, state0, torque)
     warn_of_relative_inertia(body, torque)
     if body is not None:
-        body = real_or_nan(body, throw, isinstance(state0, Turn))
+        hangs = isinstance(state0, Turn)
+        body = require_physical_body(body, throw, allow_zero_moment=hangs)
     return Checked(body, state0, ts)
 
 
@@ -131,14 +132,6 @@ def _advice(numbers: Any, moves: bool = False) -> str:
         return "; rj.MassProperties(mass, com, second_moment) makes one, rj.shapes a solid"
     moments = np.shape(numbers) == (3,)
     return f"; rj.Inertia{'.from_principal(*moments)' if moments else '(tensor)'} makes one of them"
-
-
-def real_or_nan(body: Any, throw: bool = False, allow_zero_moment: bool = False) -> Any:
-    """Return `body`, with NaN for numbers that no real body can have, or raise an error."""
-    matter = isinstance(body, MassProperties)
-    tensor = body.inertia.tensor if matter else body.tensor
-    mass = body.mass if matter else None
-    return require_physical_body(body, tensor, mass, throw, allow_zero_moment=allow_zero_moment)
 
 
 def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
