@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -188,10 +188,25 @@ def simulate(
         rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
     else:
         rtol = getattr(stepsize_controller, "rtol", None)
-    how = _solver_and_adjoint(solver, adjoint, max_steps, rtol, event is not None)
+    chosen = solver
+    if solver is None:
+        # If the user asks for forward mode alone, diffrax computes the tangents together with the
+        # run.
+        forward = isinstance(adjoint, dfx.ForwardMode) and event is None
+        chosen = SOLVER if forward or max_steps is None else DormandPrince8()
+    elif not isinstance(solver, AbstractExplicit | AbstractSplitting | Projected):
+        # The explicit methods and the splittings of this package scale the quaternion inside the
+        # kernel of a step. They are not wrapped, because a second scaling outside would split this
+        # kernel.
+        chosen = Projected(solver)
+    if isinstance(chosen, AbstractExplicit) and max_steps and isinstance(adjoint, _EITHER_MODE):
+        adjoint = REPLAY
+    elif adjoint is None:
+        tight = rtol is not None and _checks.is_known(rtol) and float(rtol) < _TIGHT  # pyright: ignore[reportArgumentType]
+        adjoint = _EVERY_STEP if tight else ADJOINT
     setup = DiffraxRun(
-        body, torque, how.solver, rtol, atol, stepsize_controller,
-        None if dt0 is None else validation.checked_first_step(dt0, times), max_step, how.adjoint,
+        body, torque, chosen, rtol, atol, stepsize_controller,
+        None if dt0 is None else validation.checked_first_step(dt0, times), max_step, adjoint,
         progress_meter or NO_METER, way, max_steps, throw,
     )  # fmt: skip
     sought = setup.replays and progress_meter is None
@@ -201,34 +216,6 @@ def simulate(
     if accuracy is not None:
         return _solve_to_accuracy(setup, event, state0, times, accuracy)
     return _solve_run(setup, event, state0, times)
-
-
-class _Chosen(NamedTuple):
-    """Hold the solver of a run, and the adjoint by which derivatives are taken."""
-
-    solver: dfx.AbstractSolver
-    adjoint: dfx.AbstractAdjoint
-
-
-def _solver_and_adjoint(
-    solver: dfx.AbstractSolver | None, adjoint: dfx.AbstractAdjoint | None,
-    max_steps: int | None, rtol: Any, has_event: bool,
-) -> _Chosen:  # fmt: skip
-    """Return the given solver and adjoint or, for `None`, the fastest for the other arguments."""
-    if solver is None:
-        # If the user asks for forward mode alone, diffrax computes the tangents together with the
-        # run.
-        forward = isinstance(adjoint, dfx.ForwardMode) and not has_event
-        solver = SOLVER if forward or max_steps is None else DormandPrince8()
-    elif not isinstance(solver, AbstractExplicit | AbstractSplitting | Projected):
-        # The explicit methods and the splittings of this package scale the quaternion inside the
-        # kernel of a step. They are not wrapped, because a second scaling outside would split this
-        # kernel.
-        solver = Projected(solver)
-    if isinstance(solver, AbstractExplicit) and max_steps and isinstance(adjoint, _EITHER_MODE):
-        return _Chosen(solver, REPLAY)
-    tight = rtol is not None and _checks.is_known(rtol) and float(rtol) < _TIGHT
-    return _Chosen(solver, adjoint or (_EVERY_STEP if tight else ADJOINT))
 
 
 def _message_of_conflict(
