@@ -25,9 +25,10 @@ from rigidjax.identify.filtering.steps import (
     correlated_torques,
     dynamics_of,
 )
+from rigidjax.identify.model.free import leaves_at
 from rigidjax.identify.model.model import Model, bound_torque, checked_x, require_single, scene_at
 from rigidjax.identify.model.scene import Process, Scene
-from rigidjax.identify.model.walks import Drift, broadcast_to, drifting_values
+from rigidjax.identify.model.walks import Drift, broadcast_to
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.manifold import leaf_names, plus
@@ -175,7 +176,8 @@ def belief_at(
     """
     dtype = state.omega.dtype
     coloured = correlated_torques(scene.process)
-    walks = tuple(value.astype(dtype) for value in drifting_values(scene, drifts))
+    values = leaves_at(scene, [drift.path for drift in drifts])
+    walks = tuple(value.astype(dtype) for value in values)
     parts = [deviations, *(law.deviation for law in coloured)]
     parts += [drift.deviation.reshape(-1) for drift in drifts]
     root = jnp.diag(jnp.concatenate([part.astype(dtype) for part in parts]))

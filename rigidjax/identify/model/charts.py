@@ -376,17 +376,6 @@ def _pad_with_zeros(
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(leading, trailing)])
 
 
-def body_with_scale_mark(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
-    """Return the body that `vector` represents; an `Inertia` gets the `scale` of the chart.
-
-    Inside a fit bodies have no such mark, with which a torque is refused.
-    """
-    body = chart.body(vector)
-    if chart.scale is None or isinstance(body, MassProperties):
-        return body
-    return Inertia(body.tensor, chart.scale)
-
-
 Charts = tuple[AbstractBodyChart, ...]
 
 

@@ -386,16 +386,6 @@ def entries_at(leaf: Any, path: tuple[Any, ...], axes: int = 0) -> Array:
     return leaf.reshape(*rows, -1)[..., np.array(some.places)].reshape(*rows, *some.shape)
 
 
-def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"]) -> Scene:
-    """Return the `scene` after the steps of its slots, which stand in the `row` of a recording."""
-    paths = [slot.path for slot in slots]
-    values = []
-    for slot, start in zip(slots, leaves_at(scene, paths), strict=True):
-        value = slot.moved(start, row[slot.columns].reshape(slot.shape))
-        values.append(value.astype(start.dtype))
-    return with_leaves(scene, paths, values)
-
-
 def leaves_at(scene: Scene, paths: Sequence[tuple[Any, ...]]) -> tuple[Array, ...]:
     """Return the numbers of a `scene` at the `paths` as JAX arrays."""
     leaves = dict(jax.tree.leaves_with_path(scene))

@@ -23,19 +23,25 @@ from rigidjax.identify.model.charts import (
     AbstractBodyChart,
     Charts,
     body_at,
-    body_with_scale_mark,
     split_numbers,
 )
 from rigidjax.identify.model.first_order import FirstOrder, value_and_jacfwd
-from rigidjax.identify.model.free import Free, Slot, entries_at, split_path, with_steps
+from rigidjax.identify.model.free import (
+    Free,
+    Slot,
+    entries_at,
+    leaves_at,
+    split_path,
+    with_leaves,
+)
 from rigidjax.identify.model.index import Index
 from rigidjax.identify.model.predict import (
     AbstractIntegrator,
     HeldSteps,
     errors_along,
+    known_motion,
     needed_body,
     sensor_inputs,
-    states_at,
 )
 from rigidjax.identify.model.priors import AbstractLoss, Entropic, Measured
 from rigidjax.identify.model.scene import Process, Scene
@@ -322,9 +328,15 @@ class Model(eqx.Module):
         name → body.
         """
         parts = split_numbers(self.charts, x[: self.index.bodies])
-        bodies = map(body_with_scale_mark, self.charts, parts)
+        bodies = []
+        for chart, part in zip(self.charts, parts, strict=True):
+            body = chart.body(part)
+            if chart.scale is not None and isinstance(body, Inertia):
+                # Inside a fit bodies have no such mark, with which a torque is refused.
+                body = Inertia(body.tensor, chart.scale)
+            bodies.append(body)
         if self.body_indices is None:
-            return next(bodies)
+            return bodies[0]
         return dict(zip(dict.fromkeys(self.body_names), bodies, strict=True))
 
     def scenes(self, x: Float[Array, " n"]) -> Any:
@@ -556,7 +568,12 @@ def scene_at(
     model: Model, row: Row, record: Recording, reference: ReferenceStates, body_index: BodyIndex
 ) -> Scene:
     """Return the scene of one recording at its parameters, which its `row` holds."""
-    scene = with_steps(starting_scene(model, record), model.slots, row)
+    scene, paths = starting_scene(model, record), [slot.path for slot in model.slots]
+    values = []
+    for slot, value in zip(model.slots, leaves_at(scene, paths), strict=True):
+        moved = slot.moved(value, row[slot.columns].reshape(slot.shape))
+        values.append(moved.astype(value.dtype))
+    scene = with_leaves(scene, paths, values)
     body = body_at(model.charts, row, body_index)
     start = reference.initial(row[model.index.first :])
     return Scene(body, scene.torque, scene.process, scene.sensors, start, scene.beside)
@@ -566,16 +583,17 @@ def motion_in(model: Model, scene: Scene, record: Recording) -> Motion:
     """Return the states at the times of a recording, and the torque that reads its inputs."""
     assert scene.body is not None and scene.start is not None
     body: Any = needed_body(scene.body, model.state_kind)
-    functions = {name: source for name, source in record.inputs.items() if callable(source)}
+    start, ts, torque = scene.start, record.t, bound_torque(scene, record)
     if isinstance(model.integrator, HeldSteps) and scene.torque is not None:
-        samples = {n: rows for n, rows in record.inputs.items() if n not in functions}
-        unbound = {name: Input(name) for name in samples}
-        torque = bind(scene.torque, functions | unbound)
-        states = model.integrator.driven_states(body, scene.start, record.t, torque, samples)
-        return Motion(states, bound_torque(scene, record))
-    torque = bound_torque(scene, record)
-    states = states_at(model.integrator, body, scene.start, record.t, torque)
-    return Motion(states, torque)
+        samples = {n: rows for n, rows in record.inputs.items() if not callable(rows)}
+        unbound = {n: Input(n) if n in samples else rows for n, rows in record.inputs.items()}
+        driven = bind(scene.torque, unbound)
+        return Motion(model.integrator.driven_states(body, start, ts, driven, samples), torque)
+    known = known_motion(body, start, ts, torque)
+    if known is not None:  # no integrator is needed
+        return Motion(known(ts), torque)
+    assert model.integrator is not None and torque is not None
+    return Motion(model.integrator.states(body, start, ts, torque), torque)
 
 
 def bound_torque(scene: Scene, record: Recording) -> Law | None:

@@ -162,22 +162,7 @@ def integrator_for(turn: float) -> AbstractIntegrator:
     return FixedSteps(substeps) if substeps <= 20 else Adaptive()
 
 
-def states_at(
-    integrator: AbstractIntegrator | None,
-    body: Body,
-    state0: State,
-    ts: Float[Array, " times"],
-    torque: Law | None,
-) -> PyTree:
-    """Return the states of a motion at `ts`, s; known ones need no `integrator`."""
-    known = _known_motion(body, state0, ts, torque)
-    if known is not None:
-        return known(ts)
-    assert integrator is not None and torque is not None
-    return integrator.states(body, state0, ts, torque)
-
-
-def _known_motion(
+def known_motion(
     body: Body, state0: State, ts: Float[Array, " times"], torque: Law | None
 ) -> Callable[[Array], PyTree] | None:
     """Return the motion as a function of times, s, if no integrator is needed, else `None`."""
@@ -281,7 +266,7 @@ def sensor_inputs(
     clock offset of the sensor.
     """
     turned = needed_body(body, type(state0))
-    known = _known_motion(turned, state0, ts, torque)
+    known = known_motion(turned, state0, ts, torque)
     carried = isinstance(known, CarriedMotion)
     field = known.field if carried else equations_of_motion(turned, state0, torque)
     offset, times = extras(sensor).offset, ts

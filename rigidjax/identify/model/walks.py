@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import NumbersLike
-from rigidjax.identify.model.free import leaf_at, leaves_at, overlap
+from rigidjax.identify.model.free import leaf_at, overlap
 from rigidjax.identify.model.scene import Scene
 
 
@@ -79,10 +79,6 @@ def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]
         )
         drifts.append(Drift(path, *parts))
     return tuple(drifts)
-
-
-def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
-    return leaves_at(scene, [drift.path for drift in drifts])
 
 
 def nonnegative(value: NumbersLike, name: str) -> Array:
