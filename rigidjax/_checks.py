@@ -439,21 +439,16 @@ def require_function(value: object, name: str, description: str, *, hint: str = 
     got = type_name(value)
     if callable(value) and not isinstance(value, type):
         listed = re.match(r"\w*\(([^()]*)\)", description)
-        if listed is None or _accepts(value, len(listed[1].split(","))):
+        try:
+            if listed is not None:
+                inspect.signature(value).bind(*listed[1].split(","))
             return value
-        got = f"one with other arguments: {inspect.signature(value)}"
+        except ValueError:
+            # The function has no signature, as some functions written in C: it is accepted.
+            return value
+        except TypeError:
+            got = f"one with other arguments: {inspect.signature(value)}"
     raise TypeError(f"{name}: wanted a function {description}, got {got}{_advice(hint)}")
-
-
-def _accepts(value: Callable[..., Any], count: int) -> bool:
-    """Return whether a function can be called with `count` positional arguments."""
-    try:
-        inspect.signature(value).bind(*[None] * count)
-    except (TypeError, ValueError) as error:
-        # A `ValueError` says that the function has no signature, as some functions written in C: it
-        # is accepted. A `TypeError` says that the number of arguments is wrong.
-        return isinstance(error, ValueError)
-    return True
 
 
 @contextlib.contextmanager

@@ -56,7 +56,18 @@ def mesh(
     centre = jax.lax.stop_gradient(corners.mean(axis=0))
     six, (a, b, c) = _tetrahedra(corners - centre[None, :], faces)
     com = (six[:, None] * (a + b + c)).sum(axis=0) / (4.0 * six.sum())
-    volume = _positive_volume(six.sum() / 6.0, corners, faces)
+    volume = six.sum() / 6.0
+    # The volume counts as zero if it is below the area of the mesh times a few units of round-off
+    # of its longest extent: the mesh is then as thin as the last digit of its length.
+    at_a, at_b, at_c = (jax.lax.stop_gradient(corners[faces[:, k]]) for k in range(3))
+    area = 0.5 * jnp.sqrt((jnp.cross(at_b - at_a, at_c - at_a) ** 2).sum(axis=1)).sum()
+    longest = jax.lax.stop_gradient(jnp.ptp(corners, axis=0).max())
+    slack = 4.0 * jnp.finfo(corners.dtype).eps * longest * area
+    volume_text = f" (volume {float(volume):.6g} m³)" if _checks.is_known(volume) else ""
+    words = f"mesh: it is inside out{volume_text}: its faces are clockwise; give faces[:, ::-1]"
+    volume = _checks.error_if(volume, volume < -slack, words)
+    words = f"mesh: it encloses no volume{volume_text}; for a flat body use plate"
+    volume = _checks.error_if(volume, ~(volume > slack), words)
     # The second moments are summed about the centre of mass itself, so that no large term is
     # subtracted afterwards.
     six, (a, b, c) = _tetrahedra(corners - (centre + com)[None, :], faces)
@@ -108,21 +119,6 @@ def _tetrahedra(vertices: Float[Array, "n 3"], faces: Int[Array, "m 3"]) -> Tetr
     """Return the tetrahedra of a mesh."""
     a, b, c = rows = [vertices[faces[:, k]] for k in range(3)]
     return Tetrahedra((a * jnp.cross(b, c)).sum(axis=1), rows)
-
-
-def _positive_volume(volume: Array, vertices: Array, faces: Array) -> Array:
-    """Return the volume of a mesh, m³; raise an error if the mesh is flat or inside out."""
-    # The volume counts as zero if it is below the area of the mesh times a few units of round-off
-    # of its longest extent: the mesh is then as thin as the last digit of its length.
-    a, b, c = (jax.lax.stop_gradient(vertices[faces[:, k]]) for k in range(3))
-    longest = jnp.ptp(vertices, axis=0).max()
-    area = 0.5 * jnp.sqrt((jnp.cross(b - a, c - a) ** 2).sum(axis=1)).sum()
-    slack = 4.0 * jnp.finfo(vertices.dtype).eps * jax.lax.stop_gradient(longest) * area
-    volume_text = f" (volume {float(volume):.6g} m³)" if _checks.is_known(volume) else ""
-    words = f"mesh: it is inside out{volume_text}: its faces are clockwise; give faces[:, ::-1]"
-    volume = _checks.error_if(volume, volume < -slack, words)
-    words = f"mesh: it encloses no volume{volume_text}; for a flat body use plate"
-    return _checks.error_if(volume, ~(volume > slack), words)
 
 
 def checked_faces(faces: Any, vertex_count: int) -> Array:

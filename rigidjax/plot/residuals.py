@@ -114,7 +114,11 @@ def _draw(
     number = int(mask.sum())
     lags = np.arange(1, max(2, min(40, number // 2)))
     for values, colour in zip(seen.T, colours, strict=True):
-        memory.plot(lags, _autocorrelation(values, lags), ".-", color=colour, ms=4, lw=0.8)
+        centred = values - values.mean()
+        # The correlation of a constant series is drawn as zero.
+        whole = float(centred @ centred) or 1.0
+        correlation = [float(centred[:-lag] @ centred[lag:]) / whole for lag in lags]
+        memory.plot(lags, correlation, ".-", color=colour, ms=4, lw=0.8)
         spectrum.plot(*power_spectrum(t[mask], values), color=colour, lw=1)
     band = 2 / np.sqrt(max(number, 1))
     memory.axhspan(-band, band, color="0.9", zorder=0)
@@ -143,14 +147,3 @@ def power_spectrum(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
     span = float(t[-1] - t[0])
     frequencies = np.arange(1, min(_MOST, max(2, int(span / (2 * gap))))) / span
     return frequencies, lombscargle(t, values - values.mean(), 2 * np.pi * frequencies)
-
-
-def _autocorrelation(values: np.ndarray, lags: np.ndarray) -> np.ndarray:
-    """Return the correlation of a series with itself at each lag, in samples, divided by that at
-    lag 0; zero for a constant series.
-    """
-    centred = values - values.mean()
-    whole = float(centred @ centred)
-    if not whole > 0:
-        return np.zeros(lags.size)
-    return np.array([centred[:-lag] @ centred[lag:] for lag in lags]) / whole

@@ -22,7 +22,6 @@ from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.model import Model, require_single
-from rigidjax.identify.search.stages import Attempt
 from rigidjax.identify.uncertainty import covariance as uncertainty
 from rigidjax.identify.uncertainty.quantities import (
     quantities_on_host,
@@ -201,7 +200,18 @@ def fit_light_curve(
     say(f"{len(starts)} starts")
     whole = stacking.pad_to_few(model)
     ends = search_starts(whole, starts, noise_of(reading, flux, pairs.scatter), tolerance)
-    aliases = _distinct_aliases(whole, ends)
+    # The different motions at the ends of the searches, the smallest cost first.
+    aliases: list[Alias] = []
+    for end in sorted(ends, key=lambda one: float(one.cost)):
+        if np.isfinite(float(end.cost)):
+            alias = _alias(whole, end.x, float(end.cost))
+            if not any(_same_motion(alias, other, SAME) for other in aliases):
+                aliases.append(alias)
+    if not aliases:
+        raise ValueError(
+            "fit_light_curve: wanted a start with a finite cost, got none; are the readings in "
+            "the unit of the sensor?"
+        )
     say(f"{len(aliases)} motions, cost {aliases[0].cost:.6g}")
     best = fit(whole, starts=1, initial=aliases[0].x, tolerance=tolerance)
     result = _result(best, aliases, pairs, used >= count)
@@ -265,23 +275,6 @@ def _alias(model: Model, x: Array, cost: float) -> Alias:
     mode = "long" if middle < 1 else "short"
     motion = float(rotation), float(precession), mode, np.array(ratios)
     return Alias(x, cost, *motion, explains=False)
-
-
-def _distinct_aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
-    """Return the different motions among the results of searches, the smallest cost first."""
-    out: list[Alias] = []
-    for end in sorted(ends, key=lambda one: float(one.cost)):
-        if not np.isfinite(float(end.cost)):
-            continue
-        alias = _alias(model, end.x, float(end.cost))
-        if not any(_same_motion(alias, other, SAME) for other in out):
-            out.append(alias)
-    if not out:
-        raise ValueError(
-            "fit_light_curve: wanted a start with a finite cost, got none; are the readings in "
-            "the unit of the sensor?"
-        )
-    return out
 
 
 def _same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:

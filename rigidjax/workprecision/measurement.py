@@ -200,7 +200,12 @@ def _tried(
     end, steps = prepared.run(setting)
     first = time.perf_counter() - begin
     if adjoint:
-        errors = _gradient_errors(scene, end, reference)
+        gradient, wanted = np.asarray(end, float), np.asarray(reference.gradient)
+        errors = {}
+        # The relative errors of the gradient and of its parts.
+        for key, part in {"error": slice(None), **scene.blocks}.items():
+            size = max(np.linalg.norm(wanted[part]), 1e-300)
+            errors[key] = float(np.linalg.norm(gradient[part] - wanted[part]) / size)
     else:
         error, rate = state_errors(scene, end, reference.end)
         energy, momentum = drifts(scene, np.asarray(end))
@@ -212,20 +217,6 @@ def _tried(
         setting, steps=float(steps), compile=prepared.compile, memory=prepared.memory, **errors,
     )  # fmt: skip
     return [_TimedRun(record, prepared, [first])]
-
-
-def _gradient_errors(
-    scene: BenchmarkScene, computed_gradient: np.ndarray | Array, reference: Reference
-) -> dict[str, float]:
-    """Return the relative errors of a gradient and of its parts, by the fields of `Measurement`."""
-    gradient, wanted = np.asarray(computed_gradient, float), np.asarray(reference.gradient)
-
-    def relative_error(part: slice) -> float:
-        miss, size = np.linalg.norm(gradient[part] - wanted[part]), np.linalg.norm(wanted[part])
-        return float(miss / max(size, 1e-300))
-
-    parts = {key: relative_error(part) for key, part in scene.blocks.items()}
-    return {"error": relative_error(slice(None)), **parts}
 
 
 def drifts(scene: BenchmarkScene, final_state: np.ndarray | Array) -> tuple[float, float]:

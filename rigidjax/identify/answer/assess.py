@@ -107,21 +107,17 @@ def goodness_of_fit(
         # Beside a sensor that the model explains, another one may read little but white noise.
         each = [one._replace(word=EXPLAINS) if one.white else one for one in each]
     left = tuple(index for index, one in enumerate(each) if one.word != EXPLAINS)
-    rest = [_goodness_of_number(name, off) for name, off in residuals_by_name(model, linear)]
+    rest = []
+    for name, off in residuals_by_name(model, linear):
+        words = f"the measured {name} is {abs(off):.3g} standard deviations off"
+        far = abs(off) > FAR_OFF
+        rest.append(_SensorGoodness(LEAVES if far else EXPLAINS, words, off**2, 1))
     words = [one.words for one in (*each, *rest) if one.word != EXPLAINS]
     found = [one.word for one in (*each, *rest)]
     word = next((word for word in (FAILS, LEAVES) if word in found), EXPLAINS)
     dof = max(sum(one.many for one in (*each, *rest)) - linear.free_count, 1)
     chi2 = float(sum(one.chi2 for one in (*each, *rest)))
     return Goodness(chi2, dof, Answer(word, tuple(words)), left)
-
-
-def _goodness_of_number(name: str, off: float) -> _SensorGoodness:
-    """Return whether the model explains a measured number that is `off`, in standard deviations."""
-    if abs(off) <= FAR_OFF:
-        return _SensorGoodness(EXPLAINS, "", off**2, 1)
-    words = f"the measured {name} is {abs(off):.3g} standard deviations off"
-    return _SensorGoodness(LEAVES, words, off**2, 1)
 
 
 def _goodness_of_sensor(

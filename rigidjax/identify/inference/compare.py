@@ -4,7 +4,6 @@ from collections.abc import Mapping
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
 
 from rigidjax import _checks
 from rigidjax.identify.answer.result import Fit
@@ -73,18 +72,12 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 def criterion(fit: Fit, free: int, correlation: float) -> float:
     """Return Schwarz's criterion of a fit with `free` parameters, if one in `correlation` readings
     is independent.
-    """
-    many = np.array(list(map(numbers_read, fit.model.records.readings))) / correlation
-    return float(many @ _log_mean_squares(fit) + free * np.log(max(many.sum(), 2.0)))
-
-
-def _log_mean_squares(fit: Fit) -> Float[np.ndarray, " sensors"]:
-    """Return the logarithm of the mean square error of each sensor.
 
     Jitter (errors of time stamps) correlates errors and raises their variance. Such errors are
     whitened to the variance of the noise alone, and the mean logarithm of the factor by which
     jitter raises the variance is added: white errors of this mean square are as likely.
     """
+    # The logarithm of the mean square error of each sensor.
     out, model = 2.0 * np.log(np.maximum(fit.rms, 1e-300)), fit.model
     errors, _ = blocks_at(model, fit.x)
     white = whiten(model, errors, fit.noises)
@@ -97,4 +90,5 @@ def _log_mean_squares(fit: Fit) -> Float[np.ndarray, " sensors"]:
             wider = np.asarray(log_variances)[reading.host_mask]
             squares = np.sum(np.asarray(e * sigma[:, None])[reading.host_mask] ** 2, axis=-1)
             out[index] = np.log(squares.mean()) + wider.mean()
-    return out
+    many = np.array(list(map(numbers_read, model.records.readings))) / correlation
+    return float(many @ out + free * np.log(max(many.sum(), 2.0)))
