@@ -517,12 +517,6 @@ def fraction(value: object, name: str, requirement: str = "a number between 0 an
     return number
 
 
-def nonnegative_float(value: object, name: str) -> float:
-    """Return `value` as a finite Python float that is not negative; raise as `positive_float`."""
-    number = python_float(value, name)
-    return 0.0 if number == 0 else positive_float(number, name, "a number ≥ 0")
-
-
 def host_array(value: object, name: str) -> np.ndarray:
     """Return numbers as a NumPy array of floats, in SI units; raise `TypeError` for traced numbers,
     and for anything but real numbers.

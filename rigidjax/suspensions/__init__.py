@@ -8,9 +8,9 @@ from rigidjax._names import define_dir_and_getattr
 from rigidjax.motion.suspension import (
     AbstractSuspension as AbstractSuspension,
     Friction as Friction,
+    period as period,
 )
 from rigidjax.suspensions.axle import Axle as Axle
-from rigidjax.suspensions.periods import period as period
 from rigidjax.suspensions.strings import Strings as Strings
 from rigidjax.suspensions.torsion import TorsionBar as TorsionBar
 

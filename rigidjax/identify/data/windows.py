@@ -19,7 +19,7 @@ from rigidjax import _checks
 from rigidjax._types import HasSpin, Numbers
 from rigidjax.identify.data.recording import Reading, Recording, unchecked_recording
 from rigidjax.identify.data.reference_states import ReferenceStates
-from rigidjax.identify.sensors.states import StateSensor
+from rigidjax.identify.sensors.attitude import StateSensor
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import leaf_names, minus_small, parts_by_name
 from rigidjax.motion.torques.inputs import delays_of

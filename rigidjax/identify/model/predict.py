@@ -19,15 +19,17 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
-from rigidjax.identify.model.carried import CarriedMotion
 from rigidjax.identify.sensors import AbstractSensor, SensorInput
 from rigidjax.identify.sensors.base import extras
 from rigidjax.motion import Attitude, Rigid, Spin, Turn
 from rigidjax.motion.coupled import Coupled, CoupledEquations, with_own_states
 from rigidjax.motion.suspension import AbstractSuspension, Law
 from rigidjax.motion.torques import Carried
+from rigidjax.motion.torques.carried import Kinematics, relative_acceleration
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.motion.torques.states import freeze_own_states
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.linalg3 import cross
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
 from rigidjax.solve.steps.components import split_scalars
 from rigidjax.solve.steps.equal_steps import loop_low_order, state_after_step
@@ -128,7 +130,8 @@ class Adaptive(AbstractIntegrator):
 
     def __check_init__(self):
         _checks.positive_float(self.rtol, "rtol")
-        _checks.nonnegative_float(self.atol, "atol")
+        if _checks.python_float(self.atol, "atol"):
+            _checks.positive_float(self.atol, "atol", "a number ≥ 0")
 
     def states(self, body: Body, state0: State, ts: Float[Array, " times"], torque: Law) -> PyTree:
         # The padding of a shorter record repeats its last time, but a solver refuses equal times. A
@@ -160,6 +163,30 @@ def integrator_for(turn: float) -> AbstractIntegrator:
         return FixedSteps(1, solvers.RungeKutta4())
     substeps = max(1, math.ceil(turn / TURN_A_STEP))
     return FixedSteps(substeps) if substeps <= 20 else Adaptive()
+
+
+class CarriedMotion(eqx.Module):
+    """Hold the motion of a carried body, read from its log; call it with times (n,), s, as a
+    `FreeMotion`.
+    """
+
+    body: MassProperties
+    torque: Carried
+
+    def __call__(self, ts: Array) -> Rigid:
+        def state(t: Array) -> Rigid:
+            now, com = self.torque.motion(t), self.body.com
+            v = now.v + quaternion.rotate(now.q, cross(now.omega, com))
+            return Rigid(now.x + quaternion.rotate(now.q, com), v, now.q, now.omega)
+
+        return jax.vmap(state)(ts)
+
+    def field(self, t: Array, state: Rigid, args: object = None) -> Rigid:
+        """Return the logged time derivative of the state, for which I⁻¹ is not needed."""
+        now: Kinematics = self.torque.motion(t)
+        moved = relative_acceleration(now.omega, now.alpha, self.body.com)
+        a = now.a + quaternion.rotate(now.q, moved)
+        return Rigid(state.v, a, quaternion.rate(state.q, state.omega), now.alpha)
 
 
 def known_motion(
