@@ -1,7 +1,6 @@
 """Describe in words which numbers a fit leaves undetermined."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -397,7 +396,16 @@ def describe_identifiability(
         if not (size[..., 1].max(axis=1) < np.linalg.norm(size[..., 0], axis=1)).all():
             many = "rate is" if count == 1 else "rates are"
             out.append(f"The initial body {many} not determined by these data.")
-    out += _describe_limits(moments)
+    # A ratio whose interval is tiny beside another one that spans all possible values.
+    wide = [(q, np.ptp(np.asarray(q.interval(0.95)))) for q in moments if "/" in q.name]
+    tiny = [q for q, width in wide if width < 1e-4 * q.value]
+    free = [q for q, width in wide if width > 0.5]
+    out += [
+        f"The interval of {one.name} is a thousandth of a per cent wide or less, that of "
+        f"{free[0].name} spans most of what is possible: the fit lies at a limit of real bodies, "
+        "and neither interval says much."
+        for one in tiny[: len(free)]
+    ]
     out += _describe_combinations(point, uncertainty)
     only_gyros = all(isinstance(sensor, Gyro) for sensor in point.model.records.sensors)
     if point.model.torque is None:
@@ -431,19 +439,6 @@ def _describe_near_ball(point: BestPoint) -> list[str]:
     return [
         f"Nearly a ball, at {rate:.2g} rad/s: so look rates in deg/s that were read as rad/s. "
         "Check the unit of the rates."
-    ]
-
-
-def _describe_limits(quantities: Sequence[Quantity]) -> list[str]:
-    """Describe a ratio whose interval is tiny beside another one that spans all possible values."""
-    wide = [(q, np.ptp(np.asarray(q.interval(0.95)))) for q in quantities if "/" in q.name]
-    tiny = [q for q, width in wide if width < 1e-4 * q.value]
-    free = [q for q, width in wide if width > 0.5]
-    return [
-        f"The interval of {one.name} is a thousandth of a per cent wide or less, that of "
-        f"{free[0].name} spans most of what is possible: the fit lies at a limit of real bodies, "
-        "and neither interval says much."
-        for one in tiny[: len(free)]
     ]
 
 

@@ -16,7 +16,7 @@ from rigidjax._types import Scalar
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.filtering.terms import recording_terms
-from rigidjax.identify.model.build import Extended, extended, interval_steps
+from rigidjax.identify.model.build import extended, interval_steps
 from rigidjax.identify.model.free import Slot
 from rigidjax.identify.model.model import (
     Model,
@@ -28,7 +28,7 @@ from rigidjax.identify.model.model import (
     unpack_at,
 )
 from rigidjax.identify.model.scene import Process, Scene, require_unknown_torque
-from rigidjax.identify.model.terms import Noise, prior_residuals
+from rigidjax.identify.model.terms import prior_residuals
 from rigidjax.identify.uncertainty.covariance import white_covariance
 from rigidjax.motion.torques.composite import parts_of
 
@@ -124,15 +124,24 @@ class LogDensity(eqx.Module):
                 "parameters, so there is no posterior; give a prior or fewer parameters"
                 f"{hint}. {what}".rstrip()
             )
-        known = process is None or deviation is None
-        prior = None if known else jnp.asarray(_checks.positive_float(deviation, "deviation"))
+        fixed = process is None or deviation is None
+        prior = None if fixed else jnp.asarray(_checks.positive_float(deviation, "deviation"))
         factors = _noise_factors(model)
         if prior is not None:
             total = sum(int(reading.host_mask.sum()) for reading in model.records.readings)
             wide = np.full(1, 1 / math.sqrt(total))
             factors += [_Factor(slot, wide) for slot in _process_slots(process, prior)]
         slots = [factor.slot for factor in factors]
-        self.model, places = _extended(model, fit.noises, process, slots)
+        wider, places = extended(model, slots)
+        records = eqx.tree_at(
+            lambda r: [reading.sensor.noise for reading in r.readings],
+            model.records,
+            list(fit.noises),
+            is_leaf=lambda node: node is None,
+        )
+        steps = model.filter_steps if process is None else interval_steps(records, model.reference)
+        known = dict(records=records, process=process, filter_steps=steps)
+        self.model = dataclasses.replace(wider, **known)
         covariance = _white_covariance(fit, process is None and not model.walks)
         self.x0 = jnp.zeros(self.model.size, fit.x.dtype).at[places].set(fit.x)
         whole = np.zeros((self.model.size, self.model.size))
@@ -239,20 +248,6 @@ def _slot(
     """Return the slot of a positive factor of a leaf of the scene, one for each group if any."""
     one = jnp.ones(())
     return Slot(path, name, unit, False, True, shape, labels, groups, one, prior, None)
-
-
-def _extended(model: Model, noises: Noise, process: Process | None, slots: list[Slot]) -> Extended:
-    """Return a model with the parameters of further `slots`, with known `noises` and a process."""
-    wider, places = extended(model, slots)
-    records = eqx.tree_at(
-        lambda r: [reading.sensor.noise for reading in r.readings],
-        model.records,
-        list(noises),
-        is_leaf=lambda node: node is None,
-    )
-    steps = model.filter_steps if process is None else interval_steps(records, model.reference)
-    wider = dataclasses.replace(wider, records=records, process=process, filter_steps=steps)
-    return Extended(wider, places)
 
 
 def _white_covariance(fit: Fit, has_deterministic_motion: bool) -> Float[np.ndarray, "n n"]:
