@@ -47,14 +47,20 @@ def furniture() -> None:
     nodes = [node for tree in trees.values() for node in ast.walk(tree)]
     docs = sum(bool(ast.get_docstring(n)) for n in nodes if isinstance(n, holders))
     print(f"statements {sum(isinstance(n, ast.stmt) for n in nodes) - docs}")
-    private = once = hidden = things = 0
+    private = once = plain = hidden = things = 0
     for file, tree in trees.items():
         used = [n.id for n in ast.walk(tree) if isinstance(n, ast.Name)]
+        calls = [n.func for n in ast.walk(tree) if isinstance(n, ast.Call)]
+        called = {n.id for n in calls if isinstance(n, ast.Name)}
         for node in tree.body:
             if isinstance(node, ast.FunctionDef) and node.name.startswith("_"):
                 private += 1
                 short = sum(isinstance(n, ast.stmt) for n in ast.walk(node)) <= 15
-                once += short and used.count(node.name) <= 1
+                single = short and used.count(node.name) <= 1
+                once += single
+                # A rule of differentiation, a program of its own and a function that is passed on
+                # as a value have to be functions; what one place calls does not.
+                plain += single and not node.decorator_list and node.name in called
             if not isinstance(node, ast.FunctionDef | ast.ClassDef):
                 continue
             for inner in ast.walk(node):
@@ -67,7 +73,8 @@ def furniture() -> None:
     names = [n.name.strip("_") for n in nodes if isinstance(n, ast.FunctionDef)]
     names = [n for n in names if n]
     long = sum(len(n) >= 30 for n in names)
-    print(f"private functions of modules {private}, of these short and named once {once}")
+    print(f"private functions of modules {private}, of these short and named once {once},", end=" ")
+    print(f"neither decorated nor passed on as a value {plain}")
     print(
         f"letters of a function's name {sum(map(len, names)) / len(names):.1f}; 30 and more: {long}"
     )
