@@ -310,7 +310,7 @@ def bifurcation(
             share = (held_value - a) / (b - a)
             guess = jax.tree.map(lambda x, y: (1 - share) * x + share * y, left, right)
             orbits[held_value] = scene.periodic_orbit(guess, hold=hold)
-        stability = np.asarray(_indices(scene, orbits[held_value]))[index]
+        stability = np.asarray(eqx.filter_jit(scene.stability_indices)(orbits[held_value]))[index]
         if abs(stability.imag) > 1e-9 * max(1.0, abs(stability)):
             words = "the stability indices are complex at a member between the orbits"
             raise ValueError(f"bifurcation: {words}; give orbits nearer to each other")
@@ -326,9 +326,3 @@ def bifurcation(
         )
     root: Any = brentq(excess, a, b, xtol=1e-13 * max(1.0, abs(b - a)), maxiter=_MOST)
     return orbits[root]
-
-
-@eqx.filter_jit
-def _indices(scene: "AbstractReversible", orbit: PeriodicOrbit) -> Complex[Array, "2"]:
-    """Return both stability indices of an orbit, by a compiled program."""
-    return scene.stability_indices(orbit)

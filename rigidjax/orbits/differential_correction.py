@@ -83,7 +83,8 @@ def periodic_orbit(
     free = np.delete(np.arange(4), index)
     if tolerance is None:
         tolerance = usual_tolerance(numbers)
-    unknown, left = _corrected_orbit(scene, numbers[free], numbers[index], index, tolerance)
+    given = index, float(tolerance), scene, numbers[free], numbers[index]
+    unknown, left = eqx.filter_jit(correct_orbit)(*given)
     bad = ~(left <= tolerance)
     said = ""
     if _checks.is_known(left):
@@ -236,14 +237,6 @@ class Corrected(NamedTuple):
 # Newton's method itself is not differentiated: `_correct_orbit_jvp` is its derivative. This rule is
 # linear in the tangents, so that it serves both `jax.jacfwd` and `jax.grad`, although the motions
 # inside the rule are differentiated in forward mode.
-@eqx.filter_jit
-def _corrected_orbit(
-    scene: AbstractScene, unknown: Array, held_value: Array, index: int, tolerance: float
-) -> Corrected:
-    """Return the corrected orbit, by a compiled program."""
-    return correct_orbit(index, float(tolerance), scene, unknown, held_value)
-
-
 @eqx.filter_custom_jvp
 def correct_orbit(
     index: int, tolerance: float, scene: AbstractScene, unknown: Array, held_value: Array

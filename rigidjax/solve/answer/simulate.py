@@ -177,14 +177,13 @@ def simulate(
         if _checks.is_known(max_step):
             _checks.positive_float(max_step, "max_step")
         max_step = jnp.asarray(max_step, times.dtype)
+    way = time_direction(times)
     if stepsize_controller is None:
         rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
-    way = time_direction(times)
-    if solver is None and stepsize_controller is None and has_closed_form(body, torque):
-        found = _solve_run(ClosedFormRun(body, way, throw, torque), event, state0, times)
-        return found if accuracy is None else with_error(found, found.error, accuracy)
-    # The tolerances are arrays, so that another tolerance does not compile again.
-    if stepsize_controller is None:
+        if solver is None and has_closed_form(body, torque):
+            found = _solve_run(ClosedFormRun(body, way, throw, torque), event, state0, times)
+            return found if accuracy is None else with_error(found, found.error, accuracy)
+        # The tolerances are arrays, so that another tolerance does not compile again.
         rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
     else:
         rtol = getattr(stepsize_controller, "rtol", None)
