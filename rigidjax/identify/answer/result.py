@@ -373,12 +373,9 @@ def value_and_interval_of(
         return _checks.differentiable_array(function(point), "function(point)")
 
     point, slopes = unpack_jacobian(shortened(fit.model), fit.point.derivative_point)
-
-    def value_and_change(step: Unpacked) -> tuple[Array, Array]:
-        return jax.jvp(value, (point,), (step,))
-
+    both = lambda step: jax.jvp(value, (point,), (step,))  # noqa: E731
     # Under `vmap` the value may come once for each of the n derivatives; all of these are equal.
-    values, slope = jax.vmap(value_and_change, in_axes=-1, out_axes=(0, -1))(slopes)
+    values, slope = jax.vmap(both, in_axes=-1, out_axes=(0, -1))(slopes)
     best = values[0] if fit.point.near is None else value(fit.model.unpack(fit.x))
     middle, slope = np.asarray(_checks.require_finite(best, "function(point)")), np.asarray(slope)
     determined, null = np.asarray(fit.determined_covariance), np.asarray(fit.null_directions)

@@ -155,9 +155,6 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
     status, lost_at = outcome(beliefs, steps.split_by_sensor(sensors, read), first.t)
     path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, kept[0].x)
 
-    def is_running(state: tuple) -> Array:
-        return (state[3] < iterations) & (state[2] > tolerance)
-
     def iterate(state: tuple) -> tuple:
         path, estimate, _, count = state
         kicks = estimate.kicks[:, : dynamics.normals_per_step]
@@ -172,7 +169,9 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
     )
     far = jnp.asarray(jnp.inf, first.root.dtype)
     path, estimate, change, count = lax.while_loop(
-        is_running, iterate, (path, blank, far, jnp.asarray(0))
+        lambda state: (state[3] < iterations) & (state[2] > tolerance),
+        iterate,
+        (path, blank, far, jnp.asarray(0)),
     )
     h = jnp.diff(stops.t, prepend=first.t).astype(first.root.dtype)
     white = []
