@@ -1,5 +1,5 @@
-"""Run the command `python -m rigidjax`, which identifies a body from logs, gives a moment of
-inertia from a swing, or compares methods.
+"""Run the command `python -m rigidjax`, which looks at logs, identifies a body from them, gives a
+moment of inertia from a swing, or compares methods.
 """
 
 import _thread
@@ -13,8 +13,9 @@ import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -31,6 +32,11 @@ from rigidjax.workprecision import command as workprecision
 # The demo takes only the options in this tuple. All other options describe how to read logs or what
 # to fit to them, and the demo reads no log.
 _OF_DEMO = ("starts", "checkpoint", "figure", "report", "json", "no_cache")
+# The options of the command `look`.
+_OF_LOOK = (
+    "logs", "--columns", "--time", "--unit", "--limit", "--sensor", "--time-unit", "--rate",
+    "--window", "--flight", "--strict", "--wheel", "--motors", "--figure",
+)  # fmt: skip
 # Each of these options names a file to write. Two options must not name the same file, and none may
 # name a log that is read.
 _OUTPUTS = ("checkpoint", "figure", "report", "json", "csv", "keep")
@@ -56,6 +62,8 @@ def main(arguments: list[str] | None = None) -> int:
         return swing.run_subcommand(options, parser)
     if options.command == "identify" and options.demo == bool(options.logs):
         parser.error("identify: give either log FILES or --demo")
+    if options.command == "look" and not 0 < len(options.logs) < (2 if options.figure else 1e9):
+        parser.error("look: give log FILES; with --figure one")
     _check_outputs(options, parser)
     if arguments is None:
         # Characters of a file name that the terminal cannot show are escaped, since they would
@@ -101,6 +109,8 @@ def _dispatch(
         jax.config.update("jax_enable_compilation_cache", False)
     elif owns_process:
         _keep_programs()
+    if options.command == "look":
+        return _run_look(options)
     return _run_demo(options) if options.demo else _run_logs(options)
 
 
@@ -239,6 +249,12 @@ OPTIONS: dict[str, dict[str, Any]] = {
         type=int, metavar="N", help="which flight of a Blackbox log that holds several, from 1"),
     "--strict": _FLAG | dict(
         help="refuse a log of which rows or frames would be left out, or whose units are doubtful"),
+    "--motors": dict(
+        nargs="+", default=[], metavar="COLUMN",
+        help="speeds or commands of motors: while one runs, no flight is free"),
+    "--throws": _FLAG | dict(
+        help="fit all free flights in the logs, which the gyro and, where there is one, the "
+        "accelerometer show (see: look LOG)"),
     "--wheel": dict(
         action="append", default=[], metavar="COLUMN:INERTIA[:AXIS[:UNIT]]",
         help="a wheel whose speed was logged: its inertia in kg m², axis x, y or z, rad/s or rpm"),
@@ -304,6 +320,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     for name, how in OPTIONS.items():
         identify.add_argument(name, **how)
+    look = commands.add_parser(
+        "look",
+        help="find free flight, swings and rest in logs",
+        description="Say when a body flies free, swings about one axis, rests or is handled, and "
+        "what can be fitted to each part of a log; an accelerometer is found by its name.",
+        epilog="Then: identify LOG --throws, or identify LOG --window FROM TO",
+    )
+    for name, how in OPTIONS.items():
+        if name in _OF_LOOK:
+            look.add_argument(name, **how)
+        else:
+            look.set_defaults(**{name.strip("-").replace("-", "_"): how.get("default")})
     swing.add_command(commands)
     workprecision.add_subcommand(commands)
     return parser
@@ -377,11 +405,78 @@ def _columns(
     return channels, dict(time=time, rate=rate, time_unit=time_unit)
 
 
-def _read_logs(
-    options: argparse.Namespace,
-) -> tuple[list[spec.Channel], list[rj.identify.Recording], rj.identify.Model]:
-    """Return the sensors of the first log, the recordings of all logs, and the model that the
-    options describe; raise `LogError` as `read_log`.
+class _Seen(NamedTuple):
+    """Hold what is read of a log: its sensors, its recording, and its phases if they are asked for.
+
+    The recording of `identify` has the sensors that the options name, and no motors.
+    """
+
+    channels: list[spec.Channel]
+    record: rj.identify.Recording
+    phases: list[rj.identify.Phase]
+
+
+def _read_log(path: str, options: argparse.Namespace, wheels: list[spec.WheelColumn]) -> _Seen:
+    """Return what is read of a log; raise `LogError` as `spec.read_log`."""
+    log = open_log(Path(path), options.flight)
+    channels, times = _columns(path, log, options)
+    asked, more = options.throws or options.command == "look", []
+    if asked and not any(one.kind == "accelerometer" for one in channels):
+        more = spec.accelerometer(path, log, channels[0].columns[0])
+        for one in more:
+            _print_line(f"{path}: specific force {', '.join(one.columns)} in {one.unit}")
+    how: Any = dict(window=options.window, wheels=wheels, free=options.free, **times)
+    record = spec.read_log(path, [*channels, *more], log=log, motors=options.motors, **how)
+    said = [
+        ("time", times["time"], TIME_UNITS),
+        *((c.kind, c.columns[0], (c.unit,)) for c in channels),
+    ]
+    units = [(what, unit_in_name(name, allowed)) for what, name, allowed in said]
+    words = [f"{what} in {unit}" for what, unit in units if unit]
+    if words and not times["rate"]:
+        _print_line(f"{path}: {', '.join(words)}, as the names of its columns say")
+    if not asked:
+        return _Seen(channels, record, [])
+    alone = eqx.tree_at(lambda r: r.readings, record, record.readings[: len(channels)])
+    try:
+        phases = rj.identify.find_phases(record, options.motors)
+    except ValueError as error:
+        if not more:
+            raise LogError(f"{path}: {error}") from None
+        warn(f"{path}: {error}; the phases are by the gyro alone")
+        phases, record = rj.identify.find_phases(alone, options.motors), alone
+    return _Seen(channels, record if options.command == "look" else alone, phases)
+
+
+def _throws(path: str, seen: _Seen) -> list[rj.identify.Recording]:
+    """Return the free flights of a log from which a body can be fitted, and say which they are;
+    **warn** of those that are left out, and raise `LogError` if there is none.
+    """
+    flights = [phase for phase in seen.phases if phase.kind == "free"]
+    for one in flights:
+        words = f"{path}: free flight {one.start:.3f} … {one.end:.3f} s"
+        _print_line(words if one.is_usable else f"{words} is left out; it says {one.says}")
+    used = [phase for phase in flights if phase.is_usable]
+    if not used:
+        raise LogError(
+            f"{path}: no free flight from which a body can be fitted; what is in it says: "
+            "python -m rigidjax look"
+        )
+    return [seen.record.between(one.start, one.end) for one in used]
+
+
+class _Read(NamedTuple):
+    """Hold the sensors of the first log, the recordings of all logs, their names, and the model."""
+
+    channels: list[spec.Channel]
+    records: list[rj.identify.Recording]
+    names: list[str]
+    model: rj.identify.Model
+
+
+def _read_logs(options: argparse.Namespace) -> _Read:
+    """Return what the logs hold, and the model that the options describe; raise `LogError` as
+    `read_log`.
     """
     if options.columns and options.time:
         raise LogError("--time: not together with --columns, whose first name is the time column")
@@ -389,7 +484,7 @@ def _read_logs(
     if alone and not options.wrench:
         raise LogError(f"--{alone[0]}: wanted a --wrench beside it, the columns of the readings")
     if options.wrench:
-        others = ("columns", "sensor", "wheel", "unit", "limit", "flight")
+        others = ("columns", "sensor", "wheel", "unit", "limit", "flight", "throws", "motors")
         others = [name for name in others if getattr(options, name)]
         if others or set(options.free) - {"bias"}:
             what = f"--{others[0]}" if others else "--free drag, --free delay"
@@ -403,30 +498,54 @@ def _read_logs(
         pose = options.pose or ["x", "y", "z", "qw", "qx", "qy", "qz"]
         columns = options.wrench, pose, options.motion
         held = [spec.read_held(path, *columns, **how) for path in options.logs]
-        return [], held, spec.model_of_held(held, options.free, options.loss)
+        names = [_checks.escape_controls(Path(path).name) for path in options.logs]
+        return _Read([], held, names, spec.model_of_held(held, options.free, options.loss))
     wheels = [spec.parse_wheel(text) for text in options.wheel]
     if options.model in ("tensor", "principal") and not wheels:
         words = "free motion shows ratios only; a scale needs a --wheel"
         raise LogError(f"--model {options.model}: {words}")
     if "delay" in options.free and not wheels:
         raise LogError("--free delay: wanted a --wheel, whose delay is to be fitted, got none")
-    how: dict[str, Any] = dict(window=options.window, wheels=wheels, free=options.free)
-    records, of_first = [], None
+    records, names, of_first = [], [], None
     for path in options.logs:
-        log = open_log(Path(path), options.flight)
-        channels, times = _columns(path, log, options)
-        records.append(spec.read_log(path, channels, log=log, **times, **how))
-        said = [
-            ("time", times["time"], TIME_UNITS),
-            *((c.kind, c.columns[0], (c.unit,)) for c in channels),
-        ]
-        units = [(what, unit_in_name(name, allowed)) for what, name, allowed in said]
-        words = [f"{what} in {unit}" for what, unit in units if unit]
-        if words and not times["rate"]:
-            _print_line(f"{path}: {', '.join(words)}, as the names of its columns say")
-        of_first = of_first or channels
+        seen = _read_log(path, options, wheels)
+        mine = _throws(path, seen) if options.throws else [seen.record]
+        of_first, records = of_first or seen.channels, [*records, *mine]
+        name = _checks.escape_controls(Path(path).name)
+        names += [f"{name}, {one.t[0]:.3f} s" if options.throws else name for one in mine]
     how = dict(typical_moment=options.typical, wheels=wheels, free=options.free, loss=options.loss)
-    return of_first or [], records, spec.model_of(records, options.model, **how)
+    return _Read(of_first or [], records, names, spec.model_of(records, options.model, **how))
+
+
+def _run_look(options: argparse.Namespace) -> int:
+    """Print the phases of each log, draw them, and return the exit code."""
+    try:
+        with _log_warnings(options.strict):
+            wheels = [spec.parse_wheel(text) for text in options.wheel]
+            seen = [_read_log(path, options, wheels) for path in options.logs]
+    except ValueError as error:
+        return _print_error(error)
+    except LogWarning as warning:
+        return _print_error(f"{warning} (--strict)")
+    for path, (channels, record, phases) in zip(options.logs, seen, strict=True):
+        span = float(record.t[-1] - record.t[0])
+        print()
+        _print_line(f"{path}: {record.t.size} samples over {span:.4g} s")
+        print(f"{'from':>10} {'to, s':>10}  {'phase':<10} {'turned':>10}  what can be fitted")
+        for p in phases:
+            turned = f"{p.turned:6.1f} rad" if p.turned else ""
+            print(f"{p.start:10.3f} {p.end:10.3f}  {p.kind:<10} {turned:>10}  {p.says}")
+        if any(p.is_usable for p in phases):
+            _print_line(f"a fit of the free flights: python -m rigidjax identify {path} --throws")
+        if options.figure is not None:
+            unit = channels[0].unit if channels[0].unit in ("rad/s", "deg/s") else "rad/s"
+            how = dict(rate_unit=unit, title=Path(path).name)
+            try:
+                rj.plot.phases(record, phases, **how)[0].figure.savefig(options.figure, dpi=130)
+            except OSError as error:
+                return _print_error(f"no figure: {options.figure}: {error}")
+            _print_line(f"figure: {options.figure}")
+    return 0
 
 
 @contextlib.contextmanager
@@ -454,12 +573,12 @@ def _run_logs(options: argparse.Namespace) -> int:
     """
     try:
         with _log_warnings(options.strict):
-            channels, records, model = _read_logs(options)
+            channels, records, names, model = _read_logs(options)
     except ValueError as error:
         return _print_error(error)
     except LogWarning as warning:
         return _print_error(f"{warning} (--strict)")
-    for path, record in zip(options.logs, records, strict=True):
+    for path, record in zip(names, records, strict=True):
         gaps = sum(int((~reading.host_mask).sum()) for reading in record.readings) + record.dropped
         words = f", {gaps} gap{'s' if gaps > 1 else ''}" if gaps else ""
         count, span = record.t.shape[0] + record.dropped, record.t[-1] - record.t[0]
@@ -477,9 +596,9 @@ def _run_logs(options: argparse.Namespace) -> int:
         print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
     print()
     print(rj.identify.report.verdict(fit))
-    names = [_checks.escape_controls(Path(path).name) for path in options.logs]
-    title = f"Identification of {', '.join(names[:3])}{' …' if names[3:] else ''}"
-    return _write_outputs(fit, options, title, names, names, {"rate_unit": rate_unit})
+    files = [_checks.escape_controls(Path(path).name) for path in options.logs]
+    title = f"Identification of {', '.join(files[:3])}{' …' if files[3:] else ''}"
+    return _write_outputs(fit, options, title, files, names, {"rate_unit": rate_unit})
 
 
 def _fit(

@@ -13,6 +13,7 @@ import numpy as np
 
 from rigidjax.body.inertia import MassProperties
 from rigidjax.cli.logs.errors import LogError, warn
+from rigidjax.cli.logs.layouts import accelerometer_columns
 from rigidjax.cli.logs.log import Log
 from rigidjax.cli.logs.table import full_names, open_log, read_columns
 from rigidjax.cli.logs.times import (
@@ -22,7 +23,14 @@ from rigidjax.cli.logs.times import (
     unwrapped,
     warn_of_steps,
 )
-from rigidjax.cli.logs.units import RATE_UNITS, TIME_UNITS, UNITS, common_unit
+from rigidjax.cli.logs.units import (
+    FORCE_UNITS,
+    RATE_UNITS,
+    TIME_UNITS,
+    UNITS,
+    common_unit,
+    unit_in_name,
+)
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.data.reference_states import require_turning
 from rigidjax.identify.model import charts
@@ -65,7 +73,7 @@ LOSSES = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}
 # Euler angles of any sequence.
 SENSOR_UNITS = {
     "gyro": (*RATE_UNITS, "rpm"),
-    "accelerometer": ("m/s2", "g", "mg"),
+    "accelerometer": FORCE_UNITS,
     "quaternion": ("1",),
     "euler": ("rad", "deg"),
 }
@@ -131,6 +139,29 @@ def parse_channel(text: str) -> Channel:
     return Channel(kind, columns, unit, noise_of_axes(noise, f"sensor {text!r}"))
 
 
+def accelerometer(path: str | Path, log: Log, rate: str) -> list[Channel]:
+    """Return the accelerometer of a log beside the column of a `rate`, if there is one.
+
+    It **warns** of one that has other times. Readings of 0.8 to 1.2 in most rows, without a unit,
+    are in g.
+    """
+    names = accelerometer_columns(log, Path(path).stem)
+    if names is None:
+        return []
+    channel = Channel("accelerometer", names, None, None)
+    try:
+        table = read_columns(Path(path), log, [rate, *names])
+        size = np.nanmedian(np.linalg.norm([table[name] for name in names], axis=0))
+        unit = unit_of_channel(path, log, channel)
+    except LogError as error:
+        warn(f"{path}: {', '.join(names)} are not read beside the rates: {error}")
+        return []
+    if not (_units_of_log(path, log, names) or unit_in_name(names[0], FORCE_UNITS)):
+        low, high = 0.8 * UNITS["g"], 1.2 * UNITS["g"]
+        unit = next((u for u in FORCE_UNITS[1:] if low < size * UNITS[u] < high), unit)
+    return [Channel("accelerometer", names, unit, None)]
+
+
 def _units(kind: str) -> tuple[str, ...]:
     """Return the allowed units of a kind of sensor, the default unit first; none for an unknown
     kind.
@@ -181,15 +212,16 @@ def read_log(
     free: Sequence[str] = (),
     rate: float | None = None,
     log: Log | None = None,
+    motors: Sequence[str] = (),
 ) -> Recording:
     """Return the recording in a log, with the sensors that `channels` describe; its times count
     from the first time stamp of the log.
 
     A sensor has no reading in a row in which one of its cells is empty. The window (from, to) is in
     s from the first time stamp. The speeds of the wheels become inputs, `wheel`, or `wheel 1`,
-    `wheel 2`, … Of the words in `free`, `bias` gives each sensor a bias; the others have no effect
-    here. At a `rate`, readings a second, the column `time` counts readings, as the rows do if it is
-    an empty name.
+    `wheel 2`, …, and the columns `motors` inputs of their names. Of the words in `free`, `bias`
+    gives each sensor a bias; the others have no effect here. At a `rate`, readings a second, the
+    column `time` counts readings, as the rows do if it is an empty name.
 
     It **warns** as `read_table` does, of rows that are left out because their times do not
     increase, of a long gap, of times that are plainly in another unit or no times, of rates that no
@@ -199,7 +231,7 @@ def read_log(
     log = open_log(Path(path)) if log is None else log
     # The dict has each column once: two wheels may have their speeds in the same column, and
     # `read_columns` refuses a column that is wanted twice.
-    turning = dict.fromkeys(w.column for w in wheels)
+    turning = dict.fromkeys([*(w.column for w in wheels), *motors])
     names = [*(c for one in channels for c in one.columns), *turning]
     table = read_columns(Path(path), log, [time, *names] if time else names)
     t, unit = _times(path, log, table, time, time_unit, rate)
@@ -219,6 +251,10 @@ def read_log(
         readings.append((sensor, values[kept], mask[kept]))
     warn_of_steps(path, t[kept], unit, rate)
     inputs = _wheel_speeds(path, t, table, wheels)
+    for name in motors:
+        seen = np.flatnonzero(np.isfinite(table[name]) & np.isfinite(t))
+        seen = seen[increasing(t[seen])]
+        inputs[name] = Series(t[seen], table[name][seen])
     # The memory of a large log is freed before the recording copies its columns.
     del table
     try:

@@ -12,6 +12,7 @@ from rigidjax.cli.logs.table import read_table as read_table
 from rigidjax.identify import report as report
 from rigidjax.identify.answer.fit import fit as fit
 from rigidjax.identify.answer.result import Fit as Fit
+from rigidjax.identify.data.phases import Phase as Phase, find_phases as find_phases
 from rigidjax.identify.data.recording import Recording as Recording
 from rigidjax.identify.data.windows import Windows as Windows, windows as windows
 from rigidjax.identify.filtering.filter import (
@@ -89,12 +90,12 @@ __all__ = [
     "AbstractBodyChart", "AbstractLoss", "AbstractSensor", "Accelerometer", "Adaptive",
     "AttitudeSensor", "Candidates", "Descent", "Direction", "Entropic", "Fit", "FixedSteps",
     "ForceTorque", "Free", "Gyro", "Huber", "Known", "LogDensity", "Magnetometer", "Marker", "Mass",
-    "Measured", "Model", "Moment", "Nuts", "Position", "Posterior", "Principal", "PrincipalRatios",
-    "Range", "Ratios", "Recording", "Refit", "Scene", "Selection", "SensorInput", "SoftL1",
-    "Tensor", "Tolerance", "Unpacked", "Velocity", "Walk", "Windows", "compare", "descend",
-    "expected_quantities", "filter", "first_belief", "fisher", "fit", "log_likelihood", "posterior",
-    "predict_windows", "read_table", "refit", "report", "sample", "select", "simulate_readings",
-    "smooth", "step", "usual_terms", "windows",
+    "Measured", "Model", "Moment", "Nuts", "Phase", "Position", "Posterior", "Principal",
+    "PrincipalRatios", "Range", "Ratios", "Recording", "Refit", "Scene", "Selection", "SensorInput",
+    "SoftL1", "Tensor", "Tolerance", "Unpacked", "Velocity", "Walk", "Windows", "compare",
+    "descend", "expected_quantities", "filter", "find_phases", "first_belief", "fisher", "fit",
+    "log_likelihood", "posterior", "predict_windows", "read_table", "refit", "report", "sample",
+    "select", "simulate_readings", "smooth", "step", "usual_terms", "windows",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

@@ -14,6 +14,7 @@ from rigidjax.plot.fit import fit as fit
 from rigidjax.plot.frames import frames as frames
 from rigidjax.plot.horizons import horizons as horizons
 from rigidjax.plot.phase_portrait import phase_portrait as phase_portrait
+from rigidjax.plot.phases import phases as phases
 from rigidjax.plot.poinsot import (
     body_axes as body_axes,
     herpolhode as herpolhode,
@@ -25,7 +26,7 @@ from rigidjax.plot.time_series import motion as motion
 
 __all__ = [
     "COLOURS", "body_axes", "fit", "frames", "herpolhode", "horizons", "inertia_ellipsoid",
-    "motion", "phase_portrait", "player", "polhode", "residuals", "tumble",
+    "motion", "phase_portrait", "phases", "player", "polhode", "residuals", "tumble",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

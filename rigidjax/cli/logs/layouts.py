@@ -8,7 +8,7 @@ from typing import NamedTuple
 from rigidjax.cli.logs.errors import LogError, list_names
 from rigidjax.cli.logs.log import Log
 from rigidjax.cli.logs.table import open_log
-from rigidjax.cli.logs.units import RATE_UNITS, TIME_UNITS, unit_in_name
+from rigidjax.cli.logs.units import FORCE_UNITS, RATE_UNITS, TIME_UNITS, unit_in_name
 
 
 class ImuColumns(NamedTuple):
@@ -34,8 +34,11 @@ _TIMES = frozenset(
 )
 _COUNTERS = frozenset("frame packetcounter counter sample samples index row".split())
 _GYRO = re.compile(r"gyr|angular_?vel|rotation_?rate|omega|ω|^w\W*$|[. _]w\W*$", re.IGNORECASE)
-# What else belongs to a gyro, but is not its rates.
-_NO_RATES = re.compile(r"cov|bias|offset|deriv|fifo|temp|std|var|noise|clip", re.IGNORECASE)
+_ACCELEROMETER = re.compile(r"acc(?!ur)|specific_?force|^a\W*$|[. _]a\W*$", re.IGNORECASE)
+# An acceleration without gravity is no specific force (the field `linear_acceleration` of ROS is).
+_NO_FORCE = re.compile(r"\blin(?!ear_acc)|linearacc|user|grav|without|ohne|sans", re.IGNORECASE)
+# What else belongs to a sensor, but is not its readings.
+_NO_READINGS = re.compile(r"cov|bias|offset|deriv|fifo|temp|std|var|noise|clip", re.IGNORECASE)
 # The units of rates and times in tables exported from Blackbox and PX4, and of the usual names.
 _UNITS = {"gyroADC": ("deg/s", "us"), "gyro_rad": ("rad/s", "us"), "wx": ("rad/s", None)}
 _SECOND_CHOICE = re.compile(r"raw|unfilt|uncal|#\d", re.IGNORECASE)
@@ -80,9 +83,21 @@ def _unit(log: Log, name: str, allowed: Sequence[str]) -> str | None:
     return log.units.get(name) or unit_in_name(name, allowed)
 
 
-def _triples(log: Log, title: str) -> Iterator[tuple[str, tuple[str, str, str]]]:
-    """Yield the columns of each gyro, in the order x, y, z, and their name without the axis; the
-    rates of a log whose `title` names a gyro may be x, y, z.
+def accelerometer_columns(log: Log, title: str) -> tuple[str, str, str] | None:
+    """Return the columns of the specific force along x, y and z, by their names and units."""
+    found = [
+        (bool(_SECOND_CHOICE.search(stem)), place, names)
+        for place, (stem, names) in enumerate(_triples(log, title, _ACCELEROMETER, FORCE_UNITS))
+        if not _NO_FORCE.search(stem)
+    ]
+    return min(found)[-1] if found else None
+
+
+def _triples(
+    log: Log, title: str, kind: re.Pattern[str] = _GYRO, units: Sequence[str] = RATE_UNITS
+) -> Iterator[tuple[str, tuple[str, str, str]]]:
+    """Yield the columns of each gyro, or another `kind`, in the order x, y, z, and their name
+    without the axis; the rates of a log whose `title` names a gyro may be x, y, z.
     """
     every, weak = dict.fromkeys(log.names), []
     for name in every:
@@ -93,17 +108,17 @@ def _triples(log: Log, title: str) -> Iterator[tuple[str, tuple[str, str, str]]]
             if y not in every or z not in every:
                 continue
             stem = before + after
-            unit = _unit(log, name, RATE_UNITS)
+            unit = _unit(log, name, units)
             plain = not re.search(r"\w", stem.rpartition(".")[2])
-            is_gyro = _GYRO.search(before) or _GYRO.search(after) or (plain and _GYRO.search(title))
-            if _NO_RATES.search(stem) or unit not in (None, *RATE_UNITS):
+            is_one = kind.search(before) or kind.search(after) or (plain and kind.search(title))
+            if _NO_READINGS.search(stem) or unit not in (None, *units):
                 continue
-            if is_gyro or unit:
+            if is_one or unit:
                 yield stem, (x, y, z)
-            elif re.fullmatch(r"(.*[. _])?[gG][. _]?", before):
+            elif kind is _GYRO and re.fullmatch(r"(.*[. _])?[gG][. _]?", before):
                 weak.append((stem, (x, y, z)))
     yield from weak
-    if {"p", "q", "r"} <= {*every}:
+    if kind is _GYRO and {"p", "q", "r"} <= {*every}:
         yield "", ("p", "q", "r")
 
 

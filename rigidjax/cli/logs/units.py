@@ -15,6 +15,7 @@ UNITS = {
     "mdeg/s": 1e-3 * math.pi / 180, "mg": 9.80665e-3, "rpm": math.pi / 30,
 }  # fmt: skip
 RATE_UNITS = ("rad/s", "deg/s", "mdeg/s")
+FORCE_UNITS = ("m/s2", "g", "mg")
 TIME_UNITS = ("s", "ms", "us", "ns")
 # Each unit has the spellings in this table, in small letters; powers are without `^`, `**` or
 # raised digits.

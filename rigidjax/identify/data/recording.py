@@ -190,6 +190,31 @@ class Recording(eqx.Module):
         values = factor * np.stack(rates, axis=1)
         return cls(times, (Gyro(noise), values, np.isfinite(values).all(axis=1)))
 
+    def between(self, start: float, end: float) -> "Recording":
+        """Return the part of this recording from the time `start` to the time `end`, both in s.
+
+        Times count on; an input that is a function of time is kept whole.
+
+        **Raises:** `ValueError` as `Recording`, for fewer than two readings.
+
+        >>> record = Recording([0.0, 1.0, 2.0], (rj.identify.Gyro(0.01), np.ones((3, 3))))
+        >>> record.between(0.5, 2.0).t.shape
+        (2,)
+        """
+        t = np.asarray(self.t)
+        rows = (t >= start) & (t <= end)
+        return Recording(
+            t[rows],
+            *(
+                (one.sensor, np.asarray(one.values)[rows], one.host_mask[rows])
+                for one in self.readings
+            ),
+            inputs={
+                name: source if callable(source) else np.asarray(source)[rows]
+                for name, source in self.inputs.items()
+            },
+        )
+
     def __repr__(self) -> str:
         if not _checks.is_known(self) or np.ndim(self.t) != 1:
             return eqx.tree_pformat(self)

@@ -115,12 +115,12 @@ def require_turning(rates: np.ndarray, name: str) -> None:
         )
 
 
-def require_no_swing(rates: np.ndarray, name: str) -> None:
-    """Raise `ValueError` if the body `rates`, rad/s, go there and back about one axis, as those of
-    a free body never do.
+def swing_axis(rates: np.ndarray) -> Float[np.ndarray, " 3"] | None:
+    """Return the axis of body `rates` that go there and back about it, as those of a free body
+    never do, or `None`.
     """
     if len(rates) < 10:
-        return
+        return None
     axis = np.linalg.eigh(rates.T @ rates)[1][:, -1]
     along = rates @ axis
     across = np.linalg.norm(rates - along[:, None] * axis, axis=1)
@@ -129,8 +129,13 @@ def require_no_swing(rates: np.ndarray, name: str) -> None:
     still = (
         turning.any() and max(np.mean(across[turning] ** 2), np.mean(across**2)) < 0.04 * size**2
     )
-    if along.min() < -0.3 * size and along.max() > 0.3 * size and still:
-        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+    there_and_back = along.min() < -0.3 * size and along.max() > 0.3 * size
+    return axis * np.sign(axis[np.argmax(np.abs(axis))]) if there_and_back and still else None
+
+
+def require_no_swing(rates: np.ndarray, name: str) -> None:
+    """Raise `ValueError` if the body `rates`, rad/s, are those of a swing."""
+    if (axis := swing_axis(rates)) is not None:
         raise ValueError(
             f"{name} are those of a swing, there and back about one axis, "
             f"[{', '.join(f'{part:.3g}' for part in axis)}]: no free body turns so, and all that "

@@ -1,0 +1,73 @@
+"""Draw a record and its phases."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from rigidjax import _checks
+from rigidjax.identify.data.phases import Phase, find_phases
+from rigidjax.identify.data.recording import Recording, input_functions
+from rigidjax.plot import style
+from rigidjax.plot.style import COLOURS, LINE_STYLES, RATES, escape_formulas
+
+_SHADES = {
+    "free": COLOURS[2], "swing": COLOURS[5], "rest": "0.5", "motors": COLOURS[4],
+    "full scale": COLOURS[1], "gap": COLOURS[3],
+}  # fmt: skip
+
+
+def phases(
+    recording: Recording,
+    found: Sequence[Phase] | None = None,
+    *,
+    rate_unit: str = "rad/s",
+    title: str = "",
+    ax: Any = None,
+) -> Any:
+    """Draw the readings of each sensor and each input against time, and shade the phases.
+
+    **Arguments:** `recording` of a gyro and other sensors; `found` its phases, by default those of
+    `rigidjax.identify.find_phases`; `rate_unit` `rad/s`, `deg/s`, `rpm` or `deg/day`; `title`; `ax`
+    axes, one for each sensor and input. **Returns** the axes.
+
+    >>> t = 0.01 * np.arange(100)
+    >>> rates = np.stack([np.cos(t), np.sin(t), 0 * t], axis=1)
+    >>> record = rj.identify.Recording(t, (rj.identify.Gyro(0.01), rates))
+    >>> phases(record)[0].get_ylabel()
+    'Gyro, rad/s'
+    """
+    rate = style.unit_factor(rate_unit, RATES, "rate_unit")
+    _checks.require_instance(recording, Recording, "recording")
+    found = find_phases(recording) if found is None else found
+    t, panels = np.asarray(recording.t), []
+    for reading in recording.readings:
+        is_rate, seen = reading.sensor.unit == "rad/s", reading.host_mask
+        values = np.asarray(reading.values).reshape(t.size, -1) * (rate if is_rate else 1.0)
+        unit = rate_unit if is_rate else reading.sensor.unit
+        label = f"{type(reading.sensor).__name__}, {unit}"
+        panels.append((label, t[seen], values[seen], "xyz"))
+    for name, source in input_functions(recording).items():
+        values = np.asarray(jax.vmap(source)(recording.t)).reshape(t.size, -1)
+        panels.append((escape_formulas(name), t, values, ""))
+    count = len(panels)
+    ax = style.axes_of_shape(ax, (count,), nrows=count, sharex=True, figsize=(9.0, 2.2 * count))
+    for one, (label, times, values, names) in zip(ax, panels, strict=True):
+        for k, column in enumerate(values.T):
+            how = dict(color=COLOURS[k % 7], ls=LINE_STYLES[k % 3], lw=0.9)
+            one.plot(times, column, label=names[k : k + 1] or None, **how)
+        said = set()
+        for phase in found:
+            if (shade := _SHADES.get(phase.kind)) is not None:
+                # Each kind of phase stands once in the legend of the first axes.
+                word = phase.kind if one is ax[0] and phase.kind not in said else None
+                said.add(phase.kind)
+                one.axvspan(phase.start, phase.end, color=shade, alpha=0.25, lw=0, label=word)
+        one.set_ylabel(label)
+        one.margins(x=0)
+        one.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, handlelength=2.6)
+    ax[-1].set_xlabel("time, s")
+    if title:
+        ax[0].set_title(escape_formulas(title))
+    return ax
