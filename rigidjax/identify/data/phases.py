@@ -32,6 +32,11 @@ _CLOSE = 0.4
 # A body at rest has steadier rates and forces, rad/s and m/s², and a bias of the gyro below _BIAS.
 _STEADY, _STEADY_FORCE, _BIAS = 0.03, 0.3, 0.15
 _GRAVITY = 9.80665
+# A tensor of inertia of the trace 2 is _I0 + Σ x B, with five tensors B that have no trace.
+_I0 = 2 / 3 * np.eye(3)
+_BASIS = np.zeros((5, 3, 3))
+_BASIS[[0, 1, 2, 0, 1, 2], [0, 0, 1, 1, 2, 2], [1, 2, 2, 0, 0, 1]] = 1.0
+_BASIS[3], _BASIS[4] = np.diag([1.0, -1.0, 0.0]), np.diag([1.0, 1.0, -2.0])
 # A free flight that turns by a smaller angle, rad, says nothing of the body, nor do fewer readings.
 _LEAST_TURN, _FEWEST = 0.5, 8
 
@@ -102,9 +107,9 @@ def find_phases(recording: Recording, motors: Sequence[str] = ()) -> list[Phase]
                 f"find_phases: at rest the accelerometer reads {np.median(size):.3g} m/s², wanted "
                 "9.8: is it in another unit (g), or is gravity already taken off? take the raw one"
             )
-    masks = {"motors": _running(recording, t, motors), "free": _free(t, w, force, mean) & ~rest}
-    masks["rest"] = rest
-    masks["swing"] = _swings(t, w, ~(rest | masks["free"]))
+    # At the turning points of a large swing hardly a force acts: a swing comes before a flight.
+    masks = {"motors": _running(recording, t, motors), "swing": _swings(t, w, ~rest)}
+    masks |= {"free": _free(t, w, force, mean) & ~rest, "rest": rest}
     speed = np.linalg.norm(w, axis=1)
     angle = np.append(0.0, np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t)))
     kinds, left = np.full(t.size, "handling", dtype=object), np.ones(t.size, bool)
@@ -140,9 +145,9 @@ def _phase(kind: str, t: np.ndarray, w: np.ndarray, turned: float, by_force: boo
     elif kind == "motors":
         says = "a law of the rotors, with the speeds or commands of the motors as inputs"
     elif kind == "swing":
-        axis = swing_axis(w)
-        along = "" if axis is None else f" [{', '.join(f'{part:.2f}' for part in axis)}]"
-        says = f"the moment about the axis{along}: python -m rigidjax swing --log"
+        axis = np.linalg.eigh(w.T @ w)[1][:, -1]
+        x, y, z = np.round(axis * np.sign(axis[np.argmax(np.abs(axis))]), 2) + 0.0
+        says = f"the moment about [{x}, {y}, {z}]: python -m rigidjax swing --log"
     elif kind == "free":
         # The third difference of white noise has 20 times its variance.
         noise = np.median(np.abs(np.diff(w, 3, axis=0))) / 0.6745 / np.sqrt(20) if len(t) > 3 else 0
@@ -236,7 +241,11 @@ def _free(
         return square - 2 * (side * x).sum(-1) + (bent * x).sum(-1) < _CLOSE**2 * sizes
 
     x = np.linalg.solve(gram + ridge, side[..., None])[..., 0]
-    near = np.flatnonzero(fits(x))
+    near = fits(x)
+    if force is None:
+        moments = np.linalg.eigvalsh(_I0 + np.einsum("nk,kij->nij", x, _BASIS))
+        near &= (moments[:, 0] > 0.05) & (moments[:, 2] < 1.1)
+    near = np.flatnonzero(near)
     if not near.size:
         return np.zeros(t.size, bool)
     tried = x[near[np.linspace(0, near.size - 1, min(near.size, 300)).astype(int)]]
@@ -278,21 +287,25 @@ def _force_rows(slope: np.ndarray, w: np.ndarray, turn: np.ndarray, force: Any) 
 
 
 def _turn_rows(slope: np.ndarray, w: np.ndarray, turn: np.ndarray, force: Any) -> _Rows:
-    """Return Euler's equations of I = (2/3) 1 + Σ x B, with five tensors B that have no trace."""
-    basis = np.zeros((5, 3, 3))
-    for b, (i, j) in zip(basis, ((0, 1), (0, 2), (1, 2)), strict=False):
-        b[i, j] = b[j, i] = 1.0
-    basis[3], basis[4] = np.diag([1.0, -1.0, 0.0]), np.diag([1.0, 1.0, -2.0])
-    columns = np.einsum("kij,nj->nik", basis, slope) + turn @ np.einsum("kij,nj->nik", basis, w)
+    """Return Euler's equations of a tensor of inertia of the trace 2."""
+    columns = np.einsum("kij,nj->nik", _BASIS, slope) + turn @ np.einsum("kij,nj->nik", _BASIS, w)
     speed = np.linalg.norm(w, axis=1)
-    return _Rows(columns, -slope * 2 / 3, _UNEXPLAINED_TURN, np.full(5, _UNLIKE), speed)
+    return _Rows(columns, -slope @ _I0, _UNEXPLAINED_TURN, np.full(5, _UNLIKE), speed)
 
 
 def _swings(t: np.ndarray, w: np.ndarray, left: np.ndarray) -> Bool[np.ndarray, " n"]:
-    """Return where the rates go there and back about one axis, in windows of 2 s."""
+    """Return where the rates go there and back about one axis, in windows of 2 s, for two periods
+    at least.
+    """
     out = np.zeros(t.size, bool)
-    for start in np.arange(t[0], t[-1] - 1.9, 0.5):
-        rows = slice(*np.searchsorted(t, [start, start + 2.0]))
-        if left[rows].all() and swing_axis(w[rows]) is not None:
-            out[rows] = True
+    for i, j in _runs(left):
+        last = t[j] - 2.0
+        for start in np.append(np.arange(t[i], last, 0.5), last) if last > t[i] else ():
+            rows = slice(*np.searchsorted(t, [start, start + 2.0 + 1e-9]))
+            out[rows] |= swing_axis(w[rows]) is not None
+    for i, j in _runs(out):
+        axis = np.linalg.eigh(w[i : j + 1].T @ w[i : j + 1])[1][:, -1]
+        along = w[i : j + 1] @ axis
+        along = along[np.abs(along) > 0.2 * np.abs(along).max()]
+        out[i : j + 1] &= np.count_nonzero(np.diff(np.sign(along))) > 3
     return out
