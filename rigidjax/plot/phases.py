@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax.identify.data.phases import Phase, find_phases
+from rigidjax.identify.data.phases import Phase
 from rigidjax.identify.data.recording import Recording, input_functions
 from rigidjax.plot import style
 from rigidjax.plot.style import COLOURS, LINE_STYLES, RATES, escape_formulas
@@ -20,7 +20,7 @@ _SHADES = {
 
 def phases(
     recording: Recording,
-    found: Sequence[Phase] | None = None,
+    found: Sequence[Phase],
     *,
     rate_unit: str = "rad/s",
     title: str = "",
@@ -28,19 +28,18 @@ def phases(
 ) -> Any:
     """Draw the readings of each sensor and each input against time, and shade the phases.
 
-    **Arguments:** `recording` of a gyro and other sensors; `found` its phases, by default those of
-    `rigidjax.identify.find_phases`; `rate_unit` `rad/s`, `deg/s`, `rpm` or `deg/day`; `title`; `ax`
-    axes, one for each sensor and input. **Returns** the axes.
+    **Arguments:** `recording` of a gyro and other sensors; `found` its phases, as
+    `rigidjax.identify.find_phases` returns them; `rate_unit` `rad/s`, `deg/s`, `rpm` or `deg/day`;
+    `title`; `ax` axes, one for each sensor and input. **Returns** the axes.
 
     >>> t = 0.01 * np.arange(100)
     >>> rates = np.stack([np.cos(t), np.sin(t), 0 * t], axis=1)
     >>> record = rj.identify.Recording(t, (rj.identify.Gyro(0.01), rates))
-    >>> phases(record)[0].get_ylabel()
+    >>> phases(record, rj.identify.find_phases(record))[0].get_ylabel()
     'Gyro, rad/s'
     """
     rate = style.unit_factor(rate_unit, RATES, "rate_unit")
     _checks.require_instance(recording, Recording, "recording")
-    found = find_phases(recording) if found is None else found
     t, panels = np.asarray(recording.t), []
     for reading in recording.readings:
         is_rate, seen = reading.sensor.unit == "rad/s", reading.host_mask

@@ -50,6 +50,22 @@ row(
     **HOST,
 )
 leave_out("a table of another library, by names", "identify.Recording.from_frame")
+
+
+def wobble(inputs: dict | None = None) -> rj.identify.Recording:
+    """Of a disc in the air, for a second."""
+    t = 0.02 * np.arange(50)
+    rates = np.stack([np.cos(4 * t), np.sin(4 * t), 5.0 + 0 * t], axis=1)
+    return rj.identify.Recording(t, (rj.identify.Gyro(0.1), rates), inputs=inputs)
+
+
+row(
+    "identify.find_phases",
+    lambda: dict(recording=wobble({"m1": np.zeros(50)}), motors=["m1"]),
+    groups=("stranger",),
+    **HOST,
+)
+leave_out("find_phases makes it", "identify.Phase")
 row(
     "identify.simulate_readings",
     lambda: dict(
@@ -316,6 +332,15 @@ row(
     "plot.residuals",
     lambda: dict(fit_result=s.found(), index=0, time_unit="s"),
     groups=KINDS,
+    transforms=(),
+)
+row(
+    "plot.phases",
+    lambda: dict(recording=wobble(), rate_unit="rad/s"),
+    run=lambda recording, **how: rj.plot.phases(
+        recording, rj.identify.find_phases(wobble()), **how
+    ),
+    groups=("stranger",),
     transforms=(),
 )
 row(

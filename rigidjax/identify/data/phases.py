@@ -77,8 +77,9 @@ def find_phases(recording: Recording, motors: Sequence[str] = ()) -> list[Phase]
     - `motors`: the names of inputs of the recording that are speeds or commands of motors: a motor
       runs while its input is above its least value by more than a twentieth of its range.
 
-    **Raises:** `ValueError` without rates, for an accelerometer that does not read 9.8 m/s² at
-    rest, and for a motor that is no input.
+    **Raises:** `TypeError` for no recording, or a traced one, and for motors that are no sequence
+    of names; `ValueError` without rates, for an accelerometer that does not read 9.8 m/s² at rest,
+    and for a motor that is no input.
 
     >>> t, up = 0.01 * np.arange(100), np.tile([0.0, 0.0, 9.8], (100, 1))
     >>> up[30:80] = 0.0
@@ -88,8 +89,12 @@ def find_phases(recording: Recording, motors: Sequence[str] = ()) -> list[Phase]
     >>> [phase.kind for phase in find_phases(record)]
     ['handling', 'free', 'handling']
     """
-    samples = rates(_checks.require_instance(recording, Recording, "recording"))
-    t, w = (np.asarray(one, float) for one in samples)
+    _checks.require_instance(recording, Recording, "recording")
+    if not _checks.is_known(recording):
+        raise TypeError("find_phases: wanted a known recording, got a traced one; call it outside")
+    if not isinstance(motors, Sequence) or isinstance(motors, str):
+        raise TypeError(f"motors: wanted a sequence of names, got {type(motors).__name__}")
+    t, w = (np.asarray(one, float) for one in rates(recording))
     if t.size < _FEWEST:
         raise ValueError(f"find_phases: wanted {_FEWEST} readings of a gyro at least, got {t.size}")
     step = float(np.median(np.diff(t)))

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from rigidjax.cli.logs.layouts import USUAL, imu_columns
+from rigidjax.cli.logs.layouts import USUAL, accelerometer_columns, imu_columns
+from rigidjax.cli.logs.log import Log
 from rigidjax.identify import read_table
 
 PHYPHOX = '"Time (s)","{0} x (rad/s)","{0} y (rad/s)","{0} z (rad/s)","{1} (rad/s)"\n'
@@ -28,3 +29,27 @@ def test_other_texts_have_the_usual_columns(tmp_path, text):
     path = tmp_path / "log.csv"
     path.write_text(text)
     assert imu_columns(path).columns == USUAL.columns
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        ("t,wx,wy,wz,ax,ay,az", "ax,ay,az"),
+        ("t,wx,wy,wz,alx,aly,alz", None),
+        ("time,gyro.x,gyro.y,gyro.z,acc.x,acc.y,acc.z", "acc.x,acc.y,acc.z"),
+        ("t,gyroADC[0],gyroADC[1],gyroADC[2],accSmooth[0],accSmooth[1],accSmooth[2]",
+         "accSmooth[0],accSmooth[1],accSmooth[2]"),
+        ("t,/imu.linear_acceleration.x,/imu.linear_acceleration.y,/imu.linear_acceleration.z",
+         "/imu.linear_acceleration.x,/imu.linear_acceleration.y,/imu.linear_acceleration.z"),
+        ("t,Linear Acceleration x (m/s^2),Linear Acceleration y (m/s^2),"
+         "Linear Acceleration z (m/s^2)", None),
+        ("t,userAccelerationX(G),userAccelerationY(G),userAccelerationZ(G)", None),
+        ("t,Beschl x [mg],Beschl y [mg],Beschl z [mg]", "Beschl x [mg],Beschl y [mg],Beschl z [mg]"),
+        ("t,accuracy x,accuracy y,accuracy z", None),
+        ("t,acc_raw_x,acc_raw_y,acc_raw_z,acc_x,acc_y,acc_z", "acc_x,acc_y,acc_z"),
+    ],
+)  # fmt: skip
+def test_the_specific_force_is_found_by_names_and_units(names, found):
+    log = Log(names.split(","), dict)
+    columns = accelerometer_columns(log, "log")
+    assert columns == (None if found is None else tuple(found.split(",")))
