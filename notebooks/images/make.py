@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import matplotlib
+import numpy as np
 from PIL import Image
 
 matplotlib.use("Agg")
@@ -137,6 +138,25 @@ def terms():
     save(figure, "terms.png")
 
 
+def look():
+    """Draw the phases of the guide's page on identification: two throws, between rests."""
+    box, rng = rj.Inertia.from_principal(2.0e-4, 3.0e-4, 4.0e-4), np.random.default_rng(0)
+    sensors = identify.Gyro(0.03), identify.Accelerometer(0.2, place=[0.02, 0.0, 0.01])
+    up, s = np.array([0.0, 0.0, 9.81]), np.linspace(0.0, 1.0, 60)[:, None]
+    rest, push = np.zeros((200, 3)), 1 + 1.5 * np.sin(np.pi * s)
+    rates, forces = [rest], [rest + up]
+    for key, (start, count) in enumerate((([8.0, 1.0, 2.0], 160), ([1.0, 9.0, -1.0], 140))):
+        how, t = dict(key=jax.random.key(key)), 0.005 * jnp.arange(count)
+        w, f = identify.simulate_readings(sensors, box, rj.Spin(start), t, **how)
+        rates += [s * w[0], w, s[::-1] * w[-1], rest]
+        forces += [push * up, f, push[::-1] * up, rest + up]
+    w, f = np.concatenate(rates), np.concatenate(forces)
+    w, f = w + 0.02 * rng.normal(size=w.shape), f + 0.1 * rng.normal(size=f.shape)
+    readings = zip(sensors, (w, f), strict=True)
+    record = identify.Recording(0.005 * np.arange(len(w)), *readings)
+    save(rj.plot.phases(record, identify.find_phases(record))[0].figure, "look.png")
+
+
 def predict():
     """Draw the prediction of the guide's page on predictions, from the same readings."""
     truth, first = rj.Inertia.from_principal(1.0, 1.6, 2.2), rj.Spin([1.0, 0.5, 1.2])
@@ -235,5 +255,6 @@ def workprecision():
 
 
 if __name__ == "__main__":
-    for draw in (frames, flip, start, fit, swing, terms, predict, simulators, workprecision):
+    drawn = (frames, flip, start, fit, swing, terms, look, predict, simulators, workprecision)
+    for draw in drawn:
         draw()

@@ -489,7 +489,7 @@ def _read_logs(options: argparse.Namespace) -> _Read:
         if others or set(options.free) - {"bias"}:
             what = f"--{others[0]}" if others else "--free drag, --free delay"
             raise LogError(f"{what}: not together with --wrench, whose motion is the logged one")
-        how = dict(
+        how: dict[str, Any] = dict(
             gravity=options.gravity or [0.0, 0.0, -9.81],
             time=options.time or "t",
             window=options.window,

@@ -4,11 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from rigidjax import _checks
-from rigidjax.identify.data.phases import Phase
-from rigidjax.identify.data.recording import Recording, input_functions
 from rigidjax.plot import style
 from rigidjax.plot.style import COLOURS, LINE_STYLES, RATES, escape_formulas
 
@@ -19,8 +17,8 @@ _SHADES = {
 
 
 def phases(
-    recording: Recording,
-    found: Sequence[Phase],
+    recording: Any,
+    found: Sequence[Any],
     *,
     rate_unit: str = "rad/s",
     title: str = "",
@@ -28,7 +26,7 @@ def phases(
 ) -> Any:
     """Draw the readings of each sensor and each input against time, and shade the phases.
 
-    **Arguments:** `recording` of a gyro and other sensors; `found` its phases, as
+    **Arguments:** `recording` a `rigidjax.identify.Recording`; `found` its phases, as
     `rigidjax.identify.find_phases` returns them; `rate_unit` `rad/s`, `deg/s`, `rpm` or `deg/day`;
     `title`; `ax` axes, one for each sensor and input. **Returns** the axes.
 
@@ -39,7 +37,8 @@ def phases(
     'Gyro, rad/s'
     """
     rate = style.unit_factor(rate_unit, RATES, "rate_unit")
-    _checks.require_instance(recording, Recording, "recording")
+    if isinstance(recording, type) or not hasattr(recording, "readings"):
+        raise TypeError(f"recording: wanted a Recording, got {type(recording).__name__}")
     t, panels = np.asarray(recording.t), []
     for reading in recording.readings:
         is_rate, seen = reading.sensor.unit == "rad/s", reading.host_mask
@@ -47,9 +46,9 @@ def phases(
         unit = rate_unit if is_rate else reading.sensor.unit
         label = f"{type(reading.sensor).__name__}, {unit}"
         panels.append((label, t[seen], values[seen], "xyz"))
-    for name, source in input_functions(recording).items():
-        values = np.asarray(jax.vmap(source)(recording.t)).reshape(t.size, -1)
-        panels.append((escape_formulas(name), t, values, ""))
+    for name, source in recording.inputs.items():
+        values = jax.vmap(source)(jnp.asarray(t)) if callable(source) else source
+        panels.append((escape_formulas(name), t, np.asarray(values).reshape(t.size, -1), ""))
     count = len(panels)
     ax = style.axes_of_shape(ax, (count,), nrows=count, sharex=True, figsize=(9.0, 2.2 * count))
     for one, (label, times, values, names) in zip(ax, panels, strict=True):

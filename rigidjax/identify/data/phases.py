@@ -97,17 +97,14 @@ def find_phases(recording: Recording, motors: Sequence[str] = ()) -> list[Phase]
     t, w = (np.asarray(one, float) for one in rates(recording))
     if t.size < _FEWEST:
         raise ValueError(f"find_phases: wanted {_FEWEST} readings of a gyro at least, got {t.size}")
-    step = float(np.median(np.diff(t)))
+    step, force = float(np.median(np.diff(t))), _force(recording, t)
     gaps = np.diff(t) > max(5 * step, 0.05)
-    mean = _means(round(_MEAN / step))
-    long = _means(round(0.3 / step))
-    force = _force(recording, t)
-    steady = _scatter(mean(w), long) < _STEADY
-    rest = steady & (np.linalg.norm(long(w), axis=1) < _BIAS)
+    mean, long = _means(round(_MEAN / step)), _means(round(0.3 / step))
+    rest = (_scatter(mean(w), long) < _STEADY) & (np.linalg.norm(long(w), axis=1) < _BIAS)
     if force is not None:
         rest &= _scatter(mean(force), long) < _STEADY_FORCE
         size = np.linalg.norm(force[rest], axis=1)
-        if rest.mean() * t.size > 10 and not 0.8 < np.median(size) / _GRAVITY < 1.2:
+        if size.size > 10 and not 0.8 < np.median(size) / _GRAVITY < 1.2:
             raise ValueError(
                 f"find_phases: at rest the accelerometer reads {np.median(size):.3g} m/s², wanted "
                 "9.8: is it in another unit (g), or is gravity already taken off? take the raw one"
@@ -146,7 +143,7 @@ def _phase(kind: str, t: np.ndarray, w: np.ndarray, turned: float, by_force: boo
     says, usable = "nothing: the force of what holds the body is not known", False
     if kind == "rest":
         x, y, z = w.mean(axis=0)
-        says = f"the bias of the gyro: {x:.4f}, {y:.4f}, {z:.4f} rad/s"
+        says = f"the mean rate, the bias of a gyro: {x:.4f}, {y:.4f}, {z:.4f} rad/s"
     elif kind == "motors":
         says = "a law of the rotors, with the speeds or commands of the motors as inputs"
     elif kind == "swing":
@@ -156,16 +153,16 @@ def _phase(kind: str, t: np.ndarray, w: np.ndarray, turned: float, by_force: boo
     elif kind == "free":
         # The third difference of white noise has 20 times its variance.
         noise = np.median(np.abs(np.diff(w, 3, axis=0))) / 0.6745 / np.sqrt(20) if len(t) > 3 else 0
-        says = "the ratios of the moments; with a wheel or a known torque the moments"
-        usable = True
         if len(t) < _FEWEST:
-            says, usable = f"nothing: {len(t)} readings are too few", False
+            says = f"nothing: {len(t)} readings are too few"
         elif turned < _LEAST_TURN:
-            says, usable = f"nothing: it turns by {turned:.2g} rad only", False
+            says = f"nothing: it turns by {turned:.2g} rad only"
         elif np.sqrt(np.mean(w**2)) < 5 * noise:
-            says, usable = "nothing: the rates are hardly above their noise", False
-        elif not by_force:
-            says += " (by the gyro alone: was it in the air?)"
+            says = "nothing: the rates are hardly above their noise"
+        else:
+            says = "the ratios of the moments; with a wheel or a known torque the moments"
+            says += "" if by_force else " (by the gyro alone: was it in the air?)"
+            usable = True
     return Phase(kind, float(t[0]), float(t[-1]), turned, says, usable)
 
 
