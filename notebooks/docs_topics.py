@@ -103,6 +103,6 @@ TOPICS = {
         "Unknown torques: filter and smoother": "Walk first_belief filter smooth step",
         "Likelihood, simulated motions": "log_likelihood sample",
         "Posterior": "LogDensity refit Refit posterior Posterior Nuts",
-        "Log files": "read_table",
+        "Log files": "read_table find_phases Phase",
     },
 }

@@ -52,6 +52,11 @@ class Phase(NamedTuple):
     - `turned`: the angle ∫ |Ω| dt, rad.
     - `says`: what can be fitted from it, in one sentence.
     - `is_usable`: whether it is a free flight from which a body can be fitted.
+
+    >>> wobble = [[np.cos(k), np.sin(k), 5.0] for k in 0.08 * np.arange(50)]
+    >>> record = Recording(0.02 * np.arange(50), (rj.identify.Gyro(0.01), wobble))
+    >>> [(phase.kind, phase.is_usable) for phase in find_phases(record)]
+    [('free', True)]
     """
 
     kind: str
@@ -101,14 +106,18 @@ def find_phases(recording: Recording, motors: Sequence[str] = ()) -> list[Phase]
     gaps = np.diff(t) > max(5 * step, 0.05)
     mean, long = _means(round(_MEAN / step)), _means(round(0.3 / step))
     rest = (_scatter(mean(w), long) < _STEADY) & (np.linalg.norm(long(w), axis=1) < _BIAS)
+    calm = np.linalg.norm(mean(w), axis=1) < _BIAS
     if force is not None:
         rest &= _scatter(mean(force), long) < _STEADY_FORCE
+        calm &= np.abs(np.linalg.norm(mean(force), axis=1) - _GRAVITY) < 0.1 * _GRAVITY
         size = np.linalg.norm(force[rest], axis=1)
         if size.size > 10 and not 0.8 < np.median(size) / _GRAVITY < 1.2:
             raise ValueError(
                 f"find_phases: at rest the accelerometer reads {np.median(size):.3g} m/s², wanted "
                 "9.8: is it in another unit (g), or is gravity already taken off? take the raw one"
             )
+    # The windows have lost the ends of a rest.
+    rest |= calm & (long(rest.astype(float)) > 1e-9)
     # At the turning points of a large swing hardly a force acts: a swing comes before a flight.
     masks = {"motors": _running(recording, t, motors), "swing": _swings(t, w, ~rest)}
     masks |= {"free": _free(t, w, force, mean) & ~rest, "rest": rest}
