@@ -109,8 +109,6 @@ def _dispatch(
         jax.config.update("jax_enable_compilation_cache", False)
     elif owns_process:
         _keep_programs()
-    if options.command == "look":
-        return _run_look(options)
     return _run_demo(options) if options.demo else _run_logs(options)
 
 
@@ -368,6 +366,8 @@ def _columns(
     The sensors are those of `--sensor`, else one gyro, which `--unit`, `--noise` and `--limit`
     describe; **raises** `LogError` for both together, or one that is not positive.
     """
+    if options.columns and options.time:
+        raise LogError("--time: not together with --columns, whose first name is the time column")
     time, *rates = options.columns or ("", "", "", "")
     time, rate = options.time or time, options.rate
     unit, time_unit = options.unit, options.time_unit
@@ -465,21 +465,12 @@ def _throws(path: str, seen: _Seen) -> list[rj.identify.Recording]:
     return [seen.record.between(one.start, one.end) for one in used]
 
 
-class _Read(NamedTuple):
-    """Hold the sensors of the first log, the recordings of all logs, their names, and the model."""
-
-    channels: list[spec.Channel]
-    records: list[rj.identify.Recording]
-    names: list[str]
-    model: rj.identify.Model
-
-
-def _read_logs(options: argparse.Namespace) -> _Read:
-    """Return what the logs hold, and the model that the options describe; raise `LogError` as
-    `read_log`.
+def _read_logs(
+    options: argparse.Namespace,
+) -> tuple[list[spec.Channel], list[rj.identify.Recording], list[str], rj.identify.Model]:
+    """Return the sensors of the first log, the recordings of all logs, their names, and the model
+    that the options describe; raise `LogError` as `read_log`.
     """
-    if options.columns and options.time:
-        raise LogError("--time: not together with --columns, whose first name is the time column")
     alone = [name for name in ("pose", "motion", "gravity") if getattr(options, name)]
     if alone and not options.wrench:
         raise LogError(f"--{alone[0]}: wanted a --wrench beside it, the columns of the readings")
@@ -499,7 +490,7 @@ def _read_logs(options: argparse.Namespace) -> _Read:
         columns = options.wrench, pose, options.motion
         held = [spec.read_held(path, *columns, **how) for path in options.logs]
         names = [_checks.escape_controls(Path(path).name) for path in options.logs]
-        return _Read([], held, names, spec.model_of_held(held, options.free, options.loss))
+        return [], held, names, spec.model_of_held(held, options.free, options.loss)
     wheels = [spec.parse_wheel(text) for text in options.wheel]
     if options.model in ("tensor", "principal") and not wheels:
         words = "free motion shows ratios only; a scale needs a --wheel"
@@ -514,19 +505,17 @@ def _read_logs(options: argparse.Namespace) -> _Read:
         name = _checks.escape_controls(Path(path).name)
         names += [f"{name}, {one.t[0]:.3f} s" if options.throws else name for one in mine]
     how = dict(typical_moment=options.typical, wheels=wheels, free=options.free, loss=options.loss)
-    return _Read(of_first or [], records, names, spec.model_of(records, options.model, **how))
+    return of_first or [], records, names, spec.model_of(records, options.model, **how)
 
 
-def _run_look(options: argparse.Namespace) -> int:
+def _look_at(options: argparse.Namespace) -> list[_Seen]:
+    """Return what is read of each log."""
+    wheels = [spec.parse_wheel(text) for text in options.wheel]
+    return [_read_log(path, options, wheels) for path in options.logs]
+
+
+def _show_phases(options: argparse.Namespace, seen: Sequence[_Seen]) -> int:
     """Print the phases of each log, draw them, and return the exit code."""
-    try:
-        with _log_warnings(options.strict):
-            wheels = [spec.parse_wheel(text) for text in options.wheel]
-            seen = [_read_log(path, options, wheels) for path in options.logs]
-    except ValueError as error:
-        return _print_error(error)
-    except LogWarning as warning:
-        return _print_error(f"{warning} (--strict)")
     for path, (channels, record, phases) in zip(options.logs, seen, strict=True):
         span = float(record.t[-1] - record.t[0])
         print()
@@ -568,16 +557,20 @@ def _log_warnings(strict: bool) -> Iterator[None]:
 
 
 def _run_logs(options: argparse.Namespace) -> int:
-    """Fit the model to the logs that the options name, print and write the report, and return the
-    exit code.
+    """Fit the model to the logs that the options name, print and write the report, or show the
+    phases of the logs, and return the exit code.
     """
+    looks = options.command == "look"
     try:
         with _log_warnings(options.strict):
-            channels, records, names, model = _read_logs(options)
+            read: Any = (_look_at if looks else _read_logs)(options)
     except ValueError as error:
         return _print_error(error)
     except LogWarning as warning:
         return _print_error(f"{warning} (--strict)")
+    if looks:
+        return _show_phases(options, read)
+    channels, records, names, model = read
     for path, record in zip(names, records, strict=True):
         gaps = sum(int((~reading.host_mask).sum()) for reading in record.readings) + record.dropped
         words = f", {gaps} gap{'s' if gaps > 1 else ''}" if gaps else ""
