@@ -422,7 +422,7 @@ def _read_log(path: str, options: argparse.Namespace, wheels: list[spec.WheelCol
     channels, times = _columns(path, log, options)
     asked, more = options.throws or options.command == "look", []
     if asked and not any(one.kind == "accelerometer" for one in channels):
-        more = spec.accelerometer(path, log, channels[0].columns[0])
+        more, log = spec.accelerometer(path, log, channels[0].columns[0], times["time"])
         for one in more:
             _print_line(f"{path}: specific force {', '.join(one.columns)} in {one.unit}")
     how: Any = dict(window=options.window, wheels=wheels, free=options.free, **times)
@@ -518,12 +518,12 @@ def _show_phases(options: argparse.Namespace, seen: Sequence[_Seen]) -> int:
     """Print the phases of each log, draw them, and return the exit code."""
     for path, (channels, record, phases) in zip(options.logs, seen, strict=True):
         span = float(record.t[-1] - record.t[0])
-        print()
+        _print_line("")
         _print_line(f"{path}: {record.t.size} samples over {span:.4g} s")
-        print(f"{'from':>10} {'to, s':>10}  {'phase':<10} {'turned':>10}  what can be fitted")
+        _print_line(f"{'from':>10} {'to, s':>10}  {'phase':<10} {'turned':>10}  what can be fitted")
         for p in phases:
             turned = f"{p.turned:6.1f} rad" if p.turned else ""
-            print(f"{p.start:10.3f} {p.end:10.3f}  {p.kind:<10} {turned:>10}  {p.says}")
+            _print_line(f"{p.start:10.3f} {p.end:10.3f}  {p.kind:<10} {turned:>10}  {p.says}")
         if any(p.is_usable for p in phases):
             _print_line(f"a fit of the free flights: python -m rigidjax identify {path} --throws")
         if options.figure is not None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from rigidjax.body.inertia import MassProperties
 from rigidjax.cli.logs.errors import LogError, warn
-from rigidjax.cli.logs.layouts import accelerometer_columns
+from rigidjax.cli.logs.layouts import accelerometer_columns, time_column
 from rigidjax.cli.logs.log import Log
 from rigidjax.cli.logs.table import full_names, open_log, read_columns
 from rigidjax.cli.logs.times import (
@@ -139,27 +139,42 @@ def parse_channel(text: str) -> Channel:
     return Channel(kind, columns, unit, noise_of_axes(noise, f"sensor {text!r}"))
 
 
-def accelerometer(path: str | Path, log: Log, rate: str) -> list[Channel]:
-    """Return the accelerometer of a log beside the column of a `rate`, if there is one.
+def accelerometer(path: str | Path, log: Log, rate: str, time: str) -> tuple[list[Channel], Log]:
+    """Return the accelerometer of a log, if it has one, and the log, from which it is read at the
+    times of the columns `rate` and `time`.
 
-    It **warns** of one that has other times. Readings of 0.8 to 1.2 in most rows, without a unit,
+    It **warns** of one that cannot be read so. Readings of 0.8 to 1.2 in most rows, without a unit,
     are in g.
     """
     names = accelerometer_columns(log, Path(path).stem)
     if names is None:
-        return []
-    channel = Channel("accelerometer", names, None, None)
+        return [], log
     try:
-        table = read_columns(Path(path), log, [rate, *names])
+        own = time_column(path, log, names[0])[0]
+        apart = bool(own and time) and own != full_names(Path(path), log, [time])[0]
+        table = read_columns(Path(path), log, [own if apart else rate, *names])
         size = np.nanmedian(np.linalg.norm([table[name] for name in names], axis=0))
-        unit = unit_of_channel(path, log, channel)
+        unit = unit_of_channel(path, log, Channel("accelerometer", names, None, None))
+        if apart:
+            # The tables of a phone's app have times of their own, by one clock.
+            at, good = read_columns(Path(path), log, [time])[time], increasing(table[own])
+            there, ends = table[own][good], (np.nan, np.nan)
+            moved = {name: np.interp(at, there, table[name][good], *ends) for name in names}
+            read = log.read
+
+            def read_at(columns: Sequence[str]) -> dict[str, Any]:
+                """Return the columns, those of the accelerometer at the times of the rates."""
+                others = read([name for name in columns if name not in moved])
+                return {**others, **{name: moved[name] for name in columns if name in moved}}
+
+            log = log._replace(read=read_at)
     except LogError as error:
         warn(f"{path}: {', '.join(names)} are not read beside the rates: {error}")
-        return []
+        return [], log
     if not (_units_of_log(path, log, names) or unit_in_name(names[0], FORCE_UNITS)):
         low, high = 0.8 * UNITS["g"], 1.2 * UNITS["g"]
         unit = next((u for u in FORCE_UNITS[1:] if low < size * UNITS[u] < high), unit)
-    return [Channel("accelerometer", names, unit, None)]
+    return [Channel("accelerometer", names, unit, None)], log
 
 
 def _units(kind: str) -> tuple[str, ...]:

@@ -151,8 +151,8 @@ def _phase(kind: str, t: np.ndarray, w: np.ndarray, turned: float, by_force: boo
     """Return a phase with the words on it."""
     says, usable = "nothing: the force of what holds the body is not known", False
     if kind == "rest":
-        x, y, z = w.mean(axis=0)
-        says = f"the mean rate, the bias of a gyro: {x:.4f}, {y:.4f}, {z:.4f} rad/s"
+        x, y, z = np.median(w, axis=0)
+        says = f"the rate, which is the bias of a gyro: {x:.4f}, {y:.4f}, {z:.4f} rad/s"
     elif kind == "motors":
         says = "a law of the rotors, with the speeds or commands of the motors as inputs"
     elif kind == "swing":
