@@ -449,13 +449,14 @@ def _read_log(path: str, options: argparse.Namespace, wheels: list[spec.WheelCol
 
 
 def _throws(path: str, seen: _Seen) -> list[rj.identify.Recording]:
-    """Return the free flights of a log from which a body can be fitted, and say which they are;
-    **warn** of those that are left out, and raise `LogError` if there is none.
+    """Return the free flights of a log from which a body can be fitted, and print all and what
+    they say; raise `LogError` if there is none.
     """
     flights = [phase for phase in seen.phases if phase.kind == "free"]
     for one in flights:
         words = f"{path}: free flight {one.start:.3f} … {one.end:.3f} s"
-        _print_line(words if one.is_usable else f"{words} is left out; it says {one.says}")
+        left_out = "" if one.is_usable else " is left out"
+        _print_line(f"{words}{left_out}; it says {one.says}")
     used = [phase for phase in flights if phase.is_usable]
     if not used:
         raise LogError(
