@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import rigidjax as rj
@@ -463,7 +464,16 @@ def _throws(path: str, seen: _Seen) -> list[rj.identify.Recording]:
             f"{path}: no free flight from which a body can be fitted; what is in it says: "
             "python -m rigidjax look"
         )
-    return [seen.record.between(one.start, one.end) for one in used]
+    record, rests = seen.record, [phase for phase in seen.phases if phase.kind == "rest"]
+    if rests and isinstance(record.readings[0].sensor, rj.identify.Gyro):
+        t, rates = (np.asarray(x) for x in (record.t, record.readings[0].values))
+        still = np.any([(one.start <= t) & (t <= one.end) for one in rests], axis=0)
+        bias = rates[still & record.readings[0].host_mask].mean(axis=0)
+        words = ", ".join(f"{rate:.4f}" for rate in bias)
+        _print_line(f"{path}: the bias of the gyro is its rate at rest, {words} rad/s")
+        gyro = dataclasses.replace(record.readings[0].sensor, bias=jnp.asarray(bias))
+        record = eqx.tree_at(lambda r: r.readings[0].sensor, record, gyro)
+    return [record.between(one.start, one.end) for one in used]
 
 
 def _read_logs(

@@ -526,7 +526,7 @@ def _parameters(
     """Return the parameters beside the body and its motion: biases, places of accelerometers, the
     drag, and the delays of wheels.
 
-    A bias is free if the sensor has one; the drag and the delays are free by their words in `free`.
+    Biases, the drag and the delays are free by their words in `free`.
     """
 
     def of_sensor(index: int, name: str) -> Callable[[Scene], Any]:
@@ -540,7 +540,7 @@ def _parameters(
     for index, (sensor, kind) in enumerate(zip(sensors, kinds, strict=True)):
         many = kinds.count(kind) > 1
         name = f"{kind} {kinds[: index + 1].count(kind)}" if many else kind
-        if getattr(sensor, "bias", None) is not None:
+        if "bias" in free and getattr(sensor, "bias", None) is not None:
             size = 0.05 if isinstance(sensor, Gyro) else 0.5
             items.append(Free(of_sensor(index, "bias"), f"{name} bias", scale=size, each=True))
         if isinstance(sensor, Accelerometer):

@@ -124,7 +124,11 @@ def test_the_free_flights_are_the_recordings_of_one_fit(folder, capsys, monkeypa
     for one, (start, end) in zip(model.recordings, log.free, strict=True):
         assert [type(sensor).__name__ for sensor in one.sensors] == ["Gyro"]
         assert start - 0.005 < one.t[0] < start + 0.02 and end - 0.02 < one.t[-1] < end + 0.005
-    assert capsys.readouterr().out.count("free flight") == 3
+    out = capsys.readouterr().out
+    assert out.count("free flight") == 3 and "the bias of the gyro is its rate at rest" in out
+    bias = np.asarray(model.recordings[0].sensors[0].bias)
+    still = (log.t[:, None] > log.rest[:, 0] + 0.05) & (log.t[:, None] < log.rest[:, 1] - 0.05)
+    np.testing.assert_allclose(bias, log.rates[still.any(axis=1)].mean(axis=0), atol=1e-3)
     # Cut to a tenth of a second, the first flight says nothing of the body.
     window = ["--window", str(log.free[0, 0] + 0.01), str(log.free[0, 0] + 0.13)]
     assert main(["identify", "log.csv", "--throws", *window]) == 2
