@@ -137,10 +137,7 @@ def write_inertials(path: str | Path, bodies: Mapping[str, Body], source: str | 
     file = open_file(source, "source")
     for name, body in bodies.items():
         _checks.require_unbatched_instance(body, (MassProperties, Inertia), f"bodies[{name!r}]")
-        try:
-            file = _parse(file.path, file.with_body(file.named(name), body))
-        except ValueError as error:
-            raise ValueError(f"{source}: {error}") from None
+        file = _parse(file.path, file.with_body(file.named(name), body))
     path.write_bytes(file.text)
 
 
@@ -166,14 +163,15 @@ class File(NamedTuple):
     places: dict[Tree.Element, int]  # where in the text each element begins
 
     def named(self, name: str | None) -> str:
-        """Return the name of a body, by default of the only one; raise `ValueError` for no such."""
+        """Return the `name`, or that of the only body; raise `ValueError` if there is none."""
         inertial = [one for one in self.nodes if self.has_inertia(one)] or list(self.nodes)
         if name is None and len(inertial) == 1:
             return inertial[0]
         if name in self.nodes:
             return name
         there = ", ".join(self.nodes) or "none (in TOML and JSON a body has a mass and a J)"
-        raise ValueError(f"no body {name!r}; there are {there}")
+        wanted = "wanted the name of a body" if name is None else f"no body {name!r}"
+        raise ValueError(f"{self.path}: {wanted}; there are {there}")
 
     def has_inertia(self, name: str) -> bool:
         """Return whether the file has an inertia of a body."""
@@ -218,9 +216,9 @@ class File(NamedTuple):
             old = self.stated(name)
         except ValueError as error:
             if isinstance(body, Inertia):
-                words = f"body {name!r}: {error}; give MassProperties: an Inertia has no mass"
-                raise ValueError(words) from None
-        new = _completed(name, body, old)
+                words = "its mass must stand in the file, since an Inertia has none"
+                raise ValueError(f"{self.path}: body {name!r}: {error}; {words}") from None
+        new = _completed(f"{self.path}: body {name!r}", body, old)
         if isinstance(node, dict):
             return self._with_table(name, new, old)
         inertial, tags, children = node.find("inertial"), {}, b""
@@ -251,7 +249,7 @@ class File(NamedTuple):
         """Return the start tag of an element as it is written."""
         found = _START_TAG.match(self.text, self.places[element])
         if found is None:
-            raise ValueError("wanted a file in UTF-8, to change numbers in it")
+            raise ValueError(f"{self.path}: wanted a file in UTF-8, to change numbers in it")
         return found[0]
 
     def _with_table(self, name: str, new: Stated, old: Stated) -> bytes:
@@ -266,10 +264,13 @@ class File(NamedTuple):
             elif key is not None and np.shape(self.nodes[name][key]) == (3,) != np.shape(numbers):
                 if (numbers - np.diag(np.diag(numbers))).any():
                     words = "has three moments: no place for products of inertia; give it (3, 3)"
-                    raise ValueError(f"body {name!r}: {key} {words}")
+                    raise ValueError(f"{self.path}: body {name!r}: {key} {words}")
                 numbers = np.diag(numbers)
             if key is not None:
                 text = _replaced(text, load, name, key, numbers)
+                if text is None:
+                    words = "wanted plain numbers, to change them in the text"
+                    raise ValueError(f"{self.path}: body {name!r}: {key}: {words}")
         return text.encode()
 
 
@@ -452,7 +453,7 @@ def _text(numbers: Any) -> str:
     return " ".join(repr(float(number)) for number in np.ravel(numbers))
 
 
-def _completed(name: str, body: Body, old: Stated) -> Stated:
+def _completed(place: str, body: Body, old: Stated) -> Stated:
     """Return the numbers of a body in its own axes; an `Inertia` has mass, centre and, of ratios,
     the sum of the moments from the file.
     """
@@ -463,10 +464,10 @@ def _completed(name: str, body: Body, old: Stated) -> Stated:
     if body.scale is not None:
         total = float(np.trace(old.tensor))
         if not total > 0:
-            raise ValueError(f"body {name!r}: ratios of moments need the moments of the file")
+            raise ValueError(f"{place}: wanted its moments beside ratios, got none")
         tensor = (tensor * (total / np.trace(tensor))).astype(tensor.dtype)
-        words = f"the sum of its moments stays that of the file, {total:.6g} kg m²"
-        warnings.warn(f"body {name!r}: only ratios are known: {words}", stacklevel=4)
+        words = f"the sum of the moments stays that of the file, {total:.6g} kg m²"
+        warnings.warn(f"{place}: only ratios are known: {words}", stacklevel=4)
     return Stated(old.mass, old.com, tensor)
 
 
@@ -548,9 +549,9 @@ def _with_child(tag: bytes, child: bytes) -> bytes:
     return tag + child
 
 
-def _replaced(text: str, load: Any, name: str, key: str, numbers: np.ndarray) -> str:
+def _replaced(text: str, load: Any, name: str, key: str, numbers: np.ndarray) -> str | None:
     """Return TOML or JSON with other numbers in one place of a table, found by trial: the text is
-    right if it is read as the old one but for these numbers.
+    right if it is read as the old one but for these numbers. `None` if there is no such place.
     """
     wanted = load(text)
     dict(_tables(wanted))[name][key] = numbers.tolist()
@@ -568,4 +569,4 @@ def _replaced(text: str, load: Any, name: str, key: str, numbers: np.ndarray) ->
                 return draft
         except ValueError:
             continue
-    raise ValueError(f"body {name!r}: {key}: wanted plain numbers in the text")
+    return None

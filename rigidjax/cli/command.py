@@ -22,7 +22,7 @@ import numpy as np
 
 import rigidjax as rj
 from rigidjax import _checks, _show
-from rigidjax.cli import spec, swing
+from rigidjax.cli import spec, swing, write
 from rigidjax.cli.logs.errors import LogError, LogWarning, warn
 from rigidjax.cli.logs.layouts import USUAL, imu_columns, time_column
 from rigidjax.cli.logs.log import Log
@@ -40,7 +40,7 @@ _OF_LOOK = (
 )  # fmt: skip
 # Each of these options names a file to write. Two options must not name the same file, and none may
 # name a log that is read.
-_OUTPUTS = ("checkpoint", "figure", "report", "json", "csv", "keep")
+_OUTPUTS = ("checkpoint", "figure", "report", "json", "csv", "keep", "write")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -295,6 +295,15 @@ OPTIONS: dict[str, dict[str, Any]] = {
         help="compile anew, and keep no compiled programs in the user's cache folder"),
     "--json": dict(
         type=Path, metavar="OUT.json", help="write all results as numbers to this file"),
+    "--write": dict(
+        type=Path, metavar="MODEL", help="the body in this file of a simulator becomes the fitted "
+        "one: URDF, MuJoCo's XML, params.toml of crazyflow, JSON"),
+    "--body": dict(metavar="NAME", help="which body of --write (default: the only one)"),
+    "--mount": dict(
+        nargs=7, type=float, metavar=("X", "Y", "Z", "QW", "QX", "QY", "QZ"),
+        help="place, m, and attitude of the log's axes in the frame of --body (default: the same "
+        "frame)"),
+    "--yes": _FLAG | dict(help="change the file --write; without it, say what would change"),
 }  # fmt: skip
 
 
@@ -573,6 +582,7 @@ def _run_logs(options: argparse.Namespace) -> int:
     """
     looks = options.command == "look"
     try:
+        target = None if looks else write.open_target(options)
         with _log_warnings(options.strict):
             read: Any = (_look_at if looks else _read_logs)(options)
     except ValueError as error:
@@ -588,7 +598,7 @@ def _run_logs(options: argparse.Namespace) -> int:
         count, span = record.t.shape[0] + record.dropped, record.t[-1] - record.t[0]
         _print_line(f"{path}: {count} samples over {span:.4g} s{words}")
     print()
-    fit = _fit(model, options, 8)
+    fit = _fit(model, options, 8, None if target is None else target.before(model))
     if fit is None:
         return 2
     of_gyros = (c.unit for c in channels if c.kind == "gyro" and c.unit in ("rad/s", "deg/s"))
@@ -599,17 +609,25 @@ def _run_logs(options: argparse.Namespace) -> int:
         scale, unit = _show.shown_unit(sensor.unit, rate_unit)
         print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
     print()
-    print(rj.identify.report.verdict(fit))
+    print(rj.identify.report.verdict(fit, rate_unit))
     files = [_checks.escape_controls(Path(path).name) for path in options.logs]
     title = f"Identification of {', '.join(files[:3])}{' …' if files[3:] else ''}"
-    return _write_outputs(fit, options, title, files, names, {"rate_unit": rate_unit})
+    code = _write_outputs(fit, options, title, files, names, {"rate_unit": rate_unit})
+    if target is None or code > 1:
+        return code
+    try:
+        for line in target.write(fit, options.yes, rate_unit):
+            _print_line(line)
+    except (OSError, ValueError) as error:
+        return _print_error(error)
+    return code
 
 
 def _fit(
-    model: rj.identify.Model, options: argparse.Namespace, starts: int
+    model: rj.identify.Model, options: argparse.Namespace, starts: int, before: Any = None
 ) -> rj.identify.Fit | None:
     """Return the fit, or `None` after an error whose message is printed; `starts` is used if the
-    options name none.
+    options name none, and the body `before` predicts what is held out, too.
     """
     try:
         return rj.identify.fit(
@@ -617,6 +635,7 @@ def _fit(
             starts=starts if options.starts is None else options.starts,
             progress=_print_line,
             checkpoint=options.checkpoint,
+            before=before,
         )
     except (OSError, ValueError) as error:
         _print_error(error)

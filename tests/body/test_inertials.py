@@ -369,7 +369,7 @@ def test_mistakes_in_tables_are_told(tmp_path, name, text, words):
 
 def test_a_body_without_an_inertial_needs_a_mass(tmp_path):
     path = written(tmp_path, URDF)
-    with pytest.raises(ValueError, match="'base': wanted an <inertial>, got none; give MassProp"):
+    with pytest.raises(ValueError, match="'base': wanted an <inertial>, got none; its mass"):
         rj.body.write_inertials(path, {"base": rj.Inertia(TENSOR)}, path)
     path = written(tmp_path, "{}", "empty.json")
     with pytest.raises(ValueError, match="no body 'arm'; there are none"):
