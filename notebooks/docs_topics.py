@@ -86,7 +86,7 @@ TOPICS = {
         "Energy and momentum": "kinetic_energy kinetic_energy_about "
         "kinetic_energy_of_matrix_rate angular_momentum spatial_angular_momentum",
         "Principal axes and ellipsoids": "principal matrix_function ellipsoid",
-        "Distance of two bodies": "divergence",
+        "Distance of two bodies, random bodies": "divergence sample Draw",
     },
     "rj.identify": {
         "The model": "Model Recording Scene Free",

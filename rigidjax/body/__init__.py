@@ -4,6 +4,7 @@
 
 from rigidjax._names import define_dir_and_getattr
 from rigidjax.body.divergence import divergence as divergence
+from rigidjax.body.draws import Draw as Draw, sample as sample
 from rigidjax.body.energy import (
     angular_momentum as angular_momentum,
     ellipsoid as ellipsoid,
@@ -20,9 +21,10 @@ from rigidjax.body.inertials import (
 from rigidjax.body.principal_axes import matrix_function as matrix_function, principal as principal
 
 __all__ = [
-    "Inertia", "MassProperties", "angular_momentum", "divergence", "ellipsoid", "kinetic_energy",
-    "kinetic_energy_about", "kinetic_energy_of_matrix_rate", "matrix_function", "principal",
-    "read_inertials", "spatial_angular_momentum", "write_inertials",
+    "Draw", "Inertia", "MassProperties", "angular_momentum", "divergence", "ellipsoid",
+    "kinetic_energy", "kinetic_energy_about", "kinetic_energy_of_matrix_rate",
+    "matrix_function", "principal", "read_inertials", "sample", "spatial_angular_momentum",
+    "write_inertials",
 ]  # fmt: skip
 
 define_dir_and_getattr(__name__)

@@ -34,9 +34,10 @@ class Target(NamedTuple):
         return old if has_mass(model.charts[0]) else old.inertia
 
     def write(self, fit: rj.identify.Fit, yes: bool, rate_unit: str) -> Iterator[str]:
-        """Put the body of a fit into the file if `yes`, and yield lines that say what changes."""
+        """Write the body of a fit into the file if `yes`, and yield lines on what changes."""
         path, body = self.file.path, fit.body.rotate(self.turn)
-        if np.any(np.asarray(fit.null_directions)[:, : fit.model.index.bodies]):
+        bodies = fit.model.index.bodies
+        if not np.isfinite(fit.covariance[:bodies, :bodies]).all():
             raise ValueError(
                 f"{path} is not changed: the log does not determine the whole body, as said above; "
                 "record more motion, or fit fewer numbers (--model)"

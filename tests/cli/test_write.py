@@ -96,7 +96,9 @@ def test_without_trust_it_is_said(folder, capsys, monkeypatch, found):
 
 
 def test_a_body_of_which_the_log_shows_a_part_is_not_written(folder, capsys, monkeypatch, found):
-    unseen = dataclasses.replace(found.uncertainty, null_directions=jnp.eye(5)[:1])
+    unseen = dataclasses.replace(
+        found.uncertainty, covariance=found.covariance.at[0, 0].set(jnp.inf)
+    )
     unseen = dataclasses.replace(found, uncertainty=unseen)
     monkeypatch.setattr(rj.identify, "fit", lambda *_, **__: unseen)
     assert run("--yes") == 2

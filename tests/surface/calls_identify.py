@@ -172,6 +172,12 @@ row(
     arguments=("of", "level"),
     **HOST,
 )
+row(
+    "identify.Fit.bodies",
+    lambda: dict(self=s.found(), key=jax.random.key(0), count=20),
+    arguments=("key", "count"),
+    transforms=(),
+)
 records = (
     "Fit",
     "Answer",

@@ -137,6 +137,8 @@ row("MassProperties.shift", lambda: dict(self=s.body(), r=V), says=("com",))
 row("MassProperties.rotate", lambda: dict(self=s.body(), q=Q), arguments=("q",))
 row("body.principal", dict(tensor=SYMMETRIC))
 row("body.matrix_function", dict(function=jnp.sqrt, tensor=SYMMETRIC))
+row("body.sample", lambda: dict(body=s.body(), key=jax.random.key(0), spread=0.05))
+leave_out("sample makes it", "body.Draw")
 row("body.divergence", lambda: dict(body=s.body(), reference=s.other_body()))
 row("body.ellipsoid", lambda: dict(body=s.inertia(), kind="energy", size=1.5))
 row(

@@ -499,6 +499,10 @@ leave_out(
     "files: tests/body read what other programs wrote, and the numbers back",
     "body.shapes.mesh_file", "body.read_inertials", "body.write_inertials",
 )  # fmt: skip
+leave_out(
+    "random: tests/body/test_draws.py, tests/identify/test_drawn_bodies.py",
+    "body.Draw", "body.sample", "identify.Fit.bodies",
+)  # fmt: skip
 leave_out("a Protocol: no numbers", "motion.HasAttitude", "motion.HasPose", "motion.HasSpin", "motion.HasAttitude.q",
           "motion.HasPose.x", "motion.HasPose.v", "motion.HasSpin.omega")  # fmt: skip
 

@@ -10,15 +10,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from rigidjax import _checks, _show
+from rigidjax.body.draws import Draw, as_draw
 from rigidjax.identify.answer import answers, undetermined
 from rigidjax.identify.answer.answers import Answer, Cause
 from rigidjax.identify.answer.causes import causes
 from rigidjax.identify.answer.parts import Assessment, BestPoint, HeldOut, Pair, Uncertainty
 from rigidjax.identify.answer.table import Row, html_rows, interval_text, numbers, table
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
+from rigidjax.identify.model.charts import Charts, body_with_scale_mark, split_numbers
 from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jacobian
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.uncertainty.covariance import Linearisation, residuals_by_name
@@ -330,6 +333,45 @@ class Fit(eqx.Module):
         _, low, high = value_and_interval_of(self, function, level)
         return low, high
 
+    def bodies(self, key: PRNGKeyArray, count: int = 1000) -> Draw | dict[str, Draw]:
+        """Return random bodies that agree with the readings, for simulations with many bodies.
+
+        The numbers that describe the body (`Model` says which) are drawn from the normal
+        distribution about the fitted ones with the covariance of this fit. Any such numbers
+        describe a possible body. If there are more draws than numbers, their mean and covariance
+        are those of the fit without the scatter of random draws.
+
+        **Arguments:**
+
+        - `key`: a key of `jax.random`.
+        - `count`: the number of draws.
+
+        **Returns** a `rj.body.Draw` with a leading axis of draws; of several bodies a dict of name
+        → `Draw`. The bodies of a fit that shows only ratios have an arbitrary scale. **Raises**
+        `ValueError` if the readings do not determine the whole body.
+
+        >>> import jax
+        >>> result = rj.identify.fit(rj.datasets.toutatis.model())
+        >>> result.bodies(jax.random.key(0), 100).moments.shape
+        (100, 3)
+        """
+        key, count = _checks.random_key(key), _checks.integer(count, "count", 1)
+        size = self.model.index.bodies
+        if not np.isfinite(np.asarray(self.covariance)[:size, :size]).all():
+            raise ValueError(
+                "bodies: the readings do not determine the whole body; fit.identifiability says "
+                "what is missing: record more motion, give a prior, or fit fewer numbers"
+            )
+        covariance = np.asarray(self.determined_covariance)[:size, :size]
+        deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        square, axes = np.linalg.eigh(covariance / np.outer(deviation, deviation))
+        root = deviation[:, None] * axes * np.sqrt(np.maximum(square, 0.0))
+        z = jax.random.normal(key, (count, size), self.x.dtype)
+        draws = _draw_bodies(self.model.charts, self.x[:size], jnp.asarray(root, z.dtype), z)
+        if self.model.body_indices is None:
+            return draws[0]
+        return dict(zip(dict.fromkeys(self.model.body_names), draws, strict=True))
+
     @property
     def undetermined_combinations(self) -> tuple[Combination, ...]:
         """Return the combinations of numbers that the data of this fit do not determine at all.
@@ -346,6 +388,21 @@ class Fit(eqx.Module):
         return undetermined.describe_identifiability(
             self.point, self.uncertainty, self.assessment, self.quantities
         )
+
+
+@eqx.filter_jit
+def _draw_bodies(charts: Charts, x: Array, root: Array, z: Array) -> tuple[Draw, ...]:
+    """Return the bodies at the parameters `x + root z` for each row z of normal numbers."""
+    if len(z) > x.size:
+        z = z - z.mean(axis=0, keepdims=True)
+        own = jnp.linalg.cholesky(z.T @ z / (len(z) - 1))
+        z = solve_triangular(own, z.T, lower=True).T
+
+    def bodies(row: Array) -> tuple[Draw, ...]:
+        parts = split_numbers(charts, x + jnp.sum(root * row[None], 1))
+        return tuple(map(as_draw, map(body_with_scale_mark, charts, parts)))
+
+    return jax.vmap(bodies)(z)
 
 
 # A weak reference to the `linear` of a fit, and its causes.
