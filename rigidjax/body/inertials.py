@@ -268,9 +268,6 @@ class File(NamedTuple):
                 numbers = np.diag(numbers)
             if key is not None:
                 text = _replaced(text, load, name, key, numbers)
-                if text is None:
-                    words = "wanted plain numbers, to change them in the text"
-                    raise ValueError(f"{self.path}: body {name!r}: {key}: {words}")
         return text.encode()
 
 
@@ -383,23 +380,22 @@ def _turn_of_mujoco(inertial: Tree.Element, compiler: dict[str, str]) -> np.ndar
     kind = next((kind for kind in _TURNS if kind in inertial.attrib), None)
     if kind is None:
         return np.eye(3)
-    numbers = _read_numbers(inertial, kind, _TURNS[kind])
-    degrees = compiler.get("angle") != "radian"
+    numbers, degrees = _read_numbers(inertial, kind, _TURNS[kind]), compiler.get("angle")
     if kind == "quat":
-        return Rotation.from_quat(numbers, scalar_first=True).as_matrix()
-    if kind == "euler":
+        turn = Rotation.from_quat(numbers, scalar_first=True)
+    elif kind == "euler":
         # MuJoCo's small letters are axes that turn with the body, which are SciPy's capitals.
         sequence = compiler.get("eulerseq", "xyz").swapcase()
-        return Rotation.from_euler(sequence, numbers, degrees).as_matrix()
-    if kind == "axisangle":
+        turn = Rotation.from_euler(sequence, numbers, degrees != "radian")
+    elif kind == "axisangle":
         axis = numbers[:3] / np.linalg.norm(numbers[:3])
-        return Rotation.from_rotvec(numbers[3] * axis, degrees).as_matrix()
-    if kind == "zaxis":
-        return Rotation.align_vectors([numbers], [[0.0, 0.0, 1.0]])[0].as_matrix()
-    x = numbers[:3] / np.linalg.norm(numbers[:3])
-    y = numbers[3:] - x * (x @ numbers[3:])
-    y = y / np.linalg.norm(y)
-    return np.stack([x, y, np.cross(x, y)], axis=1)
+        turn = Rotation.from_rotvec(numbers[3] * axis, degrees != "radian")
+    elif kind == "zaxis":
+        turn = Rotation.align_vectors(numbers[None], np.eye(3)[2:])[0]
+    else:
+        both = numbers.reshape(2, 3) / np.linalg.norm(numbers.reshape(2, 3), axis=1)[:, None]
+        turn = Rotation.align_vectors(both, np.eye(3)[:2], weights=[np.inf, 1.0])[0]
+    return turn.as_matrix()
 
 
 def _symmetric(six: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -549,9 +545,9 @@ def _with_child(tag: bytes, child: bytes) -> bytes:
     return tag + child
 
 
-def _replaced(text: str, load: Any, name: str, key: str, numbers: np.ndarray) -> str | None:
+def _replaced(text: str, load: Any, name: str, key: str, numbers: np.ndarray) -> str:
     """Return TOML or JSON with other numbers in one place of a table, found by trial: the text is
-    right if it is read as the old one but for these numbers. `None` if there is no such place.
+    right if it is read as the old one but for these numbers.
     """
     wanted = load(text)
     dict(_tables(wanted))[name][key] = numbers.tolist()
@@ -569,4 +565,4 @@ def _replaced(text: str, load: Any, name: str, key: str, numbers: np.ndarray) ->
                 return draft
         except ValueError:
             continue
-    return None
+    raise ValueError(f"body {name!r}: {key}: wanted plain numbers in the text")

@@ -87,11 +87,8 @@ def test_without_trust_it_is_said(folder, capsys, monkeypatch, found):
     monkeypatch.setattr(rj.identify, "fit", lambda _, **how: asked.append(how["before"]) or unsure)
     assert run("--yes") == 1 and asked == [None]
     said = capsys.readouterr().out
-    assert "no error by that of the file: drone.xml: body 'drone': wanted moments of a body" in said
-    assert (
-        "this body is not to be trusted: search: found; model: leaves a part" in said
-        and "by the new body\n" in said
-    )
+    assert "by the new body, none by that of the file, which no real body has\n" in said
+    assert "this body is not to be trusted: search: found; model: leaves a part" in said
     assert "drone.xml is changed" in said and Path("drone.xml").read_text() != MODEL
 
 
