@@ -170,7 +170,7 @@ class File(NamedTuple):
         if name in self.nodes:
             return name
         there = ", ".join(self.nodes) or "none (in TOML and JSON a body has a mass and a J)"
-        wanted = "wanted the name of a body" if name is None else f"no body {name!r}"
+        wanted = "wanted --body NAME" if name is None else f"no body {name!r}"
         raise ValueError(f"{self.path}: {wanted}; there are {there}")
 
     def has_inertia(self, name: str) -> bool:

@@ -374,3 +374,15 @@ def test_a_body_without_an_inertial_needs_a_mass(tmp_path):
     path = written(tmp_path, "{}", "empty.json")
     with pytest.raises(ValueError, match="no body 'arm'; there are none"):
         rj.body.write_inertials(path, {"arm": rj.Inertia(TENSOR)}, path)
+
+
+def test_a_text_that_cannot_be_changed_in_place_is_refused(tmp_path):
+    path = written(tmp_path, "[arm]\nmass = 0x10\nJ = [1, 1, 1]", "params.toml")
+    assert rj.body.read_inertials(path)["arm"].mass == 16.0
+    with pytest.raises(ValueError, match="'arm': mass: wanted plain numbers in the text"):
+        rj.body.write_inertials(path, {"arm": rj.shapes.box(1.0, [1.0, 1, 1])}, path)
+    path = tmp_path / "robot.urdf"
+    path.write_bytes(URDF.replace('<?xml version="1.0"?>', "").encode("utf-16"))
+    assert list(rj.body.read_inertials(path)) == ["upper"]
+    with pytest.raises(ValueError, match="wanted a file in UTF-8"):
+        rj.body.write_inertials(path, {"upper": rj.Inertia(TENSOR)}, path)

@@ -108,7 +108,7 @@ WRONG = [
     (["--write", "drone.xml", "--body", "camera"], "'camera': wanted an <inertial>, got none; its mass must stand in"),
     (["--write", "drones.xml"], "drones.xml: no such file"),
     (["--write", "throw.csv"], "--write: throw.csv is already the FILE"),
-    (["--write", "two.toml"], "two.toml: wanted the name of a body; there are a, b"),
+    (["--write", "two.toml"], "two.toml: wanted --body NAME; there are a, b"),
     (["--write", "drone.xml", "--mount", *"0001111"], "--mount: wanted a unit quaternion QW QX QY QZ, got one of length 2"),
     (["--body", "drone"], "--body: wanted a --write FILE beside it"),
     (["--yes"], "--yes: wanted a --write FILE beside it"),

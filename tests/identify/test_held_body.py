@@ -221,7 +221,11 @@ def test_the_command_line_reads_poses_and_a_wrench(tmp_path, monkeypatch, capsys
     np.savetxt("tool.csv", rows, delimiter=",", header=names, comments="", fmt="%.10g")
     wrench = ["--wrench", "fx", "fy", "fz", "tx", "ty", "tz", "--time-unit", "ms"]
     noise = ["--noise", "0.05", "0.0025", "--figure", "tool.png", "--no-cache"]
-    assert command.main(["identify", "tool.csv", *wrench, *noise]) == 0
+    (tmp_path / "arm.urdf").write_text(ARM)
+    place, turn = np.array([0.1, -0.2, 0.05]), Rotation.from_euler("xyz", [0.4, 1.0, -0.7])
+    mount = ["--mount", *map(str, [*place, *turn.as_quat(scalar_first=True)])]
+    write = ["--write", "arm.urdf", *mount, "--yes"]
+    assert command.main(["identify", "tool.csv", *wrench, *noise, *write]) == 0
     said = capsys.readouterr().out
     assert "status: ok" in said
     low, high = (
@@ -230,6 +234,22 @@ def test_the_command_line_reads_poses_and_a_wrench(tmp_path, monkeypatch, capsys
     )
     assert low < 0.7 < high < low + 0.01
     assert (tmp_path / "tool.png").stat().st_size > 10_000
+    # The file has the tool in its own frame, whose axes are turned and whose origin is elsewhere.
+    body, turning = rj.body.read_inertials("arm.urdf")["tool"], turn.as_matrix()
+    np.testing.assert_allclose(body.mass, 0.7, atol=2e-3)
+    np.testing.assert_allclose(body.com, place + turning @ np.asarray(TOOL.com), atol=2e-3)
+    wanted = turning @ np.asarray(TOOL.inertia.tensor) @ turning.T
+    np.testing.assert_allclose(body.inertia.tensor, wanted, atol=8e-5)
+    new, old = said.split("error of the ForceTorque: ")[1].split("\n")[0].rsplit(", ", 1)
+    assert 0.08 < float(new.split()[0]) < 0.1 < 1.0 < float(old.split()[0])
+    assert "no body" not in said and 'rpy="0.3 0.2 0.1"' in (tmp_path / "arm.urdf").read_text()
+
+
+ARM = """<robot name="arm"><link name="base"/><link name="tool"><inertial>
+  <origin xyz="0 0 0" rpy="0.3 0.2 0.1"/><mass value="1"/>
+  <inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/>
+</inertial></link></robot>
+"""
 
 
 def test_rows_with_empty_cells_are_gaps(tmp_path):

@@ -15,7 +15,7 @@ from rigidjax.identify.answer.parts import HeldOut, Pair
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.model.charts import Known, body_places
 from rigidjax.identify.model.index import build_index
-from rigidjax.identify.model.model import Model, require_one_kind
+from rigidjax.identify.model.model import Model, all_errors, require_one_kind
 from rigidjax.identify.search.stages import (
     Attempt,
     Task,
@@ -83,11 +83,16 @@ def with_held_out(fit: Fit, task: Task, part: Part, before: Any = None) -> Fit:
     test = _test_prediction(model, linear, held)
     if test is None:
         return fit
-    sizes = [_sizes(linear, ~held), _sizes(linear, held), [None] * len(linear.raw)]
+    raw, mask = linear.raw, linear.mask
+    sizes = [_sizes(raw, mask, ~held), _sizes(raw, mask, held), [None] * len(raw)]
     if before is not None:
         known, x = with_body(model, fit.x, before)
         task = task._replace(model=known)
-        sizes[2] = _sizes(_fit_of_rest(fit_in_stages(x, task), task, held), held)
+        if x.size:
+            raw = _fit_of_rest(fit_in_stages(x, task), task, held).raw
+        else:  # a held body: nothing is left to fit
+            raw = tuple(map(np.asarray, eqx.filter_jit(all_errors)(known, x)))
+        sizes[2] = _sizes(raw, mask, held)
     pairs = tuple(
         Pair(type(sensor).__name__, sensor.unit, *three)
         for sensor, *three in zip(model.records.sensors, *sizes, strict=True)
@@ -132,10 +137,12 @@ def with_body(model: Model, x: Float[Array, " n"], body: Any) -> tuple[Model, Ar
     return dataclasses.replace(model, **parts), x[model.index.bodies :]
 
 
-def _sizes(linear: Linearisation, rows: Bool[np.ndarray, "records times"]) -> list[float]:
+def _sizes(
+    raw: Sequence[np.ndarray], masks: Sequence[np.ndarray], rows: Bool[np.ndarray, "records times"]
+) -> list[float]:
     """Return the root mean square length of the errors of each sensor in some rows, or NaN."""
     out = []
-    for error, mask in zip(linear.raw, linear.mask, strict=True):
+    for error, mask in zip(raw, masks, strict=True):
         squares = np.sum(error**2, axis=-1)[mask.all(axis=-1) & rows]
         out.append(float(np.sqrt(np.mean(squares))) if squares.size else np.nan)
     return out
