@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import rigidjax as rj
 from rigidjax.identify import Gyro, Recording
 
 T = 0.05 * np.arange(8)
@@ -43,3 +44,27 @@ def test_frames(library):
 def test_xarray():
     xarray = pytest.importorskip("xarray")
     check(xarray.Dataset({name: ("t", column) for name, column in columns().items()}))
+
+
+def test_a_fit_is_a_frame():
+    pytest.importorskip("pandas")
+    fit = rj.identify.fit(rj.datasets.toutatis.model(), starts=1)
+    frame = fit.to_frame("deg/day")
+    assert list(frame.columns) == ["value", "low", "high", "unit"]
+    for name, *numbers, unit in rj.identify.report.rows(fit, "deg/day"):
+        assert frame.loc[name, ["value", "low", "high"]].tolist() == numbers
+        assert frame.loc[name, "unit"] == unit
+
+
+def test_a_run_is_a_dataset():
+    pytest.importorskip("xarray")
+    body, start = rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Attitude([1.0, 0, 0, 0], [1.0, 2, 3])
+    run = rj.simulate(body, start, T)
+    data = run.to_xarray()
+    np.testing.assert_array_equal(data.t, T)
+    np.testing.assert_array_equal(data.omega.sel(axis="z"), run.ys.omega[:, 2])
+    np.testing.assert_array_equal(data.q.sel(part="w").isel(t=3), run.ys.q[3, 0])
+    axle = rj.suspensions.TorsionBar([0, 0, 1], 2.0)
+    swing = rj.simulate(body, rj.Turn(0.1, 0.2), T, torque=axle)
+    np.testing.assert_array_equal(swing.to_xarray().angle, swing.ys.angle)
+    assert swing.to_xarray().angle.dims == ("t",)

@@ -178,6 +178,12 @@ row(
     arguments=("key", "count"),
     transforms=(),
 )
+row(
+    "identify.Fit.to_frame",
+    lambda: dict(self=s.found(), rate_unit="deg/s"),
+    arguments=("rate_unit",),
+    transforms=(),
+)
 records = (
     "Fit",
     "Answer",

@@ -360,6 +360,7 @@ row(
     groups=(*KINDS, "nan", "inf"),
     transforms=(),
 )
+row("solve.Solution.to_xarray", lambda: dict(self=s.motion()), arguments=(), transforms=())
 leave_out("simulate returns it", "solve.Solution", "solve.Error")
 leave_out("error_of returns it", "solve.FunctionError")
 leave_out(

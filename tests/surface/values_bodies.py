@@ -503,6 +503,10 @@ leave_out(
     "random: tests/body/test_draws.py, tests/identify/test_drawn_bodies.py",
     "body.Draw", "body.sample", "identify.Fit.bodies",
 )  # fmt: skip
+leave_out(
+    "tables of other libraries: tests/identify/test_tables.py",
+    "identify.Fit.to_frame", "solve.Solution.to_xarray",
+)  # fmt: skip
 leave_out("a Protocol: no numbers", "motion.HasAttitude", "motion.HasPose", "motion.HasSpin", "motion.HasAttitude.q",
           "motion.HasPose.x", "motion.HasPose.v", "motion.HasSpin.omega")  # fmt: skip
 

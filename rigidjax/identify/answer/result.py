@@ -333,6 +333,17 @@ class Fit(eqx.Module):
         _, low, high = value_and_interval_of(self, function, level)
         return low, high
 
+    def to_frame(self, rate_unit: str = "rad/s") -> Any:
+        """Return the reported quantities of this fit as a `DataFrame` of pandas.
+
+        A row has the name of a quantity as its index, the value, the ends `low` and `high` of the
+        95 % interval, and the unit. The unit of rates is `rate_unit`: `rad/s`, `deg/s` or
+        `deg/day`. **Raises** `ModuleNotFoundError` without pandas.
+        """
+        pandas = _checks.import_library("pandas", "frames", "to_frame")
+        columns = ["name", "value", "low", "high", "unit"]
+        return pandas.DataFrame(rows(self, rate_unit), columns=columns).set_index("name")
+
     def bodies(self, key: PRNGKeyArray, count: int = 1000) -> Draw | dict[str, Draw]:
         """Return random bodies that agree with the readings, for simulations with many bodies.
 

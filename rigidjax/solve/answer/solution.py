@@ -17,7 +17,14 @@ from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin, Turn
 from rigidjax.motion.conserved import drift
 from rigidjax.motion.coupled import Coupled, motion_of
-from rigidjax.motion.manifold import dimension, minus_small, parts_by_name, plus, rotation_slices
+from rigidjax.motion.manifold import (
+    dimension,
+    leaf_names,
+    minus_small,
+    parts_by_name,
+    plus,
+    rotation_slices,
+)
 from rigidjax.motion.torques.states import require_no_own_states
 from rigidjax.solve.answer.error import Error, estimate_error_of_run, largest_length_in_run
 from rigidjax.solve.answer.run import AnyRun, solve
@@ -80,6 +87,23 @@ class Solution(eqx.Module, Generic[State]):
         )
         word = dfx.RESULTS[self.result] or "successful"
         return f"Solution({type(self.ys).__name__} at {count} times {ends}{steps}; {word})"
+
+    def to_xarray(self) -> Any:
+        """Return the states of this run as a `Dataset` of xarray, with the times as `t`, s.
+
+        Vectors have the components `axis` x, y, z, and quaternions the components `part` w, x, y,
+        z. **Raises** `ModuleNotFoundError` without xarray, and `ValueError` for a batch of runs.
+        """
+        xarray = _checks.import_library("xarray", "frames", "to_xarray")
+        if np.ndim(self.ts) != 1:
+            raise ValueError(f"to_xarray: wanted one run, got times of shape {np.shape(self.ts)}")
+        named = {3: ("axis", list("xyz")), 4: ("part", list("wxyz"))}
+        variables, places = {}, {"t": np.asarray(self.ts)}
+        for name, leaf in zip(leaf_names(self.ys), jax.tree.leaves(self.ys), strict=True):
+            kinds = [named[size] for size in leaf.shape[1:]]
+            places |= dict(kinds)
+            variables[name] = (["t", *dict(kinds)], np.asarray(leaf))
+        return xarray.Dataset(variables, coords=places)
 
     @property
     def drift(self) -> dict[str, Array]:
