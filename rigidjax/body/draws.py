@@ -12,6 +12,9 @@ from rigidjax.body.inertia import Body, Inertia, MassProperties, tensor_of
 from rigidjax.body.principal_axes import eigensystem, principal
 from rigidjax.body.symmetric3 import product, to_inertia
 
+# Logarithms of a wider spread leave the range of float32.
+_WIDEST = 10.0
+
 
 class Draw(eqx.Module):
     """Hold a drawn body in the numbers that simulators take; many draws have a leading axis.
@@ -60,7 +63,8 @@ def sample(body: Body, key: PRNGKeyArray, spread: ScalarLike | Vector) -> Draw:
       centre of mass, m, and of the logarithms of 𝔖/mass along principal axes. One number s is
       (s, s r, s), with `r = √(tr 𝔖 / mass)`. Of an `Inertia` only the last of the three counts.
 
-    **Raises:** `ValueError` (`equinox` error under `jit`) for a negative spread.
+    **Raises:** `ValueError` (`equinox` error under `jit`) for a spread that is negative or
+    above 10.
 
     >>> keys = jax.random.split(jax.random.key(0), 1000)
     >>> box = rj.shapes.box(2.0, [0.1, 0.2, 0.3])
@@ -70,16 +74,19 @@ def sample(body: Body, key: PRNGKeyArray, spread: ScalarLike | Vector) -> Draw:
     """
     _checks.require_unbatched_instance(body, (MassProperties, Inertia), "body")
     key, second = _checks.random_key(key), body.second_moment
-    if np.shape(spread) == ():
-        one = _checks.array_of_shape(spread, (), "spread")
+    wide = _checks.numeric_array(spread, "spread").astype(second.dtype)
+    if wide.ndim > 0:
+        wide = _checks.array_of_shape(wide, (3,), "spread", hint="or one number")
+    words = f"spread: wanted numbers from 0 to {_WIDEST:g}; that of the centre of mass any, finite"
+    wide = _checks.error_if(wide, ~((wide >= 0) & (wide < jnp.inf)), words)
+    if wide.ndim == 0:
         radius = 1.0
         if isinstance(body, MassProperties):
             radius = jnp.sqrt(jnp.trace(second) / body.mass)
-        spread = jnp.stack([one, one * radius, one])
-    wide = _checks.array_of_shape(spread, (3,), "spread", hint="or one number")
-    wide = _checks.error_if(wide, ~(wide >= 0), "spread: wanted numbers of at least zero")
-    z = jax.random.normal(key, (4, 3), second.dtype)
-    more = jax.random.normal(jax.random.fold_in(key, 1), (), second.dtype)
+        wide = jnp.stack([wide, wide * radius, wide])
+    wide = _checks.error_if(wide, (wide > _WIDEST) & np.array([True, False, True]), words)
+    z = jax.random.normal(key, (4, 3)).astype(second.dtype)
+    more = jax.random.normal(jax.random.fold_in(key, 1)).astype(second.dtype)
     # The eigenvalues of a matrix of random numbers differ, also if the spread is zero.
     values, axes = eigensystem(0.5 * (z[:3] + z[:3].T))
     stretch = product(axes * jnp.exp(0.5 * wide[2] * values)[None], axes.T)

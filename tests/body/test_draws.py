@@ -92,6 +92,7 @@ def test_derivatives_by_the_spread_are_finite_at_zero():
         np.testing.assert_allclose(slope(spread), numeric, rtol=1e-6)
 
 
-def test_a_negative_spread_is_refused():
-    with pytest.raises(ValueError, match="spread: wanted numbers of at least zero"):
-        rj.body.sample(BOX, KEYS[0], -0.1)
+@pytest.mark.parametrize("spread", [-0.1, np.nan, 11.0, [0.1, -0.1, 0.1], [0.1, 0.1, 11.0]])
+def test_a_spread_that_is_none_is_refused(spread):
+    with pytest.raises(ValueError, match="spread: wanted numbers from 0 to 10"):
+        rj.body.sample(BOX, KEYS[0], jnp.array(spread))
