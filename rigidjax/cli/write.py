@@ -49,11 +49,12 @@ class Target(NamedTuple):
         yield from (str(one.message) for one in said)
         for pair in [] if fit.held_out is None else fit.held_out.pairs:
             scale, unit = _show.shown_unit(pair.unit, rate_unit)
-            words = "none by that of the file, which no real body has"
-            if pair.before is not None:
-                words = f"{scale * pair.before:.3g} by that of the file"
-            new = f"{scale * pair.held_out:.3g} {unit} by the new body"
-            yield f"held-out error of the {pair.sensor}: {new}, {words}"
+            sizes = (scale * pair.held_out, None if pair.before is None else scale * pair.before)
+            new, old = ("none (no real body)" if x is None else f"{x:.3g}" for x in sizes)
+            yield (
+                f"held-out error of the {pair.sensor}: {new} {unit} by the new body, {old} by that "
+                "of the file"
+            )
         if not fit.ok:
             yield f"this body is not to be trusted: {fit.status}"
         if yes:
@@ -64,9 +65,8 @@ class Target(NamedTuple):
 def open_target(options: argparse.Namespace) -> Target | None:
     """Return what `--write` names, or `None` without it; raise `ValueError` if it is missing."""
     if options.write is None:
-        alone = [name for name in ("body", "mount", "yes") if getattr(options, name)]
-        if alone:
-            raise LogError(f"--{alone[0]}: wanted a --write FILE beside it")
+        if options.body or options.mount or options.yes:
+            raise LogError("--body, --mount, --yes: wanted a --write FILE beside them")
         return None
     file = open_file(options.write, "--write")
     *place, w, x, y, z = options.mount or [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]

@@ -87,7 +87,7 @@ def test_without_trust_it_is_said(folder, capsys, monkeypatch, found):
     monkeypatch.setattr(rj.identify, "fit", lambda _, **how: asked.append(how["before"]) or unsure)
     assert run("--yes") == 1 and asked == [None]
     said = capsys.readouterr().out
-    assert "by the new body, none by that of the file, which no real body has\n" in said
+    assert "rad/s by the new body, none (no real body) by that of the file\n" in said
     assert "this body is not to be trusted: search: found; model: leaves a part" in said
     assert "drone.xml is changed" in said and Path("drone.xml").read_text() != MODEL
 
@@ -110,8 +110,8 @@ WRONG = [
     (["--write", "throw.csv"], "--write: throw.csv is already the FILE"),
     (["--write", "two.toml"], "two.toml: wanted --body NAME; there are a, b"),
     (["--write", "drone.xml", "--mount", *"0001111"], "--mount: wanted a unit quaternion QW QX QY QZ, got one of length 2"),
-    (["--body", "drone"], "--body: wanted a --write FILE beside it"),
-    (["--yes"], "--yes: wanted a --write FILE beside it"),
+    (["--body", "drone"], "--body, --mount, --yes: wanted a --write FILE beside them"),
+    (["--yes"], "--yes: wanted a --write FILE beside them"),
 ]  # fmt: skip
 
 
