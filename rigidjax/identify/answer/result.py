@@ -21,7 +21,6 @@ from rigidjax.identify.answer.causes import causes
 from rigidjax.identify.answer.parts import Assessment, BestPoint, HeldOut, Pair, Uncertainty
 from rigidjax.identify.answer.table import Row, html_rows, interval_text, numbers, table
 from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
-from rigidjax.identify.model.charts import Charts, body_with_scale_mark, split_numbers
 from rigidjax.identify.model.model import Model, Unpacked, shortened, unpack_jacobian
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.uncertainty.covariance import Linearisation, residuals_by_name
@@ -378,10 +377,7 @@ class Fit(eqx.Module):
         square, axes = np.linalg.eigh(covariance / np.outer(deviation, deviation))
         root = deviation[:, None] * axes * np.sqrt(np.maximum(square, 0.0))
         z = jax.random.normal(key, (count, size), self.x.dtype)
-        draws = _draw_bodies(self.model.charts, self.x[:size], jnp.asarray(root, z.dtype), z)
-        if self.model.body_indices is None:
-            return draws[0]
-        return dict(zip(dict.fromkeys(self.model.body_names), draws, strict=True))
+        return _draw_bodies(shortened(self.model), self.x[:size], jnp.asarray(root, z.dtype), z)
 
     @property
     def undetermined_combinations(self) -> tuple[Combination, ...]:
@@ -402,18 +398,20 @@ class Fit(eqx.Module):
 
 
 @eqx.filter_jit
-def _draw_bodies(charts: Charts, x: Array, root: Array, z: Array) -> tuple[Draw, ...]:
+def _draw_bodies(model: Model, x: Array, root: Array, z: Array) -> Draw | dict[str, Draw]:
     """Return the bodies at the parameters `x + root z` for each row z of normal numbers."""
     if len(z) > x.size:
         z = z - z.mean(axis=0, keepdims=True)
         own = jnp.linalg.cholesky(z.T @ z / (len(z) - 1))
         z = solve_triangular(own, z.T, lower=True).T
 
-    def bodies(row: Array) -> tuple[Draw, ...]:
-        parts = split_numbers(charts, x + jnp.sum(root * row[None], 1))
-        return tuple(map(as_draw, map(body_with_scale_mark, charts, parts)))
+    def draws(row: Array) -> Draw | dict[str, Draw]:
+        bodies = model.bodies(x + jnp.sum(root * row[None], 1))
+        if isinstance(bodies, dict):
+            return {name: as_draw(body) for name, body in bodies.items()}
+        return as_draw(bodies)
 
-    return jax.vmap(bodies)(z)
+    return jax.vmap(draws)(z)
 
 
 # A weak reference to the `linear` of a fit, and its causes.
