@@ -83,6 +83,7 @@ LAWS = {
         thrust=0.1,
         drag=np.array([0.2, 0.3]),
         speeds=np.array([2.0, 3.0]),
+        inertia=0.3,
     ),
 }
 for name, given in LAWS.items():

@@ -177,7 +177,9 @@ way(
 def pushes(n, d, k, c, r):
     force = sum(k[i] * n[i] ** 2 * d[i] for i in range(3))
     turn = sum(
-        np.cross(r[i], k[i] * n[i] ** 2 * d[i]) - s * c[i] * n[i] ** 2 * d[i]
+        np.cross(r[i], k[i] * n[i] ** 2 * d[i])
+        - s * c[i] * n[i] ** 2 * d[i]
+        + s * c[i] * n[i] * np.cross(d[i], n)
         for i, s in enumerate((1, -1, 1))
     )
     return force, turn
@@ -188,7 +190,7 @@ UNITS = lambda rng, i: np.stack([v.direction(rng, 1) for _ in range(3)])
 way(
     "motion.torques.Rotors",
     lambda n, d, k, c, r, q: (
-        laws.Rotors(r, d, jnp.asarray([1.0, -1.0, 1.0]), k, c, n)(0.0, rigid(
+        laws.Rotors(r, d, jnp.asarray([1.0, -1.0, 1.0]), k, c, n, c)(0.0, rigid(
             r[0], r[1], q, n), props(1.0, r[0], jnp.eye(3)))),
     (v.normal(3, low=-3, high=4), UNITS, v.ordinary, v.ordinary, v.normal(3, 3), v.quaternion),
     lambda n, d, k, c, r, q: (v.matrix_of(q) @ pushes(n, d, k, c, r)[0], pushes(n, d, k, c, r)[1]),

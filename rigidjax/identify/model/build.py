@@ -42,7 +42,7 @@ from rigidjax.motion import Attitude, Rigid, Spin, Turn
 from rigidjax.motion.manifold import dimension
 from rigidjax.motion.suspension import AbstractSuspension, Law
 from rigidjax.motion.torques import Carried
-from rigidjax.motion.torques.base import AbstractForce, require_torque
+from rigidjax.motion.torques.base import require_torque
 from rigidjax.motion.torques.composite import parts_of
 from rigidjax.motion.torques.inputs import input_names_of
 
@@ -378,7 +378,8 @@ def _state_type(sensors: Sequence[AbstractSensor], torque: Law | None, charts: C
         needed.append(getattr(torque, "feels", HasAttitude))
     movers = [type(sensor).__name__ for sensor in sensors if sensor.feels is HasPose]
     forces = None if isinstance(torque, AbstractSuspension) else torque
-    movers += [type(part).__name__ for part in parts_of(forces) if isinstance(part, AbstractForce)]
+    parts = parts_of(forces)
+    movers += [type(part).__name__ for part in parts if getattr(part, "feels", None) is HasPose]
     if HasPose in needed or movers:
         for chart in charts:
             if not has_mass(chart):

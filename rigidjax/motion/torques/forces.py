@@ -4,14 +4,17 @@ from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasPose, Mat3, NumbersLike, Scalar, ScalarLike, Vec3
+from rigidjax._types import HasPose, HasSpin, Mat3, NumbersLike, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import MassProperties
 from rigidjax.motion.torques import base
+from rigidjax.motion.torques.inputs import require_no_jumps
+from rigidjax.motion.torques.states import FrozenLaw, has_own_states
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross, dot
 
@@ -145,8 +148,13 @@ class Drag(base.AbstractForce):
 
 
 class Rotors(base.AbstractForce):
-    """Apply the forces of R propellers: the thrust `F_i = k_i n_i² d_i` at the place r_i, and the
-    reaction of the drag of the blades, the torque `τ_i = −s_i c_i n_i² d_i`.
+    """Apply the forces of R propellers: the thrust `F_i = k_i n_i² d_i` at the place r_i, the
+    reaction of the drag of the blades, the torque `τ_i = −s_i c_i n_i² d_i`, and the torque of what
+    turns, `h_i × Ω − dh_i/dt` with its momentum `h_i = s_i J_i n_i d_i` and the body rate Ω.
+
+    On a `Spin` or `Attitude`, which has no position, the torques act alone, about the point that
+    the body turns about: the log of a thrown drone has a gyro and speeds. Without a thrust or an
+    inertia that is known a gyro shows only the ratios of k, c, J and the moments of the body.
 
     **Arguments:**
 
@@ -156,28 +164,34 @@ class Rotors(base.AbstractForce):
       turns in the opposite sense.
     - `thrust`: k, N s²/rad², one number or (R,).
     - `drag`: c, N m s²/rad², one number or (R,).
-    - `speeds`: n (R,), rad/s: constant, a function of time that is an `equinox.Module`, such as
-      `Held(times, values)`, or `Input("speeds")`, whose values are given when a motion is computed.
+    - `speeds`: n (R,), rad/s, relative to the body: constant, a function of time that is an
+      `equinox.Module`, such as `Series(times, values)`, or `Input("speeds")`, whose values are
+      given when a motion is computed. Of commands it is `Lagged(Input("commands"), 0.03)`, where
+      commands may have any unit that is proportional to the speed: this unit then replaces rad/s
+      in k, c and J.
+    - `inertia`: J, kg m², of propeller and bell about d, one number or (R,), or `None` for none.
+      With it `speeds` may be `Lagged`, but not jump (`Held`, held samples), since dh/dt acts on the
+      body. The inertia of the body includes the locked rotors.
 
     Source: Mahony, Kumar and Corke 2012, Multirotor aerial vehicles, eqs 4–6,
-    doi:10.1109/MRA.2012.2206474.
+    doi:10.1109/MRA.2012.2206474; the momentum: Hughes, Spacecraft Attitude Dynamics, ch. 3.
 
     **Raises:** `ValueError` for a direction that is not a unit vector, or a spin that is not 1 or
-    −1.
+    −1; `TypeError` for an inertia with speeds that jump.
 
     >>> up = Rotors([[0.1, 0.0, 0.0]], [[0.0, 0.0, 1.0]], [1.0], 2.0, 0.5, [3.0])
-    >>> rest = rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
-    >>> up(0.0, rest, rj.shapes.sphere(1.0, 1.0)).torque.tolist()
+    >>> up(0.0, rj.Spin([0.0, 0, 0]), rj.Inertia(jnp.eye(3))).tolist()
     [0.0, -1.8, -4.5]
     """
 
-    feels: ClassVar[type] = HasPose
+    feels: ClassVar[type] = HasSpin
     positions: Float[Array, "rotors 3"]
     directions: Float[Array, "rotors 3"]
     spins: Float[Array, " rotors"]
-    thrust: Float[Array, "*rotors"]
-    drag: Float[Array, "*rotors"]
+    thrust: Float[Array, "*k"]
+    drag: Float[Array, "*c"]
     speeds: eqx.Module | Float[Array, " rotors"]
+    inertia: Float[Array, "*j"] | None
 
     def __init__(
         self,
@@ -187,6 +201,7 @@ class Rotors(base.AbstractForce):
         thrust: NumbersLike,
         drag: NumbersLike,
         speeds: NumbersLike | Callable[..., Any],
+        inertia: NumbersLike | None = None,
     ):
         count = base.row_count(positions, "positions", "rotor")
         self.positions = _checks.finite_array(positions, (count, 3), "positions")
@@ -199,21 +214,46 @@ class Rotors(base.AbstractForce):
             base.one_or_each(drag, count, "drag"),
         )
         self.speeds = base.checked_source(speeds, "speeds", count)
+        self.inertia = None if inertia is None else base.one_or_each(inertia, count, "inertia")
+        if inertia is not None and not has_own_states(speeds):
+            require_no_jumps(speeds, "speeds")
 
     jump_times = property(base.field_jumps)
 
-    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
-        n = base.vector_at(self.speeds, t, "speeds", self.spins.shape[0]).astype(self.spins.dtype)
+    def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Any:
+        count, dtype = self.spins.shape[0], self.spins.dtype
+        n = base.vector_at(self.speeds, t, "speeds", count).astype(dtype)
         square = n * n
         lift, twist = self.thrust * square, self.spins * self.drag * square
+        if self.inertia is not None:
+            gain, spun = self.spins * self.inertia, self.spins * self.inertia * n
+            twist = twist + gain * self._acceleration(t, state, body).astype(dtype)
         # The sum is written out rotor by rotor: there are few rotors, and in a batch of bodies
         # `jnp.sum` is slow.
         force, torque = jnp.zeros(3, lift.dtype), jnp.zeros(3, lift.dtype)
-        for i in range(self.spins.shape[0]):
+        for i in range(count):
             along = self.directions[i]
             force = force + lift[i] * along
             torque = torque + lift[i] * cross(self.positions[i], along) - twist[i] * along
+            if self.inertia is not None:
+                torque = torque + spun[i] * cross(along, state.omega)
+        if not isinstance(state, HasPose):
+            return torque
         return base.Wrench(quaternion.rotate(state.q, force), torque)
+
+    def _acceleration(self, t: ScalarLike, state: HasSpin, body: object) -> Array:
+        """Return the derivatives of the speeds with respect to time, (R,), rad/s²."""
+        source: Any = self.speeds
+        if not callable(source):
+            return jnp.zeros_like(source)
+        t = jnp.asarray(t, state.omega.dtype)
+        one = jnp.ones_like(t)
+        if isinstance(source, FrozenLaw):
+            own = source.own[0]
+            slope = source.law.rate(t, own, state, body)
+            return jax.jvp(source.law, (t, own), (one, slope))[1]
+        require_no_jumps(source, "speeds")
+        return jax.jvp(source, (t,), (one,))[1]
 
 
 class BodyDrag(base.AbstractForce):
