@@ -75,7 +75,7 @@ def test_commands_with_a_lag_as_scipy_has_them():
     """The lagged speeds act with their derivative, although no log has it; a lag of a lag, too."""
     wanted, first = np.array([900.0, 200, 700, 400]), np.full(4, 300.0)
     numbers = by_scipy(lambda t, n: (n, (wanted - n) / LAG), first)
-    step = torques.Held([-1.0, 5.0], np.stack([wanted, wanted]))
+    step = torques.Held(np.linspace(-1.0, 5.0, 200), np.tile(wanted, (200, 1)))
     sol = simulated(rotors(torques.Lagged(step, LAG, first)))
     np.testing.assert_allclose(sol.ys.omega[-1], numbers[:3], rtol=0, atol=1e-8)
     np.testing.assert_allclose(sol.own[0][-1], numbers[3:], rtol=1e-9)

@@ -15,14 +15,14 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.motion.torques.base import jump_times_of, require_single
-from rigidjax.motion.torques.inputs import Delayed, Lagged
+from rigidjax.motion.torques.inputs import Delayed
 from rigidjax.motion.torques.piecewise import Held, Linear, Pulses, Tabulated
 from rigidjax.motion.torques.states import has_own_states
 from rigidjax.solve.times.switching import DECLARED
 
 # These laws of this package have jumps of their own. All other laws of this package only pass on
 # the jumps of the laws inside them.
-_OWN = (Held, Linear, Pulses, Tabulated, Delayed, Lagged)
+_OWN = (Held, Linear, Pulses, Tabulated, Delayed)
 
 
 class Sided(eqx.Module):
