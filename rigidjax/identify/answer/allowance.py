@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from rigidjax.identify.data import stacking
 from rigidjax.identify.model.free import split_path
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise
@@ -21,7 +22,10 @@ from rigidjax.identify.uncertainty.considered import (
 from rigidjax.identify.uncertainty.covariance import Linearisation
 from rigidjax.identify.uncertainty.degrees_of_freedom import student_quantile
 from rigidjax.identify.uncertainty.quantities import Quantity, log_deviation, named_charts
-from rigidjax.motion.torques import Damping, QuadraticDamping
+from rigidjax.motion.torques import Damping, QuadraticDamping, Rotors
+from rigidjax.motion.torques.forces import rotors_of
+from rigidjax.motion.torques.inputs import input_names_of
+from rigidjax.motion.torques.states import has_own_states
 
 # One sentence names at most this number of quantities.
 MOST = 3
@@ -32,6 +36,9 @@ REMARKABLE = 0.2
 # A status has a condition on the bias of a gyro if this fraction of the readings' root mean square
 # would move a moment by half its interval.
 USUAL_BIAS = 0.03
+# No tip of a propeller is faster than sound, m/s, and its radius is at most half the distance between
+# two rotors. Speeds of hover in rpm, read as rad/s, would move the tips at 500 m/s and more.
+FASTEST_TIP = 400.0
 # These words describe the two kinds of small constant errors of a sensor. The sizes of these
 # errors, 1 % and 1°, are the numbers of `considered.USUAL`.
 _WAYS = {
@@ -108,13 +115,32 @@ def describe_allowed(
             f"tolerance, such as {name}(…, tolerance=Tolerance(scale=0.01, cross_axis=0.01))."
         )
     words = " ".join(out) or "They do not allow for a sensor that is off."
+    conditions += ["the speeds of the rotors are in rad/s, not rpm"] if _in_rpm(model) else []
     condition = " and ".join(dict.fromkeys(conditions))
     return Allowance(words, f"if {condition}" if condition else "")
 
 
+def _in_rpm(model: Model) -> bool:
+    """Return whether logged speeds of rotors are more likely rpm: in rad/s the tips would be faster
+    than sound.
+    """
+    for one in stacking.kinds_of(model):
+        for rotors in rotors_of(one.torque):
+            places = np.asarray(rotors.positions)
+            apart = np.linalg.norm(places[:, None] - places, axis=-1)
+            radius = 0.5 * apart.min(initial=np.inf, where=apart > 0)
+            # Commands, which a motor follows with a lag, may have any unit.
+            names = () if has_own_states(rotors.speeds) else input_names_of(rotors.speeds)
+            logs = (one.records.inputs[name] for name in names)
+            logs = (getattr(log, "values", 0.0 if callable(log) else log) for log in logs)
+            if any(FASTEST_TIP < radius * np.abs(log).max() < np.inf for log in logs):
+                return True
+    return False
+
+
 def describe_doubtful(model: Model, quantities: Sequence[Quantity]) -> str:
     """Describe each sensor bias without a prior that is large compared with the readings, and each
-    damping below zero.
+    damping, or number of rotors, below zero.
 
     Such a bias may stand for a part of the motion that the model lacks: in one fit the bias of a
     pendulum's gyro came out as 1.6 rad/s.
@@ -151,5 +177,12 @@ def describe_doubtful(model: Model, quantities: Sequence[Quantity]) -> str:
             out.append(
                 f"{slot.name!r}, a damping, came out as {min(mine):.2g}: below zero it would drive "
                 "the motion. Something else stands behind it, or it is zero within its interval."
+            )
+        # The places of rotors may be below zero; thrust, drag and inertia may not.
+        least = 0.0 if leaf[-1].name == "positions" else min(mine, default=0.0)
+        if isinstance(holder, Rotors) and least < 0:
+            out.append(
+                f"{slot.name!r}, of rotors, came out as {least:.2g}: it is below zero if the "
+                "spins are wrong, or zero within its interval."
             )
     return " ".join(out)

@@ -26,7 +26,7 @@ from rigidjax.identify.data.recording import Recording, readings_of
 from rigidjax.identify.data.reference_states import Samples, attitudes, mean_rates, rates
 from rigidjax.identify.model.charts import body_list, tensor_of
 from rigidjax.identify.model.free import Free
-from rigidjax.identify.model.model import Model, part_of_sensor
+from rigidjax.identify.model.model import Model, motion_in, part_of_sensor
 from rigidjax.identify.model.terms import Noise, scaled_slopes
 from rigidjax.identify.model.widened import with_slots, with_torques
 from rigidjax.identify.search.stages import (
@@ -54,7 +54,10 @@ from rigidjax.identify.uncertainty.covariance import (
     white_noise_variance,
 )
 from rigidjax.motion import torques
+from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.suspension import Law
+from rigidjax.motion.torques.forces import rotors_of
+from rigidjax.motion.torques.states import freeze_own_states
 
 # A correction of the recorded body rates is believed if two conditions hold. The error of the
 # corrected rates, which is their difference from the rates between attitudes or the residual of
@@ -505,6 +508,54 @@ def _misread(model: Model, index: int) -> list[_Reread]:
     if isinstance(reading.sensor, ForceTorque):
         words = "the readings are what the body does to the support", "negate all readings"
         out.append(_Reread(_with_values(model, index, -values), 1.0, *words))
+    if isinstance(reading.sensor, Gyro) and rotors_of(model.torque) and not model.parts:
+        out += _other_rotors(model)
+    return out
+
+
+def _other_rotors(model: Model) -> list[_Reread]:
+    """Return models whose rotors stand and turn as a regression of the first recording says.
+
+    The regression on Euler's equations has a torque of any direction for the square of each speed,
+    and one along each rotor's axis for its derivative.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    record, scenes = model.recording, model.scenes(model.start())
+    scene = jax.tree.map(lambda leaf: leaf[0] if eqx.is_array(leaf) else leaf, scenes)
+    states, law = motion_in(model, scene, record)
+
+    def speeds_at(t: Array, state: Any) -> Array:
+        frozen = freeze_own_states(law, state.own) if isinstance(state, Coupled) else law
+        speeds: Any = rotors_of(frozen)[0].speeds
+        return jnp.asarray(speeds(t) if callable(speeds) else speeds)
+
+    speeds = np.asarray(jax.jit(jax.vmap(speeds_at))(record.t, states))
+    rotors, count = rotors_of(model.torque)[0], speeds.shape[1]
+    places, axes = np.asarray(rotors.positions), np.asarray(rotors.directions)
+
+    def columns(t: np.ndarray, w: np.ndarray) -> np.ndarray:
+        n = np.stack([np.interp(t, np.asarray(record.t), one) for one in speeds.T], axis=1)
+        n = n / (np.abs(n).max() or 1.0)
+        pushes = np.einsum("ti,jk->tjik", n**2, np.eye(3)).reshape(t.size, 3, -1)
+        return np.concatenate([pushes, axes.T * np.gradient(n, t, axis=0)[:, None]], axis=2)
+
+    found = regress_inertia((record,), None, columns)
+    if found is None:
+        return []
+    pushes, arms = found.coefficients[: 3 * count].reshape(count, 3), np.cross(places, axes)
+    order = linear_sum_assignment(-pushes @ arms.T)[1]
+    # The sense of a rotor is less certain than its place: those that were given may be right.
+    given, seen = np.asarray(rotors.spins), -np.sign(np.sum(pushes * axes[order], axis=1))
+    sets = [tuple(x.astype(int).tolist()) for x in (seen, given, given[order], -given[order])]
+    names, out = ("positions", "directions", "spins"), []
+    parts = lambda m: [getattr(rotors_of(m.torque)[0], name) for name in names]  # noqa: E731
+    for spins in dict.fromkeys(sets):
+        if (order != np.arange(count)).any() or spins != sets[1]:
+            rows = places[order], axes[order], np.array(spins, float)
+            other = eqx.tree_at(parts, model, [jnp.asarray(each) for each in rows])
+            words = f"take rows {order.tolist()} of positions and directions, and spins {spins}"
+            out.append(_Reread(other, 1.0, "rotors in another order or sense of turning", words))
     return out
 
 
@@ -519,7 +570,7 @@ def _refit_anew(noise: Noise, one: _Reread) -> _Refit:
     task = Task(one.model, sigma, 1e-4, 4 * STRIDE)
     x = fit_in_stages(starting_points(one.model, 1, None)[0], task).x
     squares = _mean_squares(linearise(one.model, x, sigma, blocks_at(one.model, x)))
-    kind = "sign" if one.unit == 1.0 and one.words != WORLD else "misread"
+    kind = "sign" if one.remedy.startswith("negate") else "misread"
     return _Refit(_Candidate(kind, 0, one.words, one.remedy), np.zeros(0), squares)
 
 

@@ -126,8 +126,8 @@ def labels(model: Model) -> list[Label]:
         if slot.shape:
             channels = ("fx", "fy", "fz", "tx", "ty", "tz") if slot.shape == (6,) else "xyz"
             axes = dict(enumerate(channels)) if slot.shape in ((3,), (6,)) else {}
-            places = [i if len(i) > 1 else i[0] for i in np.ndindex(slot.shape)]
-            parts = [f" {axes.get(i, i)}" for i in places]
+            row, places = len(slot.shape) == 1, np.ndindex(slot.shape)
+            parts = [f" {axes.get(i[0], i[0] if row else i)}" for i in places]
         ends = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
         ends = ends if slot.spread is None else [*ends, *(f", own{where}" for where in names)]
         called = [f"{slot.name}{part}{end}" for end in ends for part in parts]

@@ -225,9 +225,11 @@ class Rotors(base.AbstractForce):
         n = base.vector_at(self.speeds, t, "speeds", count).astype(dtype)
         square = n * n
         lift, twist = self.thrust * square, self.spins * self.drag * square
+        spun = None
         if self.inertia is not None:
-            gain, spun = self.spins * self.inertia, self.spins * self.inertia * n
-            twist = twist + gain * self._acceleration(t, state, body).astype(dtype)
+            axial = self.spins * self.inertia
+            spun = axial * n
+            twist = twist + axial * self._acceleration(t, state, body).astype(dtype)
         # The sum is written out rotor by rotor: there are few rotors, and in a batch of bodies
         # `jnp.sum` is slow.
         force, torque = jnp.zeros(3, lift.dtype), jnp.zeros(3, lift.dtype)
@@ -235,7 +237,7 @@ class Rotors(base.AbstractForce):
             along = self.directions[i]
             force = force + lift[i] * along
             torque = torque + lift[i] * cross(self.positions[i], along) - twist[i] * along
-            if self.inertia is not None:
+            if spun is not None:
                 torque = torque + spun[i] * cross(along, state.omega)
         if not isinstance(state, HasPose):
             return torque
@@ -254,6 +256,12 @@ class Rotors(base.AbstractForce):
             return jax.jvp(source.law, (t, own), (one, slope))[1]
         require_no_jumps(source, "speeds")
         return jax.jvp(source, (t,), (one,))[1]
+
+
+def rotors_of(torque: object) -> list[Rotors]:
+    """Return all `Rotors` in a torque, or in a tree of torques."""
+    is_rotors = lambda node: isinstance(node, Rotors)  # noqa: E731
+    return list(filter(is_rotors, jax.tree.leaves(torque, is_leaf=is_rotors)))
 
 
 class BodyDrag(base.AbstractForce):
