@@ -36,8 +36,8 @@ REMARKABLE = 0.2
 # A status has a condition on the bias of a gyro if this fraction of the readings' root mean square
 # would move a moment by half its interval.
 USUAL_BIAS = 0.03
-# No tip of a propeller is faster than sound, m/s, and its radius is at most half the distance between
-# two rotors. Speeds of hover in rpm, read as rad/s, would move the tips at 500 m/s and more.
+# No tip of a propeller is faster than sound, m/s, and its radius is at most half the distance
+# between two rotors. Speeds of hover in rpm, read as rad/s, would move the tips at 500 m/s and more.
 FASTEST_TIP = 400.0
 # These words describe the two kinds of small constant errors of a sensor. The sizes of these
 # errors, 1 % and 1°, are the numbers of `considered.USUAL`.
