@@ -37,7 +37,7 @@ REMARKABLE = 0.2
 # would move a moment by half its interval.
 USUAL_BIAS = 0.03
 # No tip of a propeller is faster than sound, m/s, and its radius is at most half the distance
-# between two rotors. Speeds of hover in rpm, read as rad/s, would move the tips at 500 m/s and more.
+# between two rotors. Speeds of hover in rpm, read as rad/s, move the tips at 500 m/s and more.
 FASTEST_TIP = 400.0
 # These words describe the two kinds of small constant errors of a sensor. The sizes of these
 # errors, 1 % and 1°, are the numbers of `considered.USUAL`.
