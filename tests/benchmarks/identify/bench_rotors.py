@@ -1,10 +1,9 @@
 """Thrown drones whose rotors are pulsed one after the other: how often intervals hold the truth.
 
-Run `python tests/benchmarks/identify/bench_rotors.py [--throws 24] [--mistakes]`. Each throw is of another drone, simulated by
+Run `python tests/benchmarks/identify/bench_rotors.py [--throws 24] [--kind speed]`. Each throw is of another drone, simulated by
 NumPy alone (classical Runge–Kutta steps of 0.25 ms): rotors of unequal lift, the momentum of the rotors, a motor lag,
 a gyro with bias and noise, tachometers with noise that are late. What is fitted: `speed`, the logged speeds and a known rotor
-inertia (±3 %); `command`, the commands alone, with the thrust from the weight at hover (±2 %). With `--mistakes` a few throws are
-fitted with a law or a log that is wrong.
+inertia (±3 %); `command`, the commands alone, with the thrust from the weight at hover (±2 %).
 """
 
 import argparse
@@ -97,7 +96,6 @@ class Log(NamedTuple):
     gyro: np.ndarray
     speeds: np.ndarray
     commands: np.ndarray
-    noise: float
 
 
 def log(rng, one, omega, duration):
@@ -108,7 +106,7 @@ def log(rng, one, omega, duration):
     every = slice(None, None, round(1 / RATE / STEP))
     gyro = rates[every] + rng.normal(0.0, 0.02, 3) + noise * rng.normal(size=rates[every].shape)
     tacho = held[every] * (1 + 0.005 * rng.normal(size=held[every].shape))
-    return Log(t[every], gyro, tacho, commands(t[every]), noise)
+    return Log(t[every], gyro, tacho, commands(t[every]))
 
 
 # The lifts of the rotors are alike, to `UNLIKE`: numbers measured beside the log.
