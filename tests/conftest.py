@@ -73,7 +73,7 @@ def _load(default_run):
     gc.set_threshold(100_000, 50, 50)
 
 
-# Tests that took some three seconds or more of a run beside others; of many cases the shortest stays.
+# Tests that took two and a half seconds or more of a run beside others; of many cases the shortest stays.
 MARKED = {
     mark: frozenset((Path(__file__).parent / name).read_text(encoding="utf-8").splitlines())
     for mark, name in (("long", "long.txt"), ("slow", "slow.txt"))

@@ -11,7 +11,7 @@ import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.answer.answers import Answer
 from rigidjax.identify.answer.parts import Assessment, BestPoint, Uncertainty
-from rigidjax.identify.answer.undetermined import Combination, _describe_limits
+from rigidjax.identify.answer.undetermined import Combination, describe_identifiability
 from rigidjax.identify.uncertainty.quantities import Quantity
 
 TS = np.linspace(0.0, 1.0, 5)
@@ -209,10 +209,13 @@ def test_the_place_of_a_marker_is_known_only_from_the_centre_of_mass():
 )
 def test_a_tiny_interval_beside_one_of_everything_is_told(ratio, other, many):
     """Of two ratios of moments, given with these relative deviations."""
-    ratios = [
+    bias = lambda model: moved(model, model.slots[0].shared[0], 1.0)
+    fit = fit_with(identify.PrincipalRatios(), [bias])
+    ratios = (
         Quantity("Ix/Iz", 1.0, ratio, "", True, most=1.0),
         Quantity("Iy/Iz", 0.5, 0.5 * other, "", True, most=1.0),
-    ]
-    said = _describe_limits(ratios)
+    )
+    parts = fit.point, fit.uncertainty, fit.assessment, (*ratios, *fit.quantities[2:])
+    said = [one for one in describe_identifiability(*parts) if "at a limit of real bodies" in one]
     assert len(said) == many
     assert all("of Ix/Iz" in one and "of Iy/Iz spans most" in one for one in said)
