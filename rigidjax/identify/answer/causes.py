@@ -445,6 +445,10 @@ def _likeliest(
     best = min(refits, key=deviance, default=None)
     if best is None or not level(best.squares) < (1.0 - ENOUGH) * level(before):
         return None
+    # A cause that leaves most of what varies in the readings is none.
+    left = np.mean(error[used] ** 2) * (best.squares / before)[index]
+    if left > 0.5 * np.mean(np.var(np.asarray(reading.values)[used], axis=0)):
+        return None
     named = [r for r in sorted(refits, key=deviance) if deviance(r) < deviance(best) + NEARLY]
     if any(r.candidate.name == "wheel" for r in named):
         named = [r for r in named if r.candidate.name != "spin-up"]
