@@ -152,7 +152,8 @@ def test_a_record_on_a_gpu_follows_the_largest_number_of_steps(in_chunks, monkey
 
     monkeypatch.setattr(module, "fit_chunk", fit_chunk)
     monkeypatch.setattr(sharding, "memory_of", lambda mesh: 1e4)
-    there = [compiled(401)]  # another number, so that no trace of the first call is taken
+    # Other numbers, so that no trace of an earlier call is taken, nor that of the other case.
+    there = [compiled(403 if in_chunks else 401)]
     if in_chunks:
         monkeypatch.setattr(sharding, "_FEW", 2)
         there.append(compiled(402))
