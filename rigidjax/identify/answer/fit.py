@@ -3,6 +3,7 @@ between recordings.
 """
 
 import dataclasses
+import itertools
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -165,18 +166,15 @@ def fit(
             )  # fmt: skip
         return dataclasses.replace(result, place=_ON_CPU)
     if model.index.bodies:
-        recordings = [
-            (one.torque, recording, place == 0)
-            for one in stacking.kinds_of(model)
-            for place, recording in enumerate(stacking.on_host(one.records, one.counts))
-        ]
-        for number, (torque, recording, is_first) in enumerate(recordings, 1):
-            if is_first:
-                warn_of_unit(recording, torque)
-            named = rates(recording).values, f"fit: the rates of recording {number}"
-            require_turning(*named)
-            if torque is None:
-                require_no_swing(*named)
+        number = itertools.count(1)
+        for one in stacking.kinds_of(model):
+            recordings = stacking.on_host(one.records, one.counts)
+            warn_of_unit(recordings[0], one.torque)
+            for recording in recordings:
+                named = rates(recording).values, f"fit: the rates of recording {next(number)}"
+                require_turning(*named)
+                if one.torque is None:
+                    require_no_swing(*named)
     padded = stacking.pad_to_few(model)
     part = choose_part(padded, held_out)
     if before is not None:

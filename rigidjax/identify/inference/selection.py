@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from rigidjax import _checks
 from rigidjax.body.inertia import tensor_of
+from rigidjax.identify.answer.answers import NOT_ENDED
 from rigidjax.identify.answer.fit import fit
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.inference.compare import criterion
@@ -238,8 +239,9 @@ def select(
         before = _held_out(trials[best])
         for one, trial in trials.items():
             after = _held_out(trial)
-            worse = not after or (before and _mean_ratio(after, before) > WORSE)
-            if one != best and worse:
+            # Too few readings to hold some out are no reason against a set.
+            worse = before and (not after or _mean_ratio(after, before) > WORSE)
+            if one != best and (worse or trial.search.word == NOT_ENDED):
                 found[one] = math.inf
         least = min(found, key=lambda one: found[one])
         if least != best:

@@ -94,6 +94,15 @@ def test_terms_are_those_of_the_record(hidden):
     assert str(found).splitlines()[0].split() == ["terms", "criterion", "errors", "held", "out"]
 
 
+def test_too_few_readings_to_hold_some_out_are_no_reason_against_a_term(monkeypatch):
+    hidden = {"drag": [0.3, 0.2, 0.4], "bias": [0.1, -0.1, 0.1]}
+    model = model_of(hidden, identify.PrincipalRatios(), torque=torques.Damping(ZERO))
+    drag = identify.Free(lambda s: s.torque.coefficient, "drag", scale=0.1)
+    monkeypatch.setattr(selection, "_held_out", lambda trial: ())
+    found = identify.select(model, {"drag": drag, "bias": CANDIDATES["bias"]}, starts=2)
+    assert set(found.terms) == set(hidden)
+
+
 def test_usual_terms_leave_the_prediction_and_keep_what_was_free():
     """Of a model with a law whose number is free: the law becomes the first part of a sum."""
     law = torques.Damping([0.1, 0.2, 0.3])
