@@ -25,7 +25,8 @@ _SHORTEST = (0.08, 0.15, 0.3)
 # share of the reading: less is an error of the sensors.
 _UNEXPLAINED = (1.5, 0.05)
 _UNEXPLAINED_TURN = (2.0, 0.1)
-# The standard deviations of the place of an accelerometer, m, and of a ratio of moments.
+# The standard deviations, before anything is known, of the place of an accelerometer, m, of a ratio
+# of moments, and of the bias of an accelerometer, m/s².
 _FAR, _UNLIKE, _FORCE_BIAS = 0.1, 0.3, 0.3
 # Windows of free flight are explained to this share of what is allowed.
 _CLOSE = 0.4
