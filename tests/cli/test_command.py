@@ -236,7 +236,7 @@ def test_ctrl_c_is_not_lost_in_the_garbage_collector(monkeypatch):
 
 
 def test_a_reader_that_stops_reading_does_not_stop_what_is_written_after():
-    says = "import sys; from rigidjax.cli.command import _print_line; sys.stdin.read(); _print_line('1'); _print_line('2'); print('on', file=sys.stderr)"
+    says = "import sys; from rigidjax.cli.output import print_line; sys.stdin.read(); print_line('1'); print_line('2'); print('on', file=sys.stderr)"
     pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     run = subprocess.Popen([sys.executable, "-c", says], text=True, **pipes)
     assert run.stdout is not None

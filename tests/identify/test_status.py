@@ -10,7 +10,7 @@ import turns
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.answer.causes import (
+from rigidjax.identify.answer.misread import (
     ATTITUDES,
     ORDERS,
     UNITS,

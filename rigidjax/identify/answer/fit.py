@@ -18,8 +18,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax._names import suggest_arguments
 from rigidjax.identify.answer.assess import assess
-from rigidjax.identify.answer.causes import warn_of_unit
 from rigidjax.identify.answer.held_out import choose_part, with_body, with_held_out
+from rigidjax.identify.answer.misread import warn_of_unit
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.reference_states import rates, require_no_swing, require_turning

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from rigidjax.cli import command
+from rigidjax.cli import command, reading
 from rigidjax.cli.logs.errors import LogError
 from rigidjax.identify import Gyro, read_table
 
@@ -97,7 +97,7 @@ def read(path, options):
     parsed = command._parser().parse_args(["identify", str(path), *options.split()])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return command._read_logs(parsed)[1][0]
+        return reading.read_logs(parsed)[1][0]
 
 
 def check(path, options=""):
