@@ -76,23 +76,23 @@ def test_a_log_in_other_units_has_the_same_phases(folder, capsys):
 def test_the_tables_of_a_phones_app_have_times_of_their_own(folder, capsys):
     log = thrown()
     names = ",".join(f"{axis} ({{0}})" for axis in "XYZ")
+
+    def looked():
+        with zipfile.ZipFile("app.zip", "w") as packed:
+            for name in ("Gyroscope.csv", "Accelerometer.csv"):
+                packed.write(name)
+        assert main(["look", "app.zip"]) == 0
+        return capsys.readouterr().out
+
     write("Gyroscope.csv", "Time (s)," + names.format("rad/s"), log.t[40:], log.rates[40:])
     # The other sensor reads every second time, begins earlier and ends later.
     other = log.t[::2] + 0.001, log.forces[::2]
     write("Accelerometer.csv", "Time (s)," + names.format("m/s^2"), *other)
-    with zipfile.ZipFile("app.zip", "w") as packed:
-        for name in ("Gyroscope.csv", "Accelerometer.csv"):
-            packed.write(name)
-    assert main(["look", "app.zip"]) == 0
-    out = capsys.readouterr().out
+    out = looked()
     assert "specific force Accelerometer.X (m/s^2)" in out and "by the gyro alone" not in out
     np.testing.assert_allclose(free(phases(out)), log.free - log.t[40], atol=0.02)
     write("Accelerometer.csv", "count," + names.format("m/s^2"), *other)
-    with zipfile.ZipFile("app.zip", "w") as packed:
-        for name in ("Gyroscope.csv", "Accelerometer.csv"):
-            packed.write(name)
-    assert main(["look", "app.zip"]) == 0
-    out = capsys.readouterr().out
+    out = looked()
     assert "are not read beside the rates" in out and "was it in the air?" in out
 
 

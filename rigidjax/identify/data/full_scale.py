@@ -1,11 +1,13 @@
 """Find readings at full scale, and describe them in a report."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from rigidjax.identify.data.recording import Reading, Recording
 from rigidjax.identify.sensors import Gyro
@@ -17,6 +19,21 @@ FASTEST = 70.0
 # If more than this fraction of the readings of a channel have the largest value, the channel is
 # taken as constant, not as cut off.
 MOST = 0.7
+
+
+def runs(
+    x: np.ndarray, breaks: Bool[np.ndarray, " n-1"] | None = None
+) -> Iterator[tuple[int, int]]:
+    """Yield the first and last index of each run of equal values, of a mask where it is true.
+
+    A run also ends at the index i if `breaks[i]` is true.
+    """
+    new = x[1:] != x[:-1]
+    new = new if breaks is None else new | breaks
+    edges = np.concatenate([[0], np.flatnonzero(new) + 1, [x.size]])
+    for i, j in itertools.pairwise(edges):
+        if x.dtype != bool or x[i]:
+            yield int(i), int(j) - 1
 
 
 def full_scale_of(values: np.ndarray) -> float | None:
@@ -38,8 +55,7 @@ def full_scale_of(values: np.ndarray) -> float | None:
     if not (steps > 0).any() or not bend > 0:
         return None
     smooth = 1.0 + 2.0 * np.sqrt(2.0 * steps[steps > 0].min() / bend)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]]).astype(int)))
-    longest = max(end - first for first, end in edges.reshape(-1, 2))
+    longest = max(last - first + 1 for first, last in runs(at))
     return top if longest >= max(RUN, 2.0 * smooth) else None
 
 

@@ -1,8 +1,7 @@
 """Find the phases of a record: free flight, swings, rest, handling, gaps, full scale."""
 
 import functools
-import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rigidjax import _checks
-from rigidjax.identify.data.full_scale import RUN, full_scale_of
+from rigidjax.identify.data.full_scale import RUN, full_scale_of, runs
 from rigidjax.identify.data.recording import Recording, input_functions, readings_of
 from rigidjax.identify.data.reference_states import rates, swing_axis
 from rigidjax.identify.sensors import Accelerometer
@@ -127,7 +126,7 @@ def find_phases(recording: Recording, motors: Sequence[str] = ()) -> list[Phase]
     kinds, left = np.full(t.size, "handling", dtype=object), np.ones(t.size, bool)
     for kind, mask in masks.items():
         least = _SHORTEST[1 if force is None else 0] if kind == "free" else _SHORTEST[2]
-        for i, j in _runs(mask & left, gaps):
+        for i, j in runs(mask & left, gaps):
             evenly = kind == "free" and force is None and angle[j] - angle[i] < _LEAST_TURN
             if t[j] - t[i] >= least and not evenly:
                 kinds[i : j + 1], left[i : j + 1] = kind, False
@@ -139,10 +138,10 @@ def find_phases(recording: Recording, motors: Sequence[str] = ()) -> list[Phase]
         Phase("full scale", t[i], t[j], 0.0, f"the rate about {axis} is at least {top:.3g} rad/s")
         for axis, column in zip("xyz", w.T, strict=True)
         if (top := full_scale_of(column)) is not None
-        for i, j in _runs(np.abs(column) >= top * (1 - 1e-9))
+        for i, j in runs(np.abs(column) >= top * (1 - 1e-9))
         if j - i + 1 >= RUN
     ]
-    for i, j in _runs(kinds, gaps):
+    for i, j in runs(kinds, gaps):
         turned = float(angle[j] - angle[i])
         out.append(_phase(kinds[i], t[i : j + 1], w[i : j + 1], turned, force is not None))
     return sorted(out, key=lambda phase: phase.start)
@@ -187,16 +186,6 @@ def _means(count: int) -> Callable[[np.ndarray], np.ndarray]:
 def _scatter(x: np.ndarray, mean: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Return the running standard deviation of rows."""
     return np.sqrt(np.maximum(mean(x**2) - mean(x) ** 2, 0).sum(axis=1))
-
-
-def _runs(x: np.ndarray, breaks: Bool[np.ndarray, " n"] | None = None) -> Iterator[tuple[int, int]]:
-    """Yield the first and last index of each run of equal values, of a mask where it is true."""
-    new = x[1:] != x[:-1]
-    new = new if breaks is None else new | breaks
-    edges = np.concatenate([[0], np.flatnonzero(new) + 1, [x.size]])
-    for i, j in itertools.pairwise(edges):
-        if x.dtype != bool or x[i]:
-            yield int(i), int(j) - 1
 
 
 def _force(recording: Recording, t: np.ndarray) -> Float[np.ndarray, "n 3"] | None:
@@ -310,12 +299,12 @@ def _swings(t: np.ndarray, w: np.ndarray, left: np.ndarray) -> Bool[np.ndarray, 
     at least.
     """
     out = np.zeros(t.size, bool)
-    for i, j in _runs(left):
+    for i, j in runs(left):
         last = t[j] - 2.0
         for start in np.append(np.arange(t[i], last, 0.5), last) if last > t[i] else ():
             rows = slice(*np.searchsorted(t, [start, start + 2.0 + 1e-9]))
             out[rows] |= swing_axis(w[rows]) is not None
-    for i, j in _runs(out):
+    for i, j in runs(out):
         axis = np.linalg.eigh(w[i : j + 1].T @ w[i : j + 1])[1][:, -1]
         along = w[i : j + 1] @ axis
         along = along[np.abs(along) > 0.2 * np.abs(along).max()]
