@@ -381,6 +381,10 @@ def _turn_of_mujoco(inertial: Tree.Element, compiler: dict[str, str]) -> np.ndar
     if kind is None:
         return np.eye(3)
     numbers, degrees = _read_numbers(inertial, kind, _TURNS[kind]), compiler.get("angle")
+    vectors = {"quat": numbers[None], "axisangle": numbers[None, :3]}.get(kind)
+    vectors = numbers.reshape(-1, 3) if vectors is None else vectors
+    if kind != "euler" and not np.linalg.norm(vectors, axis=1).all():
+        raise ValueError(f"{kind}: wanted a direction, got one of length zero")
     if kind == "quat":
         turn = Rotation.from_quat(numbers, scalar_first=True)
     elif kind == "euler":

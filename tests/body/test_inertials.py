@@ -386,3 +386,14 @@ def test_a_text_that_cannot_be_changed_in_place_is_refused(tmp_path):
     assert list(rj.body.read_inertials(path)) == ["upper"]
     with pytest.raises(ValueError, match="wanted a file in UTF-8"):
         rj.body.write_inertials(path, {"upper": rj.Inertia(TENSOR)}, path)
+
+
+@pytest.mark.parametrize("turn", ["quat='0 0 0 0'", "axisangle='0 0 0 1'", "zaxis='0 0 0'", "xyaxes='0 0 0 1 0 0'"])  # fmt: skip
+def test_an_orientation_of_length_zero_is_refused(turn, tmp_path):
+    inertial = f"<inertial mass='1' pos='0 0 0' diaginertia='1 1 1' {turn}/>"
+    path = tmp_path / "zero.xml"
+    path.write_text(f"<mujoco><worldbody><body name='a'>{inertial}</body></worldbody></mujoco>")
+    with pytest.raises(
+        ValueError, match=r"body 'a': [a-z]+: wanted a direction, got one of length"
+    ):
+        rj.body.read_inertials(path)

@@ -22,7 +22,7 @@ MOST = 0.7
 
 
 def runs(
-    x: np.ndarray, breaks: Bool[np.ndarray, " n-1"] | None = None
+    x: np.ndarray, breaks: Bool[np.ndarray, " gaps"] | None = None
 ) -> Iterator[tuple[int, int]]:
     """Yield the first and last index of each run of equal values, of a mask where it is true.
 
